@@ -123,7 +123,7 @@ class Bench:
         shading = self.scene.shading(shot, sampling, seed=7)
         traced = time.process_time()
         camera = self.rig[view.view]
-        pictures = np.empty((len(TEXTURES), *shading.shape), dtype=np.uint8)
+        pictures = np.empty((len(TEXTURES), camera.height, camera.width, 3), dtype=np.uint8)
         self.scene.composer.compose(shading, shot.points, camera, view.substrate, floor, self.textures, pictures)
         ended = time.process_time()
         return pictures, traced - placed, ended - traced + self._per_frame(view)

@@ -122,20 +122,19 @@ void compose(const Halves& shading, std::tuple<float, float> albedos, const Inpu
              const Plane& coverage, const Colors& mean, const WindowTuple& window, const Colors& reflected,
              const WindowTuple& reflected_window, const Input<float, nb::shape<-1, -1, 3>>& floor, float reflectance,
              Pictures pictures) {
-  const std::size_t height = shading.shape(0), width = shading.shape(1), colors = overall.size();
-  if (colors != 3 * pictures.shape(0) || pictures.shape(1) != height || pictures.shape(2) != width ||
+  const std::size_t height = pictures.shape(1), width = pictures.shape(2), colors = overall.size();
+  const std::size_t fine = height > 0 ? shading.shape(0) / height : 0;
+  if (colors != 3 * pictures.shape(0) || shading.shape(0) != fine * height || shading.shape(1) != fine * width ||
       floor.shape(0) != height || floor.shape(1) != width)
-    throw std::invalid_argument("shading, overall, floor and pictures: must be of one height, width and colours");
+    throw std::invalid_argument(
+        "shading, overall, floor and pictures: must be of one size, or a multiple of it, and colours");
   if (pictures.stride(3) != 1 || pictures.stride(2) != 3 || pictures.stride(1) != static_cast<std::int64_t>(3 * width))
     throw std::invalid_argument("pictures: each must be contiguous");
   const raster::Part cloth = part(mean, window, colors), mirrored = part(reflected, reflected_window, colors);
   if (coverage.shape(0) != mean.shape(0) || coverage.shape(1) != mean.shape(1))
     throw std::invalid_argument("coverage: must be of the shape of its window");
-  const raster::Shading light{{shading.data(), shading.size()},
-                              static_cast<int>(width),
-                              static_cast<int>(height),
-                              std::get<0>(albedos),
-                              std::get<1>(albedos)};
+  const raster::Shading light{{shading.data(), shading.size()}, static_cast<int>(width), static_cast<int>(height),
+                              static_cast<int>(fine),           std::get<0>(albedos),    std::get<1>(albedos)};
   nb::gil_scoped_release release;
   raster::compose(light, {overall.data(), overall.size()}, cloth, {coverage.data(), coverage.size()}, mirrored,
                   {floor.data(), floor.size()}, reflectance, pictures.data(),
@@ -179,9 +178,11 @@ NB_MODULE(_raster, module) {
       "window"_a, "grid"_a,
       "Return coverage (h, w), mean linear albedo (h, w, count, 3), samples by triangle (end,), the mean of all\n"
       "(count, 3), and the area of the triangles, each seen alone [px].");
-  module.def("compose", &compose, "shading"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a,
-             "reflected"_a, "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
-             "Write pictures (count, h, w, 3) of a shading (h, w, 3), half floats given as uint16.");
+  module.def(
+      "compose", &compose, "shading"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a, "reflected"_a,
+      "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
+      "Write pictures (count, h, w, 3) of a shading (n h, n w, 3), half floats given as uint16; coverage and mean\n"
+      "are in its pixels, too.");
   module.def("blurred", &blurred, "values"_a, "down"_a, "across"_a,
              "Return values (h, w, k), blurred about each pixel by radii of its own (h, w) [px].");
   module.def("normals", &normals, "points"_a, "triangles"_a, "Return the unit normals of vertices (V, 3).");

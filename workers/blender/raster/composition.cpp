@@ -50,14 +50,26 @@ float single(std::uint16_t half) {
   return half & 0x8000 ? -magnitude : magnitude;
 }
 
-// Write to `codes` where the table has (once + twice * other) * albedo + gloss, times the factor.
-RASTER_KERNEL void add_up(float gloss, float once, float twice, const float* __restrict albedo,
-                          const float* __restrict other, const float* __restrict factor, std::int32_t* __restrict codes,
+// Light as a function of the cloth's albedo.
+struct Light {
+  float gloss, once, twice;
+};
+
+// The light from its values at the three albedos; sums of values have the sum of their lights.
+Light solved(const Shading& shading, const std::array<float, 3>& at) {
+  const float to_first = (at[1] - at[0]) / shading.first, to_second = (at[2] - at[0]) / shading.second;
+  const float twice = (to_second - to_first) / (shading.second - shading.first);
+  return {at[0], to_first - shading.first * twice, twice};
+}
+
+// Add to `sums` (once + twice * other) * albedo + gloss, where `cover` of it is cloth, and the rest times the floor's
+// factor.
+RASTER_KERNEL void add_up(const Light& light, float cover, const float* __restrict albedo,
+                          const float* __restrict other, const float* __restrict floor, float* __restrict sums,
                           int count) {
-  for (int k = 0; k < count; ++k) {
-    const float light = (gloss + (once + twice * other[k]) * albedo[k]) * factor[k];
-    codes[k] = code(light);
-  }
+  for (int k = 0; k < count; ++k)
+    sums[k] +=
+        (light.gloss + (light.once + light.twice * other[k]) * albedo[k]) * (1.0f + (1.0f - cover) * (floor[k] - 1.0f));
 }
 
 // Where in a part of the frame a pixel is, or -1.
@@ -73,35 +85,39 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
              const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
              std::size_t stride) {
   const std::vector<std::uint16_t>& table = encoding();
-  const int colors = static_cast<int>(overall.size());
-  std::vector<float> albedo(colors), factor(colors);
+  const int colors = static_cast<int>(overall.size()), fine = shading.fine;
+  const float part = 1.0f / static_cast<float>(fine * fine);
+  std::vector<float> albedo(colors), factor(colors), sums(colors);
   std::vector<std::int32_t> codes(colors);
   for (int row = 0; row < shading.height; ++row) {
     for (int column = 0; column < shading.width; ++column) {
       const std::size_t pixel = static_cast<std::size_t>(row) * shading.width + column;
-      const std::uint16_t* const light = shading.light.data() + 3 * pixel;
-      const float gloss = single(light[0]);
-      const float to_first = (single(light[1]) - gloss) / shading.first;
-      const float to_second = (single(light[2]) - gloss) / shading.second;
-      const float twice = (to_second - to_first) / (shading.second - shading.first);
-      const float once = to_first - shading.first * twice;
-
       const std::ptrdiff_t there = index_in(reflected.window, column, row);
-      if (there < 0)
-        std::copy(overall.begin(), overall.end(), albedo.begin());
-      else
-        std::copy_n(reflected.albedo.begin() + there * colors, colors, albedo.begin());
-      float cover = 0.0f;
-      if (const std::ptrdiff_t here = index_in(cloth.window, column, row); here >= 0) {
-        cover = coverage[here];
-        if (cover > 0.0f) {
+      const float* const around = there < 0 ? overall.data() : reflected.albedo.data() + there * colors;
+      for (int k = 0; k < colors; ++k) factor[k] = floor[3 * pixel + k % 3];
+      std::fill(sums.begin(), sums.end(), 0.0f);
+      std::array<float, 3> mean{};  // of the parts without cloth, which have one albedo
+      bool bare = false;
+      for (int y = fine * row; y < fine * (row + 1); ++y) {
+        for (int x = fine * column; x < fine * (column + 1); ++x) {
+          const std::uint16_t* const light =
+              shading.light.data() + 3 * (static_cast<std::size_t>(y) * fine * shading.width + x);
+          const std::array<float, 3> at{single(light[0]), single(light[1]), single(light[2])};
+          const std::ptrdiff_t here = index_in(cloth.window, x, y);
+          const float cover = here < 0 ? 0.0f : coverage[here];
+          if (cover <= 0.0f) {
+            for (int k = 0; k < 3; ++k) mean[k] += at[k];
+            bare = true;
+            continue;
+          }
           const float share = cover / (cover + (1.0f - cover) * reflectance);
           const float* const seen = cloth.albedo.data() + here * colors;
-          for (int k = 0; k < colors; ++k) albedo[k] += share * (seen[k] - albedo[k]);
+          for (int k = 0; k < colors; ++k) albedo[k] = around[k] + share * (seen[k] - around[k]);
+          add_up(solved(shading, at), cover, albedo.data(), overall.data(), factor.data(), sums.data(), colors);
         }
       }
-      for (int k = 0; k < colors; ++k) factor[k] = 1.0f + (1.0f - cover) * (floor[3 * pixel + k % 3] - 1.0f);
-      add_up(gloss, once, twice, albedo.data(), overall.data(), factor.data(), codes.data(), colors);
+      if (bare) add_up(solved(shading, mean), 0.0f, around, overall.data(), factor.data(), sums.data(), colors);
+      for (int k = 0; k < colors; ++k) codes[k] = code(part * sums[k]);
       std::uint8_t* out = pictures + 3 * pixel;
       for (int k = 0; k < colors; k += 3, out += stride) {
         const std::array<std::uint16_t, 3> exact{table[codes[k]], table[codes[k + 1]], table[codes[k + 2]]};

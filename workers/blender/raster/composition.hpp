@@ -12,9 +12,10 @@ namespace raster {
 
 // The light of a frame at three albedos of the cloth.
 struct Shading {
-  std::span<const std::uint16_t> light;  // half floats, height x width x 3
-  int width, height;
-  float first, second;  // the second and third albedo; the first is 0
+  std::span<const std::uint16_t> light;  // half floats, (fine height) x (fine width) x 3
+  int width, height;                     // of a picture
+  int fine;                              // pixels of the light across one of a picture, and down
+  float first, second;                   // the second and third albedo; the first is 0
 };
 
 // Albedos in a part of the frame, height x width x colours; texture n has the colours 3 n to 3 n + 2.
@@ -25,6 +26,8 @@ struct Part {
 
 // Write pictures of colours / 3 textures, height x width x 3 each and `stride` bytes apart, 8-bit sRGB.
 //
+// `cloth` and `coverage` are in pixels of the light, and their window has whole pixels of a picture: a print and a fold
+// that meet in a pixel have light of their own. A pixel is the mean of its parts.
 // `coverage` is the share of the pixels of the cloth's window that see cloth. `overall` is the albedo (colours) of
 // light that met the cloth elsewhere; `reflected` what the floor shows of the cloth in its window, instead of it.
 // `floor` (height x width x 3) is a factor of the floor's light, and `reflectance` how bright the floor is beside the

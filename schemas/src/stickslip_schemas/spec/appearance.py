@@ -39,13 +39,15 @@ Row = tuple[Float, Float, Float]
 
 
 class Lighting(StrEnum):
-    """Named ranges that the lamp of a clip is drawn from.
+    """Named ranges that the lamp of a clip is drawn from: two of a studio, a bright room, a window beside the cloth.
 
     Their order gives the codes of the label `lighting`: add new ones at the end.
     """
 
     drawn = "drawn"
     held_out = "held-out"
+    room = "room"
+    window = "window"
 
 
 class Substrate(StrEnum):

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.cloth.shading import ALBEDOS, TOLERANCE
+from stickslip_blender.cloth.shading import ALBEDOS, FINE, TOLERANCE
 from stickslip_blender.raster import Window, _raster
 
 RANDOM = np.random.Generator(np.random.PCG64(0))
@@ -17,10 +17,10 @@ def _srgb(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def test_composed_pictures_are_what_the_formula_says() -> None:
-    """In numpy, and in double precision: gloss, light once and twice scattered, from light that has all three."""
+    """In numpy, and in double precision: gloss, light once and twice scattered, in parts of pixels."""
     height, width, count = 9, 12, 3
-    window, around = Window(2, 1, 8, 7), Window(5, 3, 12, 9)
-    gloss, once, twice = RANDOM.uniform(-0.02, 0.4, (3, height, width))
+    window, around = Window(1, 1, 4, 4).times(FINE), Window(5, 3, 12, 9)
+    gloss, once, twice = RANDOM.uniform(-0.02, 0.4, (3, FINE * height, FINE * width))
     light = np.stack([gloss + once * a + twice * a * a for a in ALBEDOS], axis=-1).astype(np.float16)
     coverage = RANDOM.uniform(0.0, 1.0, (6, 6)).astype(np.float32) * (RANDOM.random((6, 6)) < 0.7)
     seen, reflected, overall = (
@@ -44,18 +44,18 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
 
     at = [light[..., k].astype(np.float64) for k in range(3)]
     S, *rest = np.linalg.solve(np.vander(ALBEDOS, 3, increasing=True), np.stack([a.ravel() for a in at]))
-    D, I = (part.reshape(height, width, 1) for part in rest)  # noqa: E741
-    albedo = np.tile(overall.astype(np.float64), (height, width, 1))
-    albedo[around.slices] = reflected
-    cover = np.zeros((height, width, 1))
+    D, I = (part.reshape(*gloss.shape, 1) for part in rest)  # noqa: E741
+    albedo = np.tile(overall.astype(np.float64), (*gloss.shape, 1))
+    albedo[around.times(FINE).slices] = reflected.repeat(FINE, 0).repeat(FINE, 1)
+    cover = np.zeros((*gloss.shape, 1))
     cover[window.slices] = coverage[..., None]
     share = cover / np.maximum(cover + (1.0 - cover) * 0.3, 1e-12)
     over = np.zeros_like(albedo)
     over[window.slices] = seen
     albedo += share * (over - albedo)
-    expected = (S.reshape(height, width, 1) + (D + I * overall) * albedo).reshape(height, width, count, 3)
-    expected *= (1.0 + (1.0 - cover) * (floor - 1.0))[:, :, None]
-    expected = np.moveaxis(expected, 2, 0)
+    expected = (S.reshape(*gloss.shape, 1) + (D + I * overall) * albedo).reshape(*gloss.shape, count, 3)
+    expected *= (1.0 + (1.0 - cover) * (floor.repeat(FINE, 0).repeat(FINE, 1) - 1.0))[:, :, None]
+    expected = np.moveaxis(expected.reshape(height, FINE, width, FINE, count, 3).mean(axis=(1, 3)), 2, 0)
     np.testing.assert_allclose(pictures, _srgb(expected), atol=1.1)
 
 

@@ -53,13 +53,16 @@ def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
     assert trio("sha256:0") == ("sha256:0",)
 
 
-@pytest.mark.parametrize("substrate", ["matt", "polyester-mirror"])
-def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> None:
+@pytest.mark.parametrize(
+    ("material", "substrate"),
+    [("gray-interlock", "matt"), ("gray-interlock", "polyester-mirror"), ("white-swim-solid", "stainless-steel")],
+)
+def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substrate: str) -> None:
     look = ClothDragRender(
         rig="drag",
         rig_digest=rig_digest("drag"),
         quality="draft",
-        material="gray-interlock",
+        material=material,
         texture="plaid",
         viewpoint="calibrated",
         instants=(1,),
@@ -70,7 +73,7 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> Non
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
     clip = renderer.clip(
-        look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 16, 0.0, 16, (0.0, 0.0, 0.0))
+        look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, 0.0, 16, (0.0, 0.0, 0.0))
     )
     names = trio("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
@@ -78,5 +81,5 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, substrate: str) -> Non
     (reference,) = clip.references(pictures, 0.0)
     for channel, video in enumerate(videos):
         found = pooled([(reference.errors(video, channel), reference.regions)])
-        assert min(found.psnr) > 28.0, names[channel]
-        assert found.psnr[0] > 34.0, names[channel]
+        assert min(found.psnr) > 27.0, names[channel]
+        assert found.psnr[0] > 36.0, names[channel]

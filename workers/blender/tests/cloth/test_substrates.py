@@ -35,6 +35,9 @@ def test_held_out_lamps_are_not_among_those_to_train_with() -> None:
     usual, other = ([drawn_light(name, seed).numbers for seed in range(200)] for name in ("drawn", "held-out"))
     low, high = np.min(usual, axis=0), np.max(usual, axis=0)
     assert not ((low <= other) & (other <= high)).any()
+    studio, room, window = (drawn_light(name, 1).source for name in ("drawn", "room", "window"))
+    assert studio.surround < window.surround < room.surround
+    assert studio.diameter < window.diameter < room.diameter
 
 
 def test_marks_lie_still_on_the_floor() -> None:

@@ -27,6 +27,7 @@ from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
 from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene, Shot
+from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
@@ -42,8 +43,8 @@ if TYPE_CHECKING:
 
 _PREVIEW_SIDE = 160  # [px]
 
-_KEPT_SHADINGS = 4
-"""Shadings that a process keeps: 9 MB each at 30 frames."""
+_KEPT_SHADINGS = 2
+"""Shadings that a process keeps: 36 MB each at 30 frames."""
 
 Clip = npt.NDArray[np.uint8]
 Light = npt.NDArray[np.float16]
@@ -101,7 +102,7 @@ class ClipRenderer:
     labels: dict[str, Any]
 
     def shading(self, sampling: ClothSampling | None = None) -> Light:
-        """Trace all frames once for all textures, shape (frames, height, width, 3)."""
+        """Trace all frames once for all textures, shape (frames, FINE height, FINE width, 3)."""
         return np.stack([self.scene.shading(shot, sampling or self.sampling, self.seed) for shot in self.shots])
 
     def clips(self, shading: Light, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
@@ -268,7 +269,9 @@ def _shading(clip: ClipRenderer, sampling: ClothSampling, look: AnyLook, task: R
             kept[key] = clip.shading(sampling)
             workshop.keep_shading(key, encode_chunk(kept[key]))
         else:
-            kept[key] = np.empty((len(clip.shots), clip.camera.height, clip.camera.width, 3), dtype=np.float16)
+            kept[key] = np.empty(
+                (len(clip.shots), FINE * clip.camera.height, FINE * clip.camera.width, 3), dtype=np.float16
+            )
             decode_chunk(stored, kept[key])
         while len(kept) > _KEPT_SHADINGS:
             kept.popitem(last=False)

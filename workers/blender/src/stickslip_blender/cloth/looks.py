@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
@@ -102,12 +102,25 @@ _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
 }
 
 
-# azimuth, elevation [degree], power: what `drawn` trains on, and what no training light has.
-_RANGES: dict[str, tuple[tuple[float, float], ...]] = {
-    "drawn": ((-75.0, 15.0), (42.0, 62.0), (0.8, 1.25)),
-    "held-out": ((25.0, 80.0), (25.0, 40.0), (0.6, 0.8)),
+@dataclass(frozen=True)
+class Source:
+    """A sort of light: ranges that a lamp is drawn from, and what all its lamps have."""
+
+    ranges: tuple[tuple[float, float], ...]
+    """Azimuth, elevation [degree] and power over the nominal power."""
+    diameter: float = 0.5
+    """Of the lamp [m], which is 1.2 m from the cloth."""
+    surround: float = 0.012
+    """Radiance from all around, of which cameras see none: a studio has black curtains."""
+
+
+_SOURCES = {
+    "drawn": Source(((-75.0, 15.0), (42.0, 62.0), (0.8, 1.25))),
+    "held-out": Source(((25.0, 80.0), (25.0, 40.0), (0.6, 0.8))),  # what no training light has
+    "room": Source(((-75.0, 15.0), (55.0, 80.0), (0.5, 0.8)), diameter=1.6, surround=0.45),
+    "window": Source(((-160.0, -115.0), (20.0, 34.0), (0.9, 1.3)), diameter=1.2, surround=0.12),
 }
-LIGHTS = tuple(_RANGES)
+LIGHTS = tuple(_SOURCES)
 """Names of the ranges that lights are drawn from."""
 
 
@@ -121,20 +134,22 @@ class Light:
     """Above the floor [degree]."""
     power: float
     """Over the nominal power."""
+    source: Source
 
     @property
     def numbers(self) -> list[float]:
         """The numbers of the label: azimuth, elevation, power."""
-        return list(astuple(self))
+        return [self.azimuth, self.elevation, self.power]
 
 
 def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Light:
-    """Draw a lamp from a named range, or from custom ones."""
+    """Draw a lamp from a named range, or from custom ones in a studio."""
     if custom is not None:
-        ranges: tuple[tuple[float, float], ...] = (custom.azimuth, custom.elevation, custom.power)
-    elif name in _RANGES:
-        ranges = _RANGES[name]
+        source = Source((custom.azimuth, custom.elevation, custom.power))
+    elif name in _SOURCES:
+        source = _SOURCES[name]
     else:
         raise ValueError(f"light must be one of {', '.join(LIGHTS)}; got {name!r}")
     uniform = np.random.Generator(np.random.PCG64(seed)).uniform
-    return Light(*(float(uniform(low, high)) for low, high in ranges))
+    azimuth, elevation, power = (float(uniform(low, high)) for low, high in source.ranges)
+    return Light(azimuth, elevation, power, source)

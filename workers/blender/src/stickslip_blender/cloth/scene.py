@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.geometry import Geometry, mirrored
+from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.looks import Light, Look
-from stickslip_blender.cloth.shading import ALBEDOS, Composer
+from stickslip_blender.cloth.shading import ALBEDOS, FINE, Composer
 from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.cycles.engine import ClothSampling, Sampling, new_scene, set_sampling
 from stickslip_blender.cycles.environment import set_curtains
@@ -26,19 +26,19 @@ from stickslip_blender.cycles.objects import (
     add_view,
     move_mesh,
     set_inputs,
+    set_roughness,
     set_view,
 )
 from stickslip_blender.cycles.pixels import FrameReader
 from stickslip_blender.raster import Window, projected, window_about
 
 _LAMP_DISTANCE = 1.2  # [m]
-_LAMP_SIZE = 0.5  # [m], diameter
 _LAMP_POWER = 24.0  # [W]
-_AMBIENT = 0.012  # radiance of the black curtains around the scene; cameras see none of it
 _FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED, _RAMP = 4, 8  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
-_MIRRORING = 0.3  # roughness below which a floor's mirror image is in the window too
+_DISCARDED, _RAMP = 2, 8  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
+_MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
+_MIRROR_PATHS = 4  # times as many paths for the frame then
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,9 @@ class ClothScene:
         self.geometry = geometry
         self.composer = Composer(geometry)
         self._scene = new_scene(max_bounces=3, diffuse_bounces=2, light_tree=False)  # one lamp: nothing to choose
-        set_curtains(self._scene, _AMBIENT)
-        self._lamp = Lamp(self._scene, _LAMP_SIZE)
+        cycles = self._scene.cycles  # what else meets gloss is soft: set_roughness
+        cycles.caustics_reflective, cycles.blur_glossy, cycles.sample_clamp_indirect = True, 0.0, 0.0
+        self._lamp = Lamp(self._scene)
         self._floor = None
         if geometry.surroundings.floor is not None:
             self._floor = add_material(add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor")
@@ -71,7 +72,7 @@ class ClothScene:
         for prop in geometry.surroundings.props:
             mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces)
             if prop.sheet is None:
-                add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0), Roughness=prop.roughness)
+                set_roughness(add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0)), prop.roughness)
             else:
                 fabric = Fabric(mesh, prop.sheet.uv, np.concatenate(prop.faces).astype(np.int32))
                 fabric.set_look(**_shader(prop.sheet.look))
@@ -85,30 +86,34 @@ class ClothScene:
         set_view(self._scene, camera)
         self._camera, self._light, self.substrate = camera, light, substrate
         self._fabric.set_look(**_shader(look))
-        self._lamp.set_power(_LAMP_POWER * light.power)
+        self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
+        set_curtains(self._scene, light.source.surround)
         if self._floor is not None:
+            set_roughness(self._floor, substrate.roughness)
             set_inputs(
                 self._floor,
                 Base_Color=(*(substrate.albedo,) * 3, 1.0),
-                Roughness=substrate.roughness,
                 Metallic=substrate.metallic,
                 Specular_IOR_Level=substrate.specular,
             )
 
     def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
-        """Render one instant for all textures: linear light at ALBEDOS, shape (height, width, 3).
+        """Render one instant for all textures: linear light at ALBEDOS, shape (FINE height, FINE width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not flicker.
         """
         self._fabric.set_color(ALBEDOS)
         self._place(shot)
-        set_sampling(self._scene, Sampling(sampling.frame, "plain", seed))
-        light = self._reader.read_light()
+        paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
+        set_sampling(self._scene, Sampling(paths, "plain", seed))
+        light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
         part = self.window(shot, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed, noise=sampling.noise))
-        down, across = _share(part.top, part.bottom, len(light)), _share(part.left, part.right, light.shape[1])
-        finer = self._reader.read_light(part).astype(np.float32) - light[part.slices]
-        light[part.slices] += np.minimum.outer(down, across)[..., None] * finer
+        down = _share(part.top, part.bottom, self._camera.height)
+        across = _share(part.left, part.right, self._camera.width)
+        here = part.times(FINE).slices
+        finer = self._reader.read_light(part, FINE).astype(np.float32) - light[here]
+        light[here] += np.minimum.outer(down, across)[..., None] * finer
         return light
 
     def direct(
@@ -121,10 +126,8 @@ class ClothScene:
         return self._reader.read_light(window)
 
     def window(self, shot: Shot, margin: int = _WINDOW_MARGIN) -> Window:
-        """Return the part of the frame that shows the cloth, and its image in a floor that mirrors it."""
-        cloth, floor = shot.points[: self.geometry.cloth_vertices], self.geometry.surroundings.floor
-        if self.substrate.roughness < _MIRRORING and floor is not None:
-            cloth = np.concatenate([cloth, mirrored(cloth, floor)])
+        """Return the part of the frame that shows the cloth."""
+        cloth = shot.points[: self.geometry.cloth_vertices]
         return window_about(projected(self._camera, cloth), self._camera, margin)
 
     def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
@@ -141,8 +144,8 @@ class ClothScene:
 
 
 def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
-    """Return the share of a window [low, high) in a frame of a size: a smooth step at each end inside it [px]."""
-    inside = np.arange(low, high) + 0.5
+    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels: smooth at its ends."""
+    inside = low + (np.arange(FINE * (high - low)) + 0.5) / FINE
     ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside
     step = np.clip((np.minimum(*ends) - _DISCARDED) / _RAMP, 0.0, 1.0)
     return np.asarray(step * step * (3.0 - 2.0 * step), dtype=np.float32)

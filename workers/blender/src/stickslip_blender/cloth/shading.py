@@ -9,9 +9,12 @@ A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture i
 
     L(p) = S + (D + I m) A(p)     m: mean albedo of the cloth in sight, for light comes from elsewhere on the cloth
 
-in linear light, for each of the texture's colours. Off the cloth D is light that the cloth threw there: A is m, or what
-a floor that mirrors shows of the cloth, blurred as much as its roughness does. Marks of the floor and colours of props
-lie on top, as factors of their light: whatever is not the cloth is grey in Cycles.
+in linear light, for each of the texture's colours. The cloth is rendered with FINE x FINE pixels in each of a picture:
+where light and print change within one, the mean of their products is not the product of their means.
+
+Off the cloth D is light that the cloth threw there: A is m, or what a floor that mirrors shows of the cloth, blurred as
+much as its roughness does. Marks of the floor and colours of props lie on top, as factors of their light: whatever is
+not the cloth is grey in Cycles.
 
 Each level of a picture is within TOLERANCE of the exact value, and chosen so that the colours of grey are equal: clips
 are a tenth smaller for it.
@@ -27,10 +30,13 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.substrates import Substrate
-from stickslip_blender.raster import Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
+from stickslip_blender.raster import GRID, Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
 
 ALBEDOS = (0.0, 0.5, 0.9)
 """The cloth's base colour in a shading."""
+
+FINE = 2
+"""Pixels of a shading across one of a picture, and down."""
 
 TOLERANCE: int = _raster.TOLERANCE
 """Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/composition.hpp sets it."""
@@ -70,12 +76,13 @@ class Composer:
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
     ) -> Sight:
-        """Compose one frame's shading (height, width, 3) with all textures, into `pictures`.
+        """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
         8-bit sRGB, chosen as in raster/composition.hpp, shape (textures, height, width, 3).
         """
-        seen = see(projected(camera, points), self._geometry.triangles, self._window(points, camera))
+        window, parts = self._window(points, camera).times(FINE), _finer(camera)
+        seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
         reflected, around = np.empty((0, 0, colors), dtype=np.float32), Window(0, 0, 0, 0)
@@ -94,7 +101,7 @@ class Composer:
             _reflectance(substrate),
             pictures,
         )
-        frame = camera.width * camera.height
+        frame = parts.width * parts.height
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return Sight(float(sight.coverage.sum()) / frame, float(min(visible, 1.0)))
 
@@ -170,6 +177,13 @@ class Composer:
         color = blurred[..., 1:] / np.maximum(share, 1e-6)
         mean = overall.ravel()
         return (mean + known * (color - mean)).astype(np.float32), window
+
+
+def _finer(camera: Camera) -> Camera:
+    """Return a camera with FINE x FINE pixels in each."""
+    numbers = {name: FINE * getattr(camera, name) for name in ("width", "height", "fx", "fy")}
+    centre = {name: FINE * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
+    return camera.model_copy(update=numbers | centre)
 
 
 def _reflectance(substrate: Substrate) -> float:

@@ -39,11 +39,11 @@ class ClothSampling:
     frame: int
     """Paths per pixel in the whole frame."""
     window: int
-    """Most paths per pixel in the window that the cloth is in."""
+    """Most paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a picture."""
     noise: float
     """Noise of a pixel of the window at which it gets no more; 0: all get the same number."""
     usual: int
-    """Paths per pixel that the window gets on average, for a dark floor."""
+    """Paths per pixel of a picture that the window gets on average, for a dark floor."""
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
@@ -62,10 +62,10 @@ SAMPLING = {
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
-    Quality.preview: ClothSampling(1, 3, 0.0, 3, (22.0, 19.0, 20.0)),
-    Quality.draft: ClothSampling(2, 32, 0.1, 9, (27.0, 24.0, 23.0)),
-    Quality.standard: ClothSampling(2, 128, 0.03, 24, (30.0, 27.0, 25.0)),
-    Quality.high: ClothSampling(8, 512, 0.015, 90, (31.0, 28.0, 26.0)),
+    Quality.preview: ClothSampling(1, 1, 0.0, 4, (24.0, 20.0, 21.0)),
+    Quality.draft: ClothSampling(2, 3, 0.0, 12, (30.0, 27.0, 25.0)),
+    Quality.standard: ClothSampling(2, 10, 0.0, 40, (34.0, 30.0, 28.0)),
+    Quality.high: ClothSampling(8, 128, 0.03, 100, (35.0, 31.0, 29.0)),
 }
 _FEWEST = 8  # paths of a pixel before its noise is estimated
 REFERENCE = Sampling(samples=256, seed=1)

@@ -6,8 +6,10 @@ in memory, of which a killed process leaves nothing behind.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import sys
+import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +22,13 @@ import numpy.typing as npt
 from stickslip_blender.cycles.blender import import_bpy
 from stickslip_blender.cycles.exr import read_exr
 from stickslip_blender.raster import Window
+
+FIRST_SECONDS = 300.0
+"""What a first frame may take besides its paths: a GPU may load its kernels [s]."""
+LEAST_SECONDS = 60.0
+"""What any later frame may take besides its paths, on a machine that has a lot else to do [s]."""
+_PATH_SECONDS = 5e-6  # of a path before one is measured: a slow core
+_SLOWER = 20.0  # times as long as its paths took before, and a frame hangs
 
 _LEVELS = 65536  # of the table that encodes linear light
 
@@ -54,37 +63,57 @@ class FrameReader:
         render.use_stamp = False
         render.use_file_extension = False
         render.filepath = str(self._path)
+        self._besides, self._path_seconds = FIRST_SECONDS, _PATH_SECONDS
 
-    def read_light(self, window: Window | None = None) -> npt.NDArray[np.float16]:
+    def read_light(self, window: Window | None = None, fine: int = 1) -> npt.NDArray[np.float16]:
         """Render the scene as it stands, or a window of it: linear light, not clipped, shape (height, width, 3).
 
-        A window has the very values that it would have in the whole frame.
+        A window has the very values that it would have in the whole frame. Each pixel is rendered as fine x fine ones.
         """
-        return read_exr(self._rendered("RGB", window), "RGB")
+        return read_exr(self._rendered("RGB", window, fine), "RGB")
 
     def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
         """Render as `read_light` does, before nothing: light times coverage, and coverage, shape (height, width, 4)."""
         return read_exr(self._rendered("RGBA", window), "RGBA")
 
-    def _rendered(self, channels: Literal["RGB", "RGBA"], window: Window | None) -> bytes:
+    def _rendered(self, channels: Literal["RGB", "RGBA"], window: Window | None, fine: int = 1) -> bytes:
+        self._scene.render.resolution_percentage = 100 * fine
         self._scene.render.film_transparent = channels == "RGBA"
         self._scene.render.image_settings.color_mode = channels
-        _set_window(self._scene.render, window)
+        _set_window(self._scene.render, window, fine)
         self._path.write_bytes(b"")  # so that a frame is never an old one
-        with _quiet():
+        with _quiet(), self._watched(window, fine):
             import_bpy().ops.render.render(write_still=True)
         return self._path.read_bytes()
 
+    @contextmanager
+    def _watched(self, window: Window | None, fine: int) -> Iterator[None]:
+        """End the process if a frame takes far longer than its paths took in the frames before."""
+        render = self._scene.render
+        here = window or Window(0, 0, render.resolution_x, render.resolution_y)
+        size = fine**2 * max((here.right - here.left) * (here.bottom - here.top), 1)
+        paths, start = size * self._scene.cycles.samples, time.monotonic()
+        limit = self._besides + _SLOWER * self._path_seconds * paths
+        faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__ or 2)  # Blender keeps Python's lock
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+        took = (time.monotonic() - start) / paths
+        first = self._besides == FIRST_SECONDS
+        self._besides, self._path_seconds = LEAST_SECONDS, took if first else max(took, self._path_seconds)
 
-def _set_window(render: Any, window: Window | None) -> None:
+
+def _set_window(render: Any, window: Window | None, fine: int) -> None:
     render.use_border = render.use_crop_to_border = window is not None
     if window is not None:
         width, height = render.resolution_x, render.resolution_y
-        # Blender truncates to whole pixels: half a pixel keeps rounding out of it. It counts rows from below.
-        render.border_min_x = (window.left + 0.5) / width
-        render.border_max_x = (window.right + 0.5) / width
-        render.border_min_y = (height - window.bottom + 0.5) / height
-        render.border_max_y = (height - window.top + 0.5) / height
+        # Blender truncates to whole pixels: half of one keeps rounding out of it. It counts rows from below.
+        half = 0.5 / fine
+        render.border_min_x = (window.left + half) / width
+        render.border_max_x = (window.right + half) / width
+        render.border_min_y = (height - window.bottom + half) / height
+        render.border_max_y = (height - window.top + half) / height
 
 
 @contextmanager

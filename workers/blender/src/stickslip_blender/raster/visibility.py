@@ -43,6 +43,10 @@ class Window:
         """Index of the window in a frame (height, width, ...)."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    def times(self, fine: int) -> Window:
+        """Return the same part where each pixel is fine x fine ones."""
+        return Window(fine * self.left, fine * self.top, fine * self.right, fine * self.bottom)
+
     @property
     def place(self) -> tuple[int, int, int, int]:
         """Left, top, width and height, as the compiled rasteriser takes them."""
