@@ -245,9 +245,13 @@ def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> No
     after = client.post("/v1/jobs:validate", json=rods(gamma=(1.0, 2.0, 3.0))).json()
     assert (after["sample_count"], after["cached_count"]) == (6, 4 + 4 + 2)
     assert after["bytes_estimate"] > 6 * 4 * 224 * 224 * 3
-    assert before["core_seconds"] is None
-    assert after["core_seconds"]["seconds"] == pytest.approx(6 + 6 + 4)  # PretendWorker reports a second each
-    assert after["core_seconds"]["low"] < 16 < after["core_seconds"]["high"]
+    usual, costs = before["estimate"], after["estimate"]
+    assert (usual["measured"], usual["wall_seconds"]) == ([], None)
+    assert 0.1 < usual["cpu_seconds"]["median"] < 10
+    assert costs["measured"] == ["pack", "simulate", "render"]
+    assert costs["cpu_seconds"]["median"] == pytest.approx(6 + 6 + 3, abs=1)  # PretendWorker reports a second each
+    assert costs["cpu_seconds"]["low"] < 15 < costs["cpu_seconds"]["high"]
+    assert costs["wall_seconds"]["median"] == pytest.approx(costs["cpu_seconds"]["median"] / worker.slots)
     assert len(client.get("/v1/jobs").json()["items"]) == 1
 
 

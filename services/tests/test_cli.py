@@ -180,6 +180,9 @@ def test_without_a_coordinator_it_fails_at_once_and_validates_all_the_same(tmp_p
     assert "samples                    4" in valid.stdout
     assert "No coordinator answers" in valid.stderr
     wrong = write(tmp_path / "wrong.yaml", rods(gamma=(-1.0,)))
+    costs = json.loads(runner.invoke(app, ["validate", str(spec), "--json"], env=env).stdout)["estimate"]
+    assert costs["cpu_seconds"]["low"] < costs["cpu_seconds"]["median"] < costs["cpu_seconds"]["high"]
+    assert "CPU time, render" in valid.stdout
     invalid = runner.invoke(app, ["validate", str(wrong)], env=env)
     assert invalid.exit_code == 1
     assert "axes.gamma" in invalid.stderr

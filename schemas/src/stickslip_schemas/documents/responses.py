@@ -12,6 +12,7 @@ from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.costs import Estimate
 
 T = TypeVar("T")
 
@@ -108,9 +109,9 @@ class Validation(Document):
     stored_bytes_estimate: int | None = Field(
         description="file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
     )
-    core_seconds: Eta | None = Field(
-        description="time of one core for all tasks, without cached results, from tasks of this kind that the service "
-        "has measured, with its 80 % interval [s]; null: it has measured none"
+    estimate: Estimate = Field(
+        description="time of all tasks, without cached results: of stages that this service has measured, how long "
+        "such tasks held a slot; of others, the records of the package"
     )
     certificate: Sha256 | None = Field(description="certificate that covers the dataset; null: none")
     refusal: str | None = Field(

@@ -9,7 +9,7 @@ from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.jobs import JobSpec, Quality, Render, SeedRule, Simulation
+from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render, SeedRule, Simulation
 
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
@@ -92,6 +92,12 @@ class RodHangSpec(JobSpec):
         if self.views is None:
             return None
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
+
+    @property
+    def usual_costs(self) -> Costs:
+        """Usual CPU times; four views are a render."""
+        view = {"preview": 0.016, "draft": 0.026, "standard": 0.055, "high": 0.18}[self.quality]
+        return Costs(simulate=0.005, render=4 * view)
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras of the array `views`, in its order."""

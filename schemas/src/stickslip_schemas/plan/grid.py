@@ -45,6 +45,8 @@ class Counts:
     samples: int
     simulations: int
     renders: int
+    shadings: int
+    """Renders that differ in more than the axis of variants."""
     shards: int
     expected_splits: dict[str, int]
     """Samples by split if each split got exactly its share; splits are drawn, so real numbers differ a little."""
@@ -69,6 +71,7 @@ def count(spec: JobSpec) -> Counts:
         samples=spec.sample_count,
         simulations=_distinct(spec, physical),
         renders=0 if spec.render_settings() is None else _distinct(spec, seen),
+        shadings=0 if spec.render_settings() is None else _distinct(spec, seen - {spec.variant_axis}),
         shards=ceil(spec.sample_count / spec.samples_per_shard),
         expected_splits={name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)},
     )

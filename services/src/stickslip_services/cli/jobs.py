@@ -1,5 +1,7 @@
 """Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise and cancel."""
 
+import json
+import os
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
@@ -11,6 +13,7 @@ from rich.table import Table
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import FileUpload, JobDetail, TextureEntry
 from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.plan.costs import Estimate, estimated
 from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -49,9 +52,7 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
             _upload(client, spec, files)
             answer = client.validate(document)
     except UnreachableError:
-        if as_json:
-            raise
-        return _validate_offline(spec, url)
+        return _validate_offline(spec, url, as_json=as_json)
     refused = answer.refusal is not None
     if as_json:
         print_json(answer)
@@ -61,7 +62,7 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     shown.add_row("tasks cached", f"{cached} of {answer.task_count}")
     if answer.stored_bytes_estimate is not None:
         shown.add_row("size of the files, about", size(answer.stored_bytes_estimate))
-    shown.add_row("time of one core, without what is cached", wording.eta(answer.core_seconds))
+    _add_costs(shown, answer.estimate)
     shown.add_row("certificate", answer.certificate or "none")
     console().print(shown)
     if refused:
@@ -70,12 +71,26 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
 
 
-def _validate_offline(spec: JobSpec, url: str) -> None:
-    console().print(_counts(spec))
-    say(
-        f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown. "
-        "To start one on this machine: stickslip up"
+def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
+    costs = estimated(spec, count(spec), {}, os.cpu_count() or 1)
+    if as_json:
+        return typer.echo(json.dumps({"estimate": costs.model_dump(mode="json")}, indent=2))
+    shown = _counts(spec)
+    _add_costs(shown, costs)
+    console().print(shown)
+    return say(
+        f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown, and the "
+        "wall time is that of all cores of this machine. To start one here: stickslip up"
     )
+
+
+def _add_costs(shown: Table, costs: Estimate) -> None:
+    for stage, interval in costs.stages.items():
+        source = "measured by this service" if stage in costs.measured else "by the package's records"
+        shown.add_row(f"CPU time, {stage}", f"{wording.interval(interval)}, {source}")
+    shown.add_row("CPU time, all", wording.interval(costs.cpu_seconds))
+    wall = "unknown: no worker is there" if costs.wall_seconds is None else wording.interval(costs.wall_seconds)
+    shown.add_row(f"wall time, {costs.slots} at once", wall)
 
 
 def _counts(spec: JobSpec) -> Table:

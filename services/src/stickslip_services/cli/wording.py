@@ -2,6 +2,7 @@
 
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Eta, Progress, StageProgress
+from stickslip_schemas.plan.costs import Interval
 
 from stickslip_services.units import duration
 
@@ -24,6 +25,11 @@ def eta(value: Eta | None) -> str:
     if value is None:
         return "unknown"
     return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
+
+
+def interval(value: Interval) -> str:
+    """Return a time with its range."""
+    return f"about {duration(value.median)} ({duration(value.low)} to {duration(value.high)})"
 
 
 def state(value: JobState) -> str:

@@ -7,9 +7,10 @@ from itertools import islice
 from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.documents.responses import Eta, JobDetail, Validation
+from stickslip_schemas.documents.responses import JobDetail, Validation
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.costs import Interval, estimated
 from stickslip_schemas.plan.grid import Counts, count, grid
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -28,7 +29,7 @@ from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.ledger import Ledger
 from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, terms_for
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
-from stickslip_services.queue.workers import NO_WORKER
+from stickslip_services.queue.workers import NO_WORKER, alive_workers
 from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
 
 LOOKED_UP = 10_000
@@ -136,7 +137,8 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         except (KindNotAvailableError, PresetNotCertifiedError) as error:
             refusal = str(error)
         compression = _compression(connection, spec.kind)
-        core_seconds = _core_seconds(connection, spec, counts)
+        measured = _measured(connection, spec, counts)
+        slots = sum(worker.condition.slots for worker in alive_workers(context, connection))
     return Validation(
         spec=spec,
         spec_digest=spec.content_digest,
@@ -148,25 +150,25 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         cached_count=None if terms is None else _cached(database, spec, terms),
         bytes_estimate=raw,
         stored_bytes_estimate=None if compression is None else round(raw * compression),
-        core_seconds=core_seconds,
+        estimate=estimated(spec, counts, measured, slots),
         certificate=None if terms is None else terms.certificate,
         refusal=refusal,
     )
 
 
-def _core_seconds(connection: Connection, spec: JobSpec, counts: Counts) -> Eta | None:
-    """Return what all tasks cost together, from what was measured of such tasks; None where nothing was."""
+def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Stage, Interval]:
+    """Return what the stages cost of which tasks were measured."""
     costs, points = read_costs(connection), list(islice(grid(spec), LOOKED_UP))
-    work = {}
+    work = {Stage.pack: [StageWork(counts.shards, timings_of(costs, Stage.pack, spec.kind, ""))]}
     for stage, number in ((Stage.simulate, counts.simulations), (Stage.render, counts.renders)):
         groups = Counter(spec.cost_group(stage, point) for point in points)
         work[stage] = [
             StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))
             for group, share in groups.items()
         ]
-    shards = counts.tasks - counts.simulations - counts.renders
-    work[Stage.pack] = [StageWork(shards, timings_of(costs, Stage.pack, spec.kind, ""))]
-    return estimate(work, slots=1)
+    known = [stage for stage, items in work.items() if all(item.timings is not None for item in items)]
+    found = [(stage, estimate({stage: work[stage]}, slots=1)) for stage in known]
+    return {stage: Interval(median=eta.seconds, low=eta.low, high=eta.high) for stage, eta in found if eta is not None}
 
 
 def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:

@@ -1,0 +1,58 @@
+"""What a job costs: from tasks that a service has measured or, of other stages, from the records of the package.
+
+The usual costs of a kind were fitted to measured jobs of 1 to 768 samples on two shared virtual cores. Another machine,
+fabric or motion makes them larger or smaller: the 80 % intervals say by how much, and are guessed.
+"""
+
+from collections.abc import Mapping
+
+from pydantic import Field
+
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.plan.grid import Counts
+from stickslip_schemas.spec.jobs import JobSpec
+
+PACK_SECONDS = 0.03
+"""CPU time of packing a sample [s]."""
+PUBLISH_SECONDS = 0.1
+"""CPU time of publishing a shard [s]."""
+
+
+class Interval(Document):
+    """A time [s]; 80 % of jobs lie from `low` to `high`."""
+
+    median: float
+    low: float
+    high: float
+
+
+class Estimate(Document):
+    """What a job costs without cached results."""
+
+    cpu_seconds: Interval
+    wall_seconds: Interval | None = Field(description="on the slots of the workers that are there; null: none is there")
+    slots: int = Field(description="tasks that can run at once")
+    stages: dict[Stage, Interval] = Field(description="CPU time by stage [s]")
+    measured: tuple[Stage, ...] = Field(description="stages whose cost this service has measured")
+
+
+def estimated(spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval], slots: int) -> Estimate:
+    """Return what a job costs; `measured` are the CPU times of stages that a service knows [s]."""
+    usual = spec.usual_costs
+    shaded = 0.0 if not counts.renders else usual.start + counts.shadings * usual.shade + counts.renders * usual.render
+    stages = {
+        Stage.simulate: _within(counts.simulations * usual.simulate, usual.unsure),
+        Stage.render: _within(shaded, 2.0),
+        Stage.pack: _within(counts.samples * PACK_SECONDS, 2.0),
+        Stage.publish: _within(counts.shards * PUBLISH_SECONDS, 2.0),
+    } | dict(measured)
+    totals = {name: sum(getattr(stage, name) for stage in stages.values()) for name in Interval.model_fields}
+    wall = Interval(**{name: total / slots for name, total in totals.items()}) if slots else None
+    return Estimate(
+        cpu_seconds=Interval(**totals), wall_seconds=wall, slots=slots, stages=stages, measured=tuple(measured)
+    )
+
+
+def _within(seconds: float, unsure: float) -> Interval:
+    return Interval(median=seconds, low=seconds / unsure, high=seconds * unsure)

@@ -1,0 +1,67 @@
+"""What a job costs: usual costs of the kinds, and what a service has measured in their place."""
+
+from typing import Any
+
+import pytest
+from stickslip_schemas.base.states import Stage
+from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.costs import Estimate, Interval, estimated
+from stickslip_schemas.plan.grid import count
+
+
+def estimate(slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any) -> Estimate:
+    spec = job_spec_adapter.validate_python(document)
+    return estimated(spec, count(spec), measured or {}, slots)
+
+
+def rods(number: int, quality: str) -> dict[str, Any]:
+    gamma = {"type": "linspace", "start": 100.0, "stop": 1300.0, "num": number}
+    return {"kind": "rod_hang", "axes": {"gamma": gamma, "phi0": 1.0, "phi1": 6.0}, "quality": quality}
+
+
+def clips(*textures: str, mu: Any = 0.3, **more: Any) -> dict[str, Any]:
+    axes = {"material": "gray-interlock", "mu": mu, "texture": list(textures), "viewpoint": "left"}
+    return {"kind": "cloth_drag", "axes": axes, **more}
+
+
+@pytest.mark.parametrize(
+    ("document", "stage", "cost"),
+    [
+        (rods(24, "high"), Stage.render, 16.9),
+        (rods(20, "draft"), Stage.render, 2.1),
+        (clips("dots", frames=10), Stage.render, 9.1),
+        (clips("dots", "plaid", "floral", "checker", frames=10), Stage.render, 11.9),
+        (clips("dots", frames=10, quality="high"), Stage.render, 18.3),
+        (clips("dots", "checker", mu=[0.2, 0.6], frames=30, quality="draft"), Stage.render, 51.0),
+        (clips("dots", "checker", mu=[0.2, 0.6], mesh=21, preset="fast"), Stage.simulate, 6.0),
+        (clips("dots", mesh=41), Stage.simulate, 31.0),
+    ],
+)
+def test_usual_costs_fit_the_jobs_that_they_were_taken_from(document: Any, stage: Stage, cost: float) -> None:
+    """Not a check of accuracy: these jobs gave the numbers. It holds the units and the counts."""
+    found = estimate(**document).stages[stage]
+    assert found.median == pytest.approx(cost, rel=0.4)
+    assert found.low < cost < found.high
+
+
+def test_what_was_measured_replaces_what_is_usual() -> None:
+    known = Interval(median=100.0, low=90.0, high=120.0)
+    costs = estimate(slots=4, measured={Stage.simulate: known}, **clips("dots", frames=10))
+    assert costs.stages[Stage.simulate] == known
+    assert costs.measured == (Stage.simulate,)
+    assert costs.cpu_seconds.median == pytest.approx(sum(stage.median for stage in costs.stages.values()))
+    assert costs.wall_seconds is not None
+    assert costs.wall_seconds.high == pytest.approx(costs.cpu_seconds.high / 4)
+    assert estimate(slots=0, **rods(2, "draft")).wall_seconds is None
+
+
+def test_textures_share_a_shading_and_nothing_is_rendered_without_views() -> None:
+    one, four = (estimate(**clips(*names)).stages[Stage.render].median for names in (["dots"], ["dots", "plaid"]))
+    assert four < 1.5 * one
+    assert estimate(**(rods(20, "high") | {"views": None})).stages[Stage.render].high == 0.0
+
+
+def test_an_unknown_scene_says_how_little_is_known() -> None:
+    axes = {"texture": "dots", "viewpoint": "front"}
+    costs = estimate(kind="cloth_scene", scene="turning-ball", axes=axes).stages[Stage.simulate]
+    assert costs.high == pytest.approx(100 * costs.low)
