@@ -45,7 +45,7 @@ CASES: dict[str, str] = {
             newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy
             stepping.smooth_iterations stepping.strained_long""",
         "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at control.newton_work
-            control.novelty control.reject_at control.rejected_work factor.pool""",
+            control.looks control.novelty control.reject_at control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",

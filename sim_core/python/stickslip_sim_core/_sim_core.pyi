@@ -190,6 +190,12 @@ class StepReport:
         """Least radius of a skeleton that cloth touched, in cells."""
 
     @property
+    def uneven(self) -> float:
+        """
+        Distance of what drives the cloth from an even motion within a step of the controller [m].
+        """
+
+    @property
     def least_distance(self) -> float:
         """
         Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.
@@ -204,7 +210,7 @@ class ClothSolver:
 
     def step(self, dt: float, gravity: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], held: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], surfaces: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], bodies: Sequence[tuple[int, Sequence[float], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], damping: float) -> StepReport: ...
 
-    def advance(self, time: float, event: float, motion: Callable[[float], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Sequence[tuple[int, Sequence[float], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], float]]) -> tuple[float, StepReport]: ...
+    def advance(self, time: float, event: float, motion: Callable[[float], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Sequence[tuple[int, Sequence[float], Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], float, Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='F')]]], float]], path: Callable[[Sequence[float]], tuple[Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C')]]]) -> tuple[float, StepReport]: ...
 
     def momentum_rate(self) -> Annotated[NDArray[numpy.float64], dict(shape=(3), order='C')]: ...
 
@@ -229,10 +235,6 @@ class ClothSolver:
     def stiffness_times(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], v: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]: ...
 
     def softest(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')]) -> float: ...
-
-    def part_error(self, sticking: Sequence[int], dt: float) -> tuple[float, float]: ...
-
-    def factor_error(self, positions: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C')], dt: float) -> float: ...
 
     def phases(self) -> tuple[float, float, float, float]: ...
 

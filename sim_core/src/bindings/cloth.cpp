@@ -33,6 +33,8 @@ using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
 using MotionCallback =
     std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
 
+using PathCallback = std::function<std::pair<Points3, decltype(Track::poses)>(const std::vector<double>& times)>;
+
 struct DriveNow {
   Points3 gravity, held, surfaces;
   std::vector<Body> bodies;
@@ -91,6 +93,8 @@ void bind_cloth(nb::module_& m) {
       .def_ro("sliding", &StepReport::sliding)
       .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear a force.")
       .def_ro("sharpest", &StepReport::sharpest, "Least radius of a skeleton that cloth touched, in cells.")
+      .def_ro("uneven", &StepReport::uneven,
+              "Distance of what drives the cloth from an even motion within a step of the controller [m].")
       .def_ro("least_distance", &StepReport::least_distance,
               "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
@@ -138,18 +142,23 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
-          [](ClothSolver& self, double time, double event, const MotionCallback& motion) {
+          [](ClothSolver& self, double time, double event, const MotionCallback& motion, const PathCallback& path) {
             DriveNow now;
             nb::gil_scoped_release release;
-            const StepReport report = self.advance(time, event, [&](double at) -> Drive {
+            const auto drive = [&](double at) -> Drive {
               nb::gil_scoped_acquire acquire;
               auto [gravity, held, surfaces, bodies, damping] = motion(at);
               now = {gravity, held, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.surfaces, now.bodies, damping};
+            };
+            const StepReport report = self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
+              nb::gil_scoped_acquire acquire;
+              auto [points, poses] = path(times);
+              return {points, poses};
             });
             return std::make_tuple(time, report);
           },
-          "time"_a, "event"_a, "motion"_a)
+          "time"_a, "event"_a, "motion"_a, "path"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
@@ -172,8 +181,6 @@ void bind_cloth(nb::module_& m) {
           "positions"_a)
       .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "v"_a)
       .def("softest", &ClothSolver::softest, "positions"_a)
-      .def("part_error", &ClothSolver::part_error, "sticking"_a, "dt"_a)
-      .def("factor_error", &ClothSolver::factor_error, "positions"_a, "dt"_a)
       .def("phases",
            [](const ClothSolver& self) {
              const ClothPhases p = self.phases();

@@ -10,6 +10,8 @@ namespace {
 
 // Share of an interval by which instants differ that rounding has parted.
 constexpr double same_instant = 1e-9;
+// What accelerates by a is a dt^2 from where it was predicted, and a dt^2/8 from an even motion between the ends.
+constexpr double even_to_predicted = 8.0;
 
 int level_of(int steps, const char* name) {
   int level = 0;
@@ -24,12 +26,12 @@ StepController::StepController(Stepper& stepper, const StepControl& control, con
     : stepper_(stepper),
       control_(control),
       constants_(constants),
-      finest_(level_of(control.finest, "finest")),
-      last_(finest_ + constants.halvings),
+      finest_(std::isfinite(control.error) ? level_of(control.finest, "finest") : 0),
+      last_(std::isfinite(control.error) ? finest_ + constants.halvings : 0),
       level_(finest_),
       tick_(ticks(0)),
       cost_(last_ + 1, 0.0) {
-  if (!(control.error > 0.0) || !std::isfinite(control.error)) refuse("error: must be finite and > 0");
+  if (!(control.error > 0.0)) refuse("error: must be > 0");
   if (!(control.longest > 0.0) || !std::isfinite(control.longest)) refuse("longest: must be finite and > 0");
 }
 
@@ -63,7 +65,7 @@ void StepController::begin_interval(double time, double event) {
   tick_ = 0;
 }
 
-StepReport StepController::advance(double& time, double event, const Motion& motion) {
+StepReport StepController::advance(double& time, double event, const Motion& motion, const Path& path) {
   if (!(event > time)) refuse(text("event: must be after ", time, " s, got ", event));
   const int all = ticks(0);
   const auto instant = [&](int tick) {
@@ -71,17 +73,27 @@ StepReport StepController::advance(double& time, double event, const Motion& mot
     return std::abs(event - at) <= same_instant * length_ ? event : at;
   };
   const bool ended = tick_ == all || time != instant(tick_), cut = event < instant(all);
-  if (ended || cut) begin_interval(time, event);
+  const bool halves = last_ > 0;
+  if (ended || cut) {
+    begin_interval(time, event);
+    course_.look(begin_, begin_ + length_, halves ? constants_.looks : 1, path);
+  }
   StepReport total;
   for (bool taken = false; !taken;) {
     while (tick_ % ticks(level_) != 0) ++level_;
     const int size = ticks(level_);
     const double share = static_cast<double>(size) / all, dt = share * length_;
     const Drive drive = motion(instant(tick_ + size));
+    const double uneven = course_.off(instant(tick_), instant(tick_ + size), stepper_, drive);
+    if (even_to_predicted * uneven > constants_.reject_at * control_.error && level_ < finest_) {
+      ++level_;
+      continue;
+    }
+    total.uneven = std::max(total.uneven, uneven);
     StepReport report;
-    const bool solved = stepper_.attempt(dt, drive, report);
+    const bool solved = halves && stepper_.attempt(dt, drive, report);
     const bool near = stepper_.near();
-    const double missed = stepper_.missed() / control_.error;
+    const double missed = std::max(stepper_.missed(), even_to_predicted * uneven) / control_.error;
     if (solved ? level_ < finest_ && missed > constants_.reject_at : level_ < last_) {
       stepper_.reject();
       total.add_work(report);
@@ -93,7 +105,7 @@ StepReport StepController::advance(double& time, double event, const Motion& mot
     if (solved) {
       stepper_.accept(drive, report);
     } else {
-      stepper_.reject();
+      if (halves) stepper_.reject();
       total.add_work(report);
       report = stepper_.step(dt, drive);
     }

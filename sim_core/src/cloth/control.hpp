@@ -4,20 +4,21 @@
 // run takes the same steps however it is watched. Only before an event, at which a step has to end, they are shorter.
 //
 // Implicit Euler is wrong by dt^2 a/2 in a step, and the prediction x + dt v by dt^2 a: their distance is the estimate
-// of the error. A step that misses it, or that Newton's method does not solve within its patience, is taken back and
-// halved. Steps grow where the error leaves room for it and where longer ones have not been dearer of late: work is
-// counted in iterations and factors, not in seconds, so that a rerun takes the same steps.
+// of the error. A step that misses it, in which bodies or holders do not move as evenly, or that Newton's method does
+// not solve within its patience, is taken back and halved. Steps grow where the error leaves room for it and where
+// longer ones have not been dearer of late: work is counted in iterations and factors, not in seconds, so that a rerun
+// takes the same steps.
 #pragma once
 
 #include <functional>
 #include <vector>
 
-#include "cloth/stepping.hpp"
+#include "cloth/course.hpp"
 
 namespace sim_core {
 
 struct StepControl {
-  double error;    // m: largest distance of a node from where it was predicted
+  double error;    // m: largest distance of a node from where it was predicted; infinite: all steps are the longest
   double longest;  // s: length of a step
   int finest;      // steps that one of this length is cut into at most for the error's sake: a power of two
 };
@@ -30,7 +31,7 @@ class StepController {
   StepController(Stepper& stepper, const StepControl& control, const ControlSettings& constants);
 
   // Takes one step from `time` [s], and sets that to its end. A step ends at `event`, which may be infinite.
-  StepReport advance(double& time, double event, const Motion& motion);
+  StepReport advance(double& time, double event, const Motion& motion, const Path& path);
   void restart();
 
  private:
@@ -41,6 +42,7 @@ class StepController {
   void begin_interval(double time, double event);
 
   Stepper& stepper_;
+  Course course_;
   StepControl control_;
   ControlSettings constants_;
   int finest_, last_, level_;          // log2 of steps in an interval; `last_`: of the shortest

@@ -29,12 +29,14 @@ struct ControlSettings {
   // Halvings of a step that is not solved beyond `finest`. Without any, royal-target dragged for 24 s at mu 0.8 cost
   // 24.8 CPU s in place of 14.5. Sweep: 2 takes 1 % more iterations and 3 % more factors of a fold that is let down.
   int halvings = 4;
+  // Times in the longest step at which bodies and holders are looked at: one in each of the shortest of `certified`.
+  int looks = 64;
 
   template <class Self, class Call>
   static void each(Self& s, const Call& call) {
     call("reject_at", s.reject_at), call("grow_at", s.grow_at), call("factor_work", s.factor_work),
         call("newton_work", s.newton_work), call("rejected_work", s.rejected_work), call("dearer", s.dearer),
-        call("forgiven", s.forgiven), call("novelty", s.novelty), call("halvings", s.halvings);
+        call("forgiven", s.forgiven), call("novelty", s.novelty), call("halvings", s.halvings), call("looks", s.looks);
   }
 };
 

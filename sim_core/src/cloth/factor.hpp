@@ -31,7 +31,6 @@ class StaleFactor {
   StaleFactor(const StaleFactor&) = delete;
 
   const Factor& view() const { return view_; }
-  const FactorStorage& storage() const { return storage_; }
 
   // Whether it is for steps of this length.
   bool fits(double dt) const;

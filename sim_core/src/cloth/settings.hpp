@@ -26,7 +26,8 @@ struct StepReport {
   int newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest = std::numeric_limits<double>::infinity();        // cells: least radius of a skeleton that bears
-  double factorizations = 0.0;                                      // whole ones, and shares of those in part
+  double uneven = 0.0;          // m: distance of what drives the cloth from an even motion in a step of the controller
+  double factorizations = 0.0;  // whole ones, and shares of those in part
   Observed seen;
 
   void add_work(const StepReport& other) {
@@ -48,6 +49,7 @@ struct StepReport {
     pairs = other.pairs;
     least_distance = std::min(least_distance, other.least_distance);
     sharpest = std::min(sharpest, other.sharpest);
+    uneven = std::max(uneven, other.uneven);
     seen.add(other.seen);
   }
 };

@@ -131,12 +131,17 @@ void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
   if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
     refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
-  if (begins) impl_->stepper.refuse_inside(bodies);
   impl_->load(velocities, impl_->stepper.v);
   impl_->stepper.restart({});
-  meet(bodies);
-  impl_->stepper.restart(bodies);
+  begin(bodies, begins);
   impl_->controller.restart();
+}
+
+// Places the bodies before a first step, and refuses free vertices inside one where the scene `begins`.
+void ClothSolver::begin(const std::vector<Body>& bodies, bool begins) {
+  meet(bodies);
+  if (begins) impl_->stepper.refuse_inside(bodies);
+  impl_->stepper.restart(bodies);
 }
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
@@ -145,9 +150,9 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const Motion& motion) {
-  if (!impl_->stepper.started()) meet(motion(time).bodies);
-  return impl_->controller.advance(time, event, motion);
+StepReport ClothSolver::advance(double& time, double event, const Motion& motion, const Path& path) {
+  if (!impl_->stepper.started()) begin(motion(time).bodies);
+  return impl_->controller.advance(time, event, motion, path);
 }
 
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
@@ -194,7 +199,7 @@ Points3 ClothSolver::surface_forces() const {
   }
   const ContactState& contact = impl_->newton.contact;
   for (int i = 0; i < impl_->numbering.free_nodes; ++i) {
-    if (contact.touched[i] < impl_->stepper.bodies()) continue;
+    if (contact.touched[i] < static_cast<int>(impl_->stepper.bodies().size())) continue;
     const Foot& foot = contact.surfaces->foot(i);
     for (int k = 0; k < 3; ++k) {
       const int vertex = impl_->numbering.vertex[contact.surfaces->triangles()[foot.triangle][k]];
@@ -248,16 +253,6 @@ Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& v)
 
 double ClothSolver::softest(const Points3& positions) {
   return softest_mode(impl_->assembly, impl_->newton, impl_->at(positions));
-}
-
-double ClothSolver::factor_error(const Points3& positions, double dt) {
-  return sim_core::factor_error(impl_->assembly, impl_->newton, impl_->at(positions), dt);
-}
-
-std::pair<double, double> ClothSolver::part_error(const std::vector<std::int32_t>& sticking, double dt) {
-  std::vector<int> nodes;
-  for (const std::int32_t vertex : sticking) nodes.push_back(impl_->numbering.node[vertex]);
-  return sim_core::part_error(impl_->assembly, impl_->newton, impl_->stepper.x, nodes, dt);
 }
 
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }

@@ -41,7 +41,7 @@ class ClothSolver {
                   const std::vector<Body>& bodies, double damping);
 
   // A step of the controller's choice: see StepController::advance.
-  StepReport advance(double& time, double event, const Motion& motion);
+  StepReport advance(double& time, double event, const Motion& motion, const Path& path);
   // Change of the cloth's momentum over the last step, N.
   Eigen::Vector3d momentum_rate() const;
 
@@ -77,11 +77,6 @@ class ClothSolver {
   Points3 stiffness_times(const Points3& positions, const Points3& v);
   // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
   double softest(const Points3& positions);
-  // Relative error of a solve with the factor of its approximation, mass / dt^2 and all: for tests.
-  double factor_error(const Points3& positions, double dt);
-  // Largest difference between a factor whose parts that hold these vertices, which stick, were made anew, and a whole
-  // one, over its largest number; and the share that was made.
-  std::pair<double, double> part_error(const std::vector<std::int32_t>& sticking, double dt);
 
   const Eigen::VectorXd& masses() const;
   ClothPhases phases() const;
@@ -98,6 +93,7 @@ class ClothSolver {
   void each_bone_contact(const Call& call) const;
 
   void meet(const std::vector<Body>& bodies);
+  void begin(const std::vector<Body>& bodies, bool begins = true);
 };
 
 }  // namespace sim_core

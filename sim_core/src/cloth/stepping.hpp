@@ -45,8 +45,9 @@ class Stepper {
   // Largest distance of a free node from where it was predicted in the last attempt, m.
   double missed() const;
 
-  // Of the last step: how many there were.
-  int bodies() const { return static_cast<int>(bodies_before_.size()); }
+  // At the end of the last step.
+  const std::vector<Body>& bodies() const { return bodies_before_; }
+  const Numbering& numbering() const { return assembly_.numbering; }
   // Change of momentum over the last step, N.
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 

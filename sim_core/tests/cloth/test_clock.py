@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named
+from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named, sphere
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth import checks, meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.scene import ClothRun, Scene
@@ -77,6 +77,66 @@ def test_a_floor_that_shakes_between_frames_moves_the_cloth() -> None:
     path = shaken(100).positions
     assert np.ptp(path[:, :, 0].mean(axis=1)) > 2e-3
     assert np.abs(path[1:, :, 2]).max() < 1e-6
+
+
+def watched(
+    bodies: Callable[[float], list[Body]], end: float, preset: SolverSettings = CERTIFIED, held: tuple[int, ...] = ()
+) -> tuple[Cloth, Floats]:
+    """A patch lies at rest on bodies that begin to move later; return its mean x at 200 frames a second [m]."""
+    cloth = Cloth(PATCH, MATERIAL, preset, held=held, kernel="baseline")
+    start = np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))])
+    cloth.set_state(start, bodies=bodies(0.0))
+    path = []
+    for frame in range(1, round(200 * end) + 1):
+        cloth.advance(frame / 200, lambda t: (cloth.gravity, start[list(held)], bodies(t)))
+        path.append(cloth.positions_at(frame / 200)[:, 0].mean())
+    return cloth, np.array(path)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("frequency", [4.0, 8.0, 16.0, 32.0, 37.3])
+def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> None:
+    """It moves as a rigid block does: with the floor, or with |v'| = mu g, which a step takes to begin at its end."""
+    begin, size, dt = 0.5, 2e-3, 1e-5
+
+    def floor(time: float) -> float:
+        return size * float(1.0 - np.cos(2.0 * np.pi * frequency * max(time - begin, 0.0)))
+
+    cloth, path = watched(lambda time: [plane(1.0, origin=(floor(time), 0.0, 0.0))], 0.8)
+    x, v, block = 0.0, 0.0, []
+    for tick in range(1, 80_001):
+        u = (floor(tick * dt) - floor((tick - 1) * dt)) / dt
+        v += np.clip(u - v, -GRAVITY * dt, GRAVITY * dt)
+        x += v * dt
+        if tick % 500 == 0:
+            block.append(x)
+    sticks = size * (2.0 * np.pi * frequency) ** 2 < GRAVITY
+    assert path == pytest.approx(block, abs=3e-5 if sticks else 3e-3)
+    assert np.ptp(path) > size
+    assert checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0))) == ("", "")
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("far", [1.0, 0.01, 0.0006])
+@pytest.mark.parametrize("preset", [CERTIFIED, replace(CERTIFIED, step_error=None)], ids=["steps", "fixed"])
+def test_jumps_are_not_valid(far: float, preset: SolverSettings) -> None:
+    """A body or a holder that is elsewhere from one instant to the next."""
+    jumps = watched(lambda time: [plane(1.0, origin=(0.0, 0.0, far * (time >= 0.3)))], 0.4, preset)[0]
+    assert checks.failed(checks.values(checks.Seen(jumps, jumps.positions[None], 0)))[0] == "jumps"
+
+
+@pytest.mark.physics
+def test_what_moves_evenly_is_valid() -> None:
+    """By 1 cm in 0.1 s, with an acceleration of 4 m/s^2; and a ball far away that jumps."""
+
+    def bodies(time: float) -> list[Body]:
+        share = min(max(time - 0.3, 0.0) / 0.1, 1.0)
+        far = sphere(0.5, 0.01, origin=(5.0 + (time > 0.2), 0.0, 0.0))
+        return [plane(1.0, origin=(0.01 * share * share * (3.0 - 2.0 * share), 0.0, 0.0)), far]
+
+    cloth, path = watched(bodies, 0.5)
+    assert path[-1] == pytest.approx(0.01, abs=1e-4)
+    assert checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0))) == ("", "")
 
 
 @pytest.mark.physics

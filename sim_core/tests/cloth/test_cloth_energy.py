@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, preset_named
-from stickslip_sim_core._sim_core import cloth_kernels
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.protocols.strip import LENGTH, MeshKind, mesh_kinds, strip
@@ -97,28 +96,6 @@ def test_matrix(name: str, state: str, material: str) -> None:
     Kv, Kw = (np.asarray(cloth._solver.stiffness_times(at, u)) for u in (v, w))
     assert np.linalg.norm(Kv - difference) < 1e-6 * np.linalg.norm(difference)
     assert float((Kv * w).sum()) == pytest.approx(float((Kw * v).sum()), rel=1e-5)
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_factor_solves(name: str) -> None:
-    """In single precision, where the matrix is definite by itself: flat, and pulled."""
-    mesh = MESHES[name]
-    cloth = cloth_of(mesh)
-    for stretch in (1.0, 1.05):
-        assert cloth._solver.factor_error(stretch * flat(mesh), 0.01) < 1e-4
-
-
-@pytest.mark.parametrize("kernel", cloth_kernels())
-def test_parts_of_a_factor_are_made_anew_as_the_whole(kernel: str) -> None:
-    mesh = meshes.grid(0.6, 0.6, 20, 20)
-    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=[0, 20], kernel=kernel)
-    vertices = np.arange(len(mesh.rest))
-    shares = []
-    for sticking in (vertices[210:211], vertices[-30:], vertices[21:]):
-        error, share = cloth._solver.part_error(sticking.tolist(), 0.02)
-        assert error == 0.0
-        shares.append(share)
-    assert 0.0 < shares[0] < shares[1] < shares[2] == 1.0
 
 
 def rotation(seed: int) -> Floats:

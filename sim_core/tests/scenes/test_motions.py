@@ -26,9 +26,9 @@ class TestKeyframes:
         for time, move in zip(
             (0.0, 1.0, 2.0, 4.0, 9.0), ([0, 0, 0], [1, 0, 0], [1, 2, 0], [3, 1, 0], [3, 1, 0]), strict=True
         ):
-            assert keys.at(time)[1] == pytest.approx(move)
+            assert keys.pose(time)[:, 3] == pytest.approx(move)
         times = np.linspace(0.0, 4.0, 401)
-        path = np.stack([keys.at(time)[1] for time in times])
+        path = np.stack([keys.pose(time)[:, 3] for time in times])
         assert path[:, 0].max() <= 3.0
         assert np.allclose(path[100:201, 0], 1.0)  # it stays where two keys say the same
         assert path[:, 1].max() <= 2.0
@@ -38,7 +38,7 @@ class TestKeyframes:
 
     def test_turns_are_about_a_point(self) -> None:
         keys = Keyframes([0.0, 1.0], np.zeros((2, 3)), np.array([[0, 0, 0], [0, 0, np.pi]]), about=[1.0, 0.0, 0.0])
-        turn, move = keys.at(1.0)
+        turn, move = keys.pose(1.0)[:, :3], keys.pose(1.0)[:, 3]
         assert turn @ [1.0, 0.0, 0.0] + move == pytest.approx([1.0, 0.0, 0.0])
         assert turn @ [2.0, 0.0, 0.0] + move == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
 

@@ -30,7 +30,7 @@ COUNTS = frozenset(
         *(f"newton.{name}" for name in ("reversals_from", "rounds_max", "window", "cuts_max", "smooth_hops", "hops")),
         *("newton.halving_iterations", "newton.longest", "path.rounds_max", "factor.pool"),
         *("stepping.strained_soon", "stepping.strained_long", "stepping.smooth_iterations"),
-        "control.halvings",
+        *("control.halvings", "control.looks"),
     }
 )
 """Constants that are integers >= 1."""

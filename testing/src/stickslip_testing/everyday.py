@@ -207,6 +207,27 @@ def shaken_floor(cells: int) -> str:
     return runs[0][0] or ("right" if off < 1e-5 else f"wrong: off by {off:.3g} m")
 
 
+def shaken_from_rest(cells: int) -> str:
+    """A floor that begins to shake after 0.5 s, in periods of the longest step, takes the cloth along within 5 %."""
+
+    def bodies(t: float) -> list[Body]:
+        return [plane(1.0, origin=[1e-3 * (1.0 - np.cos(16.0 * np.pi * max(t - 0.5, 0.0))), 0.0, 0.0])]
+
+    code, cloth = _run(cells, bodies, seconds=0.5625, height=1e-6, fps=16.0)
+    way = float((cloth.positions_at(0.5625) - np.pad(cloth.mesh.rest, ((0, 0), (0, 1))))[:, 0].mean())
+    return code or ("right" if abs(way / 2e-3 - 1.0) < 0.05 else f"wrong: goes {way:.3g} m of 2 mm")
+
+
+def jumping_floor(cells: int) -> str:
+    """A floor that is 1 cm higher from one instant to the next."""
+    return _run(cells, lambda t: [plane(0.5, origin=[0.0, 0.0, 0.01 * (t > 0.15)])], height=1e-6)[0]
+
+
+def jumping_holder(cells: int) -> str:
+    """A holder that is 1 cm further from one instant to the next."""
+    return _run(cells, lambda _: [], held=[0, cells], path=lambda start, t: start + 0.01 * (t > 0.15))[0]
+
+
 def squeezed(cells: int) -> str:
     """Two blocks close on a napkin until they cross."""
 
@@ -239,6 +260,9 @@ EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingPr
             (start_in_floor, ("refused", "contact_gain")),
             (start_in_ball, ("refused", "contact_gain", "penetration", "stretch")),
             (shaken_floor, ("right",)),
+            (shaken_from_rest, ("right",)),
+            (jumping_floor, ("jumps",)),
+            (jumping_holder, ("jumps",)),
             (squeezed, ("penetration", "contact_gain", "passages", "unconverged", "budget")),
         )
     }

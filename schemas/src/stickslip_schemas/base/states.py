@@ -82,6 +82,7 @@ class Reason(StrEnum):
     poor_pictures = "poor_pictures"
     # The same, of cloth: the check of the solver that failed.
     not_finite = "not_finite"
+    jumps = "jumps"
     unconverged = "unconverged"
     budget = "budget"
     missed = "missed"
@@ -115,6 +116,7 @@ _OF_SAMPLE = {
     Reason.invalid_sample,
     Reason.poor_pictures,
     Reason.not_finite,
+    Reason.jumps,
     Reason.unconverged,
     Reason.budget,
     Reason.missed,

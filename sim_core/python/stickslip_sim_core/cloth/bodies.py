@@ -82,15 +82,17 @@ class Body:
 
 
 def plane(mu: float | ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
-    """Return the half-space below a plane."""
+    """Return the half-space below a plane, with the axes of the world in the shortest turn from z to the normal."""
     n = np.asarray(normal, float)
     if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
         raise ValueError(f"normal: must be three finite numbers, not all 0, got {n.tolist()}")
     n = n / np.linalg.norm(n)
-    other = np.eye(3)[np.argmin(np.abs(n))]
-    t = np.cross(n, other)
-    t /= np.linalg.norm(t)
-    return Body(mu, 0, origin=np.asarray(origin, float), rotation=np.stack([t, np.cross(n, t), n], axis=1))
+    turn = np.diag([1.0, -1.0, -1.0])
+    b = 1.0 + n[2] if n[2] > 0.0 else (n[0] ** 2 + n[1] ** 2) / (1.0 - n[2])
+    if b > 0.0:
+        a = -n[0] * n[1] / b
+        turn = np.array([[1.0 - n[0] ** 2 / b, a, n[0]], [a, 1.0 - n[1] ** 2 / b, n[1]], [-n[0], -n[1], n[2]]])
+    return Body(mu, 0, origin=np.asarray(origin, float), rotation=turn)
 
 
 def sphere(

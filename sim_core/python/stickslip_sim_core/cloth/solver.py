@@ -31,6 +31,9 @@ GRAVITY = 9.81
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 """From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies."""
 
+Path = Callable[[Floats], tuple[ArrayLike, ArrayLike]]
+"""From times (T,) [s] to positions of the held vertices (T, K, 3) [m], and poses of the bodies (T, B, 3, 4) [m]."""
+
 
 def kernel_level() -> str:
     """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
@@ -99,8 +102,8 @@ class Cloth:
             refactor_after=preset.refactor_after,
             patience=preset.patience,
             halvings_max=preset.halvings_max,
-            step_error=preset.step_error or 1.0,
-            longest_step=preset.longest_step,
+            step_error=preset.step_error or np.inf,
+            longest_step=preset.longest_step if preset.step_error else preset.time_step,
             finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
             thickness=thickness.tolist(),
@@ -121,6 +124,8 @@ class Cloth:
         """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
         self.sharpest = np.inf
         """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
+        self.uneven = 0.0
+        """Largest distance of bodies, held vertices and surfaces from an even motion in a step of `advance` [m]."""
         self.spent = 0.0
         """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1 it stops."""
         self._spent = 0.0
@@ -268,19 +273,22 @@ class Cloth:
         end: float,
         motion: Motion,
         *,
+        path: Path | None = None,
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
     ) -> None:
         """Take steps until one ends at `end` [s] or later: those of the controller, or of the preset's length.
 
         Steps depend on where the cloth is, not on how often this is called: `positions_at` has it at any time of the
-        last step. `motion` and `damping`, which is proportional to mass [1/s], are asked at the ends of steps.
+        last step. Gravity and damping are those at the ends of steps. Where held vertices, bodies or surfaces do not
+        move evenly in a step, it is halved: they are looked at 512 times a second, with `certified`.
 
         Args:
             end: [s]
             motion: What drives the cloth.
+            path: The same at many times, which is quicker; None: `motion` is asked at each.
             event: Time [s] of the next sudden change of the motion, which a step must end at.
-            damping: Of all fabrics, on top of their own.
+            damping: Of all fabrics, on top of their own: proportional to mass [1/s].
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
@@ -293,22 +301,24 @@ class Cloth:
             ends, tuples = np.asarray(held, float).reshape(-1, 3), [body.as_tuple() for body in bodies]
             return self.gravity, ends, self._surfaces_at(time), tuples, damping(time)
 
+        def track(times: Sequence[float]) -> tuple[Floats, Floats]:
+            at = np.array(times)
+            if path is not None:
+                held, poses = path(at)
+            else:
+                found = [motion(time) for time in times]
+                held = np.array([np.asarray(one[1], float) for one in found])
+                poses = np.array([[body.pose for body in one[2]] for one in found])
+            corners = [self._surfaces_at(time) for time in times]
+            points = np.concatenate([np.reshape(held, (len(at), -1, 3)), corners], axis=1)
+            return points.reshape(-1, 3), np.reshape(np.asarray(poses, float), (-1, 4))
+
         while self.time < end and self.spent <= 1.0:
             self._before = self.time, self.positions, self.velocities
+            self.time, report = self._solver.advance(self.time, event, drive, track)
+            self._count(report)
             if self.preset.step_error is not None:
-                self.time, report = self._solver.advance(self.time, event, drive)
-                self._count(report)
                 self._spend(report.newton, self.time - self._before[0])
-                continue
-            if not event > self.time:
-                raise ValueError(f"event: must be after {self.time:g} s, got {event:g}")
-            dt = self.preset.time_step
-            if np.isfinite(event):
-                dt = (event - self.time) / np.ceil((event - self.time) / dt * (1.0 - 1e-9))
-            self.gravity, held, bodies = motion(self.time + dt)
-            self.step(dt, held=held, bodies=bodies, damping=damping(self.time + dt))
-            if abs(event - self.time) < 1e-9 * dt:
-                self.time = event
 
     def _spend(self, iterations: int, seconds: float) -> None:
         """Count the iterations of the last second of scene time."""
@@ -362,6 +372,7 @@ class Cloth:
         self.halvings += report.halvings
         self.least_distance = min(self.least_distance, report.least_distance)
         self.sharpest = min(self.sharpest, report.sharpest)
+        self.uneven = max(self.uneven, report.uneven)
         self.seen.add(report.seen)
         return report
 

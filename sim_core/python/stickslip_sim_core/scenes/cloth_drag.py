@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -37,16 +37,13 @@ FRAME_RATE = 2.4
 """[1/s]"""
 
 
-def travel(time: float, distance: float) -> float:
-    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`."""
+def travel(time: ArrayLike, distance: float) -> Floats:
+    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`: ([T])."""
     ramp = SPEED / ACCELERATION
     duration = duration_of(distance)
-    t = min(max(time, 0.0), duration)
-    if t < ramp:
-        return 0.5 * ACCELERATION * t * t
-    if t > duration - ramp:
-        return distance - 0.5 * ACCELERATION * (duration - t) ** 2
-    return SPEED * (t - 0.5 * ramp)
+    t = np.clip(time, 0.0, duration)
+    late = np.where(t > duration - ramp, distance - 0.5 * ACCELERATION * (duration - t) ** 2, SPEED * (t - 0.5 * ramp))
+    return np.where(t < ramp, 0.5 * ACCELERATION * t * t, late)
 
 
 def duration_of(distance: float) -> float:
@@ -54,14 +51,11 @@ def duration_of(distance: float) -> float:
     return distance / SPEED + SPEED / ACCELERATION
 
 
-def holder_path(time: float) -> Floats:
-    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]."""
+def holder_path(time: ArrayLike) -> Floats:
+    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]: ([T,] 2)."""
     start, leg = duration_of(DROP), duration_of(DRAG)
-    x, direction = 0.0, 1.0
-    for i in range(LEGS):
-        x += direction * travel(time - start - i * leg, DRAG)
-        direction = -direction
-    return np.array([x, -travel(time, DROP)])
+    x = sum((-1.0) ** i * travel(np.asarray(time) - start - i * leg, DRAG) for i in range(LEGS))
+    return np.stack([x, -travel(time, DROP)], axis=-1)
 
 
 DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
@@ -124,6 +118,7 @@ def scene(
         start=cloth.positions,
         holders=[Holder(cloth.held, holder_pose)],
         motion=motion_of(cloth, len(square.rest), [plane(mu)]),
+        poses=lambda times: np.broadcast_to(plane(mu).pose, (len(times), 1, 3, 4)),
         self_contact=None if self_friction is None else SelfContact(self_friction),
         frames=frames,
         frame_rate=FRAME_RATE,
@@ -169,10 +164,12 @@ def motion_of(hung: Hung, vertices: int, floor: Sequence[Body]) -> Callable[[flo
     return motion
 
 
-def holder_pose(time: float) -> Floats:
-    """Return the pose (3, 4) of the holders, relative to their start."""
-    x, z = holder_path(time)
-    return np.column_stack([np.eye(3), [x, 0.0, z]])
+def holder_pose(time: ArrayLike) -> Floats:
+    """Return the pose of the holders, relative to their start, at a time or times [s]: ([T,] 3, 4)."""
+    pose = np.zeros((*np.shape(time), 3, 4))
+    pose[..., :3] = np.eye(3)
+    pose[..., ::2, 3] = holder_path(time)
+    return pose
 
 
 def dragged_forces(cloth: Cloth, hung: Hung, contact: Floats) -> Record:

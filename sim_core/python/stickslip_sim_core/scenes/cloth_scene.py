@@ -59,6 +59,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     ]
     gravity = _Gravity(document, sheets, seed)
     rigid = [one.rigid for one in things if one.rigid is not None]
+    placed = [one.pose for one in things if one.rigid is not None]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         return gravity.at(time), [at(time) for at in rigid]
@@ -79,6 +80,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         preset=preset_named(document["preset"]),
         start=np.concatenate([one.start for one in sheets]),
         motion=motion,
+        poses=lambda times: np.swapaxes(np.reshape([at(times) for at in placed], (-1, len(times), 3, 4)), 0, 1),
         holders=holders,
         self_contact=_touch(document, sheets, mu),
         surfaces=[one.surface for one in things if one.surface is not None],

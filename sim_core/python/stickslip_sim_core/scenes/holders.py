@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import Body
@@ -26,8 +26,8 @@ class Holder:
     vertices: NDArray[np.intp]
     """(K,)"""
 
-    pose: Callable[[float], Floats]
-    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]."""
+    pose: Callable[[ArrayLike], Floats]
+    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]; in a scene with `poses`, from times (T,), too."""
 
     grasp: tuple[float, float] = ALWAYS
     """When it takes hold, and when it lets go [s]."""
@@ -75,10 +75,14 @@ class Hands:
         held = [self.holders[number].vertices for number in self._taken]
         return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
-    def at(self, time: float) -> Floats:
-        """Return the positions of the held vertices at a time [s]: (K, 3) [m]."""
-        poses = [(points, self.holders[number].pose(time)) for number, points in self._taken.items()]
-        return np.concatenate([np.empty((0, 3)), *(points @ pose[:, :3].T + pose[:, 3] for points, pose in poses)])
+    def at(self, time: ArrayLike) -> Floats:
+        """Return the positions of the held vertices at a time [s], or at times (T,): ([T,] K, 3) [m]."""
+        shape = np.shape(time)
+        found = [np.empty((*shape, 0, 3))]
+        for number, points in self._taken.items():
+            pose = np.broadcast_to(self.holders[number].pose(time), (*shape, 3, 4))
+            found.append(points @ np.swapaxes(pose[..., :3], -1, -2) + pose[..., None, :, 3])
+        return np.concatenate(found, axis=-2)
 
     def driving(self, motion: Callable[[float], tuple[Floats, Sequence[Body]]]) -> Motion:
         """Return gravity, the held vertices and bodies, where `motion` returns gravity and bodies."""

@@ -24,14 +24,14 @@ def _times(times: ArrayLike) -> Floats:
     return t
 
 
-def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[float], Floats]:
+def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLike], Floats]:
     """Return the cubic Hermite interpolant of values (K, ...); constant before the first and after the last."""
     from scipy.interpolate import CubicHermiteSpline  # here, so that importing the package stays quick
 
     if len(times) == 1:
-        return lambda _time: np.array(values[0])
+        return lambda time: np.array(np.broadcast_to(values[0], np.shape(time) + values.shape[1:]))
     path = CubicHermiteSpline(times, values, slopes)
-    return lambda time: np.asarray(path(min(max(time, float(times[0])), float(times[-1]))))
+    return lambda time: np.asarray(path(np.clip(time, times[0], times[-1])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Keyframes:
     ramp: float = 0.0
     """Of a linear motion [s], 0 or more."""
 
-    _path: Callable[[float], Floats] = field(init=False, repr=False)
+    _path: Callable[[ArrayLike], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))
@@ -83,16 +83,11 @@ class Keyframes:
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
         return 0.0 if (values == values[0]).all() else float(np.asarray(self.times)[-1]) + self.ramp
 
-    def at(self, time: float) -> tuple[Floats, Floats]:
-        """Return the motion at a time [s]: x -> R x + b, as R (3, 3) and b (3,) [m]."""
+    def pose(self, time: ArrayLike) -> Floats:
+        """Return the motion x -> R x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
         found = self._path(time)
-        R, about = rotation(found[3:]), np.asarray(self.about)
-        shift: Floats = about + found[:3] - R @ about
-        return R, shift
-
-    def pose(self, time: float) -> Floats:
-        """Return the motion at a time [s] as (3, 4)."""
-        return np.column_stack(self.at(time))
+        R, about = rotation(found[..., 3:]), np.asarray(self.about)
+        return np.concatenate([R, (about + found[..., :3] - R @ about)[..., None]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,19 +114,19 @@ class Spin:
         """When the motion ends [s]: never, unless nothing moves."""
         return float("inf") if self.speed else 0.0
 
-    def pose(self, time: float) -> Floats:
-        """Return the motion at a time [s]: x -> A x + b, as (3, 4)."""
-        t = max(time - self.begin, 0.0)
-        angle = self.speed * (0.5 * t * t / self.ramp if t < self.ramp else t - 0.5 * self.ramp)
+    def pose(self, time: ArrayLike) -> Floats:
+        """Return the motion x -> A x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
+        t = np.maximum(np.asarray(time, float) - self.begin, 0.0)
+        angle = self.speed * np.where(t < self.ramp, 0.5 * t * t / (self.ramp or 1.0), t - 0.5 * self.ramp)
         axis, about = np.asarray(self.axis, float), np.asarray(self.about, float)
-        R = rotation(angle * axis / np.linalg.norm(axis))
-        return np.column_stack([R, about - R @ about])
+        R = rotation(angle[..., None] * axis / np.linalg.norm(axis))
+        return np.concatenate([R, (about - R @ about)[..., None]], axis=-1)
 
 
 RigidMotion = Keyframes | Spin
 
 
-def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[float], Floats]:
+def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike], Floats]:
     """Return v0 + sum over k of (s_k - s_(k-1)) r(t - t_k), s_k being the slope after t_k.
 
     r(u) = u^2/(2 ramp) up to the ramp, and u - ramp/2 from there on; 0 before 0.
@@ -140,8 +135,8 @@ def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[float], Flo
     still = np.zeros((1, values.shape[1]))
     changes = np.diff(np.concatenate([still, slopes, still]), axis=0)
 
-    def at(time: float) -> Floats:
-        u = np.clip(time - times, 0.0, None)
+    def at(time: ArrayLike) -> Floats:
+        u = np.clip(np.asarray(time, float)[..., None] - times, 0.0, None)
         reached = np.where(u < ramp, 0.5 * u * u / (ramp or 1.0), u - 0.5 * ramp)
         found: Floats = values[0] + reached @ changes
         return found
@@ -160,12 +155,14 @@ def _monotone(times: Floats, values: Floats) -> Floats:
 
 
 def rotation(turn: ArrayLike) -> Floats:
-    """Return the matrix (3, 3) of a rotation vector (3,) [rad]; right angles are exact."""
+    """Return the matrices (..., 3, 3) of rotation vectors (..., 3) [rad]; right angles are exact."""
     from scipy.spatial.transform import Rotation
 
-    found = np.asarray(Rotation.from_rotvec(np.asarray(turn, float)).as_matrix())
+    vectors = np.asarray(turn, float)
+    found = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     whole = np.rint(found)
-    return found if (np.abs(found - whole) > RIGHT_ANGLE).any() else whole + 0.0
+    oblique = (np.abs(found - whole) > RIGHT_ANGLE).any(axis=(-2, -1), keepdims=True)
+    return np.where(oblique, found, whole + 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +193,7 @@ class MovingMesh:
     strength: float = 1.0
     """Factor of all displacements since the first frame."""
 
-    _path: Callable[[float], Floats] = field(init=False, repr=False)
+    _path: Callable[[ArrayLike], Floats] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))

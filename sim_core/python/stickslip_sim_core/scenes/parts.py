@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -45,7 +45,7 @@ class Sheet:
     holders: Mapping[str, Holder]
     """By name; their vertices are those of the sheet."""
 
-    tracks: Mapping[str, Callable[[float], Floats]]
+    tracks: Mapping[str, Callable[[ArrayLike], Floats]]
     """By holder: its pose (3, 4), from its own axes, that are warp, weft and normal of the flat sheet, to the world."""
 
     boxes: Mapping[str, Floats]
@@ -85,7 +85,7 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
         local = positions
     start = local @ turn.T + origin
     holders: dict[str, Holder] = {}
-    tracks: dict[str, Callable[[float], Floats]] = {}
+    tracks: dict[str, Callable[[ArrayLike], Floats]] = {}
     boxes: dict[str, Floats] = {}
     last, taken = 0.0, np.zeros(len(start), dtype=bool)
     for key, holder in sorted(given["holders"].items()):
@@ -154,12 +154,12 @@ def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
     return Keyframes(times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"])
 
 
-def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[float], Floats]:
-    """Return the pose (3, 4) at a time [s] of what starts with axes `turn` (3, 3) at `origin` (3,) [m]."""
+def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[ArrayLike], Floats]:
+    """Return the pose at times, ([T,] 3, 4) [s], of what starts with axes `turn` (3, 3) at `origin` (3,) [m]."""
 
-    def at(time: float) -> Floats:
-        pose = motion.pose(time)
-        return np.column_stack([pose[:, :3] @ turn, pose[:, :3] @ origin + pose[:, 3]])
+    def at(time: ArrayLike) -> Floats:
+        R, shift = np.split(motion.pose(time), [3], axis=-1)
+        return np.concatenate([R @ turn, (R @ origin)[..., None] + shift], axis=-1)
 
     return at
 
@@ -169,8 +169,8 @@ class Thing:
     """A body: rigid, or a surface of triangles."""
 
     name: str
-    pose: Callable[[float], Floats]
-    """(3, 4): from its own axes to the world, at a time [s]."""
+    pose: Callable[[ArrayLike], Floats]
+    """From its own axes to the world, at a time or times [s]: ([T,] 3, 4)."""
 
     last: float
     """When its motion ends [s]."""
@@ -198,7 +198,7 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     """
     if given["type"] == "plane":
         still = plane(mu, normal=given["normal"], origin=given["origin"])
-        return Thing(name, lambda _time: still.pose, 0.0, rigid=lambda _time: still)
+        return Thing(name, lambda time: np.broadcast_to(still.pose, (*np.shape(time), 3, 4)), 0.0, lambda _time: still)
     if given["type"] == "mesh":
         return _surface(name, given, mu)
     origin = np.array(given["origin"], float)

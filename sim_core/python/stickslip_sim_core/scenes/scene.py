@@ -108,6 +108,9 @@ class Scene:
     motion: Callable[[float], tuple[Floats, Sequence[Body]]]
     """From a time [s] to gravity (V, 3) [m/s^2] and bodies."""
 
+    poses: Callable[[Floats], Floats] | None = None
+    """From times (T,) [s] to the poses of bodies (T, B, 3, 4); holders take times, too. None: `motion` is asked."""
+
     frames: int
     frame_rate: float
     """[1/s]; the first frame is at 0 s."""
@@ -232,11 +235,13 @@ class Scene:
 
     def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
+        poses = self.poses
+        path = None if poses is None else lambda times: (hands.at(times), poses(times))
         while cloth.time < end and cloth.spent <= 1.0:
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
-            cloth.advance(min(end, event), hands.driving(self.motion), event=event, damping=self.damping)
+            cloth.advance(min(end, event), hands.driving(self.motion), path=path, event=event, damping=self.damping)
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store."""

@@ -118,6 +118,7 @@ def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
 CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
     {
         "not_finite": ("coordinates that are not finite numbers", 0.0),
+        "jumps": ("distance of bodies and holders from even motion in a step, over the step error", 1.0),
         "unconverged": ("steps above the tolerance over those that the preset allows", 1.0),
         "budget": ("most iterations in a second of the scene over those that the preset allows", 1.0),
         "missed": ("share of time in shortest steps that are further off than twice the step error", 0.5),
