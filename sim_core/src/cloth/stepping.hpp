@@ -51,7 +51,7 @@ class Stepper {
   // Change of momentum over the last step, N.
   const Eigen::Vector3d& momentum_rate() const { return momentum_rate_; }
 
-  // Throws std::invalid_argument where a free vertex is inside a body.
+  // Throws std::invalid_argument where a free vertex, or a triangle with one, is inside a body.
   void refuse_inside(const std::vector<Body>& bodies) const;
 
  private:

@@ -5,6 +5,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "cloth/refusal.hpp"
+
 namespace sim_core {
 
 using Eigen::Matrix2d;
@@ -88,6 +90,19 @@ double Watch::depth_in(const Body& body, const Buffer<double>& x) const {
     deepest = std::max(deepest, (-least - allowed) / cell);
   }
   return deepest;
+}
+
+void Watch::refuse_inside(const Body& body, int number, double inside, const Buffer<double>& x) const {
+  const Numbering& numbering = assembly_.numbering;
+  for (std::size_t t = 0; t < nodes_.size(); t += 3) {
+    const int* node = &nodes_[t];
+    if (std::min({node[0], node[1], node[2]}) >= numbering.free_nodes) continue;
+    const double depth = depth_beyond(body, {at_node(x, node[0]), at_node(x, node[1]), at_node(x, node[2])}, inside);
+    if (depth == 0.0) continue;
+    refuse(text("positions: triangles must not start more than ", 1e3 * inside,
+                " mm inside a body, and that of vertices ", numbering.vertex[node[0]], ", ", numbering.vertex[node[1]],
+                " and ", numbering.vertex[node[2]], " is ", 1e3 * depth, " mm inside body ", number));
+  }
 }
 
 // No triangle comes to a core unless it is as large as the body is thick, or goes as far in a step.

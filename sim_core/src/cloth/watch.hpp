@@ -23,6 +23,8 @@ class Watch {
 
   // The state was set: the energy of the next one is the first.
   void restart() { energy_.reset(); }
+  // Throws std::invalid_argument where a triangle with a free corner is deeper in a body than `inside`, m.
+  void refuse_inside(const Body& body, int number, double inside, const Buffer<double>& x) const;
   // `newton`: as the step left it.
   Observed see(const StepTaken& step, const Newton& newton);
 

@@ -1,6 +1,7 @@
 #include "contact/bodies.hpp"
 
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -26,6 +27,24 @@ Gap gap_of(const Body& body, const Vector3d& x) {
   beyond.maxCoeff(&axis);
   normal[axis] = std::copysign(1.0, local[axis]);
   return {beyond[axis] - body.radius, body.rotation * normal};
+}
+
+// A body is convex, so its distance grows by at least the normal's share of the way from the triangle's middle. Where
+// that leaves it open, its quarters are looked at.
+double depth_beyond(const Body& body, const std::array<Vector3d, 3>& triangle, double allowed) {
+  const auto& [a, b, c] = triangle;
+  const Vector3d middle = (a + b + c) / 3.0;
+  const Gap gap = gap_of(body, middle);
+  if (gap.distance < -allowed) return -gap.distance;
+  const double lowest = std::min({gap.normal.dot(a - middle), gap.normal.dot(b - middle), gap.normal.dot(c - middle)});
+  constexpr double error = 1e-6;  // m
+  if (!(gap.distance + lowest < -allowed - error)) return 0.0;
+  const Vector3d ab = 0.5 * (a + b), bc = 0.5 * (b + c), ca = 0.5 * (c + a);
+  for (const auto& quarter : {std::array{ab, bc, ca}, {a, ab, ca}, {ab, b, bc}, {ca, bc, c}}) {
+    const double depth = depth_beyond(body, quarter, allowed);
+    if (depth > 0.0) return depth;
+  }
+  return 0.0;
 }
 
 Vector3d carried(const Body& begin, const Body& end, const Vector3d& x) {

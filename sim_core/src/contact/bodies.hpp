@@ -2,6 +2,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <array>
 #include <vector>
 
 namespace sim_core {
@@ -28,6 +29,9 @@ struct Gap {
   Eigen::Vector3d normal;
 };
 Gap gap_of(const Body& body, const Eigen::Vector3d& x);
+
+// Depth in a body of a point of a triangle that is deeper than `allowed`, or 0 where none is, up to 1 um, m.
+double depth_beyond(const Body& body, const std::array<Eigen::Vector3d, 3>& triangle, double allowed);
 
 // Where the motion from `begin` to `end` carries the material point of the body that is at x.
 Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3d& x);

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from stickslip_sim_core import Body, Cloth, box, fabric, plane, preset_named, sphere
+from stickslip_sim_core import Body, Cloth, box, capsule, cylinder, fabric, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
 
 PATCH = meshes.grid(0.06, 0.06, 6, 6)
@@ -38,9 +39,49 @@ def test_starts_inside_a_body_are_refused(height: float, body: Body, depth: str)
         sheet.step(0.01, bodies=bodies)
 
 
-def test_starts_on_a_body_are_not() -> None:
+UPRIGHT = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+"""Axes of a rod along y."""
+
+CORNER_UP = Rotation.align_vectors([[0.0, 0.0, 1.0]], [[1.0, 1.0, 1.0]])[0].as_matrix()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        box(0.5, (0.004, 0.2, 0.05), origin=(0.005, 0.0, 0.0)),
+        box(0.5, (0.1, 0.1, 0.1), origin=(0.003, 0.005, -0.0789), rotation=CORNER_UP),
+        cylinder(0.5, 0.002, origin=(0.004, 0.006, 0.0)),
+        cylinder(0.5, 0.002, origin=(0.005, 0.0, 0.0005), rotation=UPRIGHT),
+        capsule(0.5, 0.0015, 0.05, origin=(0.004, 0.006, -0.0255)),
+        sphere(0.5, 0.003, origin=(0.004, 0.006, -0.001)),
+    ],
+    ids=["plate", "corner of a table", "peg", "rod", "end of a peg", "bead"],
+)
+def test_starts_through_a_body_that_is_between_vertices_are_refused(body: Body) -> None:
+    """They would be accepted, and cost minutes, for no step leads out of them."""
+    message = r"positions: triangles must not start more than [0-9.]+ mm inside a body, and that of vertices \d+, .* is"
     sheet, start = cloth(0.0)
-    sheet.set_state(start, bodies=[plane(0.5)])
+    with pytest.raises(ValueError, match=message):
+        sheet.set_state(start, bodies=[body])
+    sheet.set_state(start)
+    with pytest.raises(ValueError, match=message):
+        sheet.advance(0.01, lambda _: (sheet.gravity, start[:0], [body]))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        plane(0.5),
+        box(0.5, (0.004, 0.2, 0.05), origin=(0.005, 0.0, -0.025)),
+        box(0.5, (0.3, 0.3, 0.05), origin=(0.005, 0.0, -0.025)),
+        cylinder(0.5, 0.002, origin=(0.005, 0.0, -0.002), rotation=UPRIGHT),
+        sphere(0.5, 0.003, origin=(0.004, 0.006, -0.003)),
+        sphere(0.5, 0.04, origin=(0.0, 0.0, -0.04)),
+    ],
+)
+def test_starts_on_a_body_are_not(body: Body) -> None:
+    sheet, start = cloth(0.0)
+    sheet.set_state(start, bodies=[body])
 
 
 def test_what_is_let_go_inside_a_body_gets_no_velocity_by_that() -> None:
