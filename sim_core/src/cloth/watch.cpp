@@ -151,15 +151,25 @@ void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& 
 void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& out) {
   const Numbering& numbering = assembly_.numbering;
   double kinetic = 0.0, weight = 0.0, forces = 0.0, sizes = 0.0;
-  for (int i = 0; i < numbering.nodes; ++i) {
-    const Vector3d way = at_node(step.x, i) - at_node(step.start, i);
-    const double work = way.dot(at_node(newton.residual, i));
-    forces += work;
-    sizes += std::abs(work);
+  const auto add = [&](double work) { forces += work, sizes += std::abs(work); };
+  const auto way_of = [&](int node) -> Vector3d { return at_node(step.x, node) - at_node(step.start, node); };
+  for (int i = 0; i < numbering.nodes - numbering.bones; ++i) {
+    const Vector3d way = way_of(i);
+    add(way.dot(at_node(newton.residual, i)));
     const int vertex = numbering.vertex[i];
     if (vertex >= numbering.vertices) continue;
     kinetic += 0.5 * assembly_.mass[i] * at_node(step.v, i).squaredNorm();
     weight += assembly_.mass[i] * step.gravity.row(vertex).dot(way);
+  }
+  if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts is what cloth gets
+    for (const Pair& pair : newton.pairs->list()) {
+      if (!newton.pairs->bone_of(pair)) continue;
+      Vector3d way = Vector3d::Zero();
+      for (int c = 0; c < 4; ++c) {
+        if (pair.who.node[c] < numbering.nodes - numbering.bones) way += pair.weights[c] * way_of(pair.who.node[c]);
+      }
+      add(way.dot(pair.at.force));
+    }
   }
   const double energy = kinetic + assembly_.membrane_energy + assembly_.bending_energy;
   if (energy_) {
