@@ -96,7 +96,7 @@ class CoordinatorDouble:
             self.registrations.clear()
             self.leased.clear()
 
-    def until(self, condition: Callable[[], bool], timeout: float = 60) -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = 180) -> None:
         """Wait for a condition, which is looked at after every request."""
         with self.changed:
             assert self.changed.wait_for(condition, timeout), (self.results, self.leased, self.released)

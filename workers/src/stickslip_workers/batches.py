@@ -32,9 +32,6 @@ enough for so long [s]. A call costs 10 ms, and so does a request for tasks; but
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
 """How many tasks to ask for at once at most: one call takes as many simulations."""
 
-_WEIGHT = 0.2
-"""Of the last call in the mean of their times."""
-
 _tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
 _results = TypeAdapter(list[TaskResult])
 
@@ -97,17 +94,21 @@ def _renders(part: list[Lease]) -> list[RenderTask]:
 
 
 class Pace:
-    """How long tasks take, lately, and how many a call takes therefore."""
+    """How long tasks took the last time, and how many a call takes therefore."""
 
     def __init__(self) -> None:
         self._seconds: dict[Stage, float] = {}
+        self._short_renders = 1
+        """How many that share no shading are one call. CPU time counts: a busy machine needs no smaller calls."""
         self._renders_share = False
         """Whether the last renders that were leased share shadings."""
 
-    def note(self, one: Call, seconds: float) -> None:
+    def note(self, one: Call, seconds: float, results: list[TaskResult]) -> None:
         """Note the duration of a call."""
-        last = max(seconds / len(one.leases), 1e-3)
-        self._seconds[one.stage] = (1 - _WEIGHT) * self._seconds.get(one.stage, last) + _WEIGHT * last
+        self._seconds[one.stage] = max(seconds / len(results), 1e-3)
+        if one.stage is Stage.render:
+            cpu = max(sum(result.cpu_seconds for result in results) / len(results), 1e-3)
+            self._short_renders = max(min(int(ENOUGH_SECONDS / cpu), MOST_TOGETHER), 1)
 
     def call(self, stage: Stage) -> float:
         """Return how long a call takes [s]; infinity where that is not known."""
@@ -115,11 +116,10 @@ class Pace:
 
     def tasks(self, stage: Stage) -> int:
         """Return how many tasks one call takes."""
-        seconds = self._seconds.get(stage, math.inf)
         if stage is Stage.simulate:
-            return LARGEST_BATCH if seconds < ENOUGH_SECONDS else 1
+            return LARGEST_BATCH if self._seconds.get(stage, math.inf) < ENOUGH_SECONDS else 1
         if stage is Stage.render:
-            return MOST_TOGETHER if self._renders_share else max(min(int(ENOUGH_SECONDS / seconds), MOST_TOGETHER), 1)
+            return MOST_TOGETHER if self._renders_share else self._short_renders
         return 1
 
     def ahead(self, stage: Stage) -> int:

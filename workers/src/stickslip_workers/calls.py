@@ -12,8 +12,8 @@ from stickslip_workers import call
 from stickslip_workers.batches import Call
 from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
 
-LOOK_SECONDS = 2.0
-"""Time between two looks at the nodes of the cluster [s]."""
+LOOK_SECONDS = 4.0
+"""Time between two looks at the nodes of the cluster [s], which cost 3 ms each."""
 
 DEMAND = 1.5
 """Calls given to Ray for each CPU. An autoscaler adds nodes for those that wait."""
@@ -43,6 +43,8 @@ class Calls:
         self._described = described
         self._calls: dict[Any, Call] = {}
         self._foreign: set[str] = set()
+        self._lost: set[str] = set()
+        """Nodes that were lost last. Later calls avoid them by name: of equal ones, Ray asks a frozen node forever."""
         self._warm: set[str] = set()
         """Nodes on which processes were started."""
         self._next_look = 0.0
@@ -80,8 +82,8 @@ class Calls:
         """Give a call to Ray, which may choose the node."""
         renders, settings = one.stage is Stage.render, self._settings
         options: dict[str, Any] = {"num_cpus": 1 if one.parts and not one.is_express else 0, "memory": one.memory}
-        if node or self._foreign:
-            options["label_selector"] = {"ray.io/node-id": node or f"!in({','.join(sorted(self._foreign))})"}
+        if node or (avoided := sorted(self._foreign | self._lost)):
+            options["label_selector"] = {"ray.io/node-id": node or f"!in({','.join(avoided)})"}
         one.given_at = time.monotonic()
         one.reference = (
             self._remote[renders]
@@ -148,6 +150,7 @@ class Calls:
             raise StartError(self.trouble)
         self._next_look = time.monotonic() + LOOK_SECONDS
         lost = self._warm - nodes.keys()
+        self._lost = lost or self._lost
         for name in nodes.keys() - self._warm:  # its first tasks should not have to wait for Blender
             for stage in (Stage.simulate, Stage.render) * min(cpus[name], most):
                 self.give(Call(stage, []), name)

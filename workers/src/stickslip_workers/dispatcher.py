@@ -158,9 +158,9 @@ class Dispatcher:
         """Put the results of a call into the outbox."""
         if isinstance(said, list):
             seconds = time.monotonic() - one.started_at
-            self._pace.note(one, seconds)
             each = {"call_seconds": seconds / len(one.parts)}
             results = [result.model_copy(update=each) for result in one.results(said)]
+            self._pace.note(one, seconds, results)
         elif one.cancelled:
             results = [failed(Reason.exec_timeout, one.cancelled)] * len(one.leases)
         else:
