@@ -403,6 +403,23 @@ class TestNothingCrosses:
         ends[len(a.rest) :, 2] = 0.002
         assert cloth.step(0.02, held=ends).converged
 
+    @pytest.mark.parametrize(("end", "unconverged"), [(0.002, 0), (-0.005, 1)])
+    def test_a_step_ends_where_its_holders_are(self, end: float, unconverged: int) -> None:
+        """One held sheet goes to another, and through it: forces on the free corners balance, but nothing arrives."""
+        sheet = meshes.grid(0.02, 0.08, 2, 8)
+        count, away = len(sheet.rest), sheet.rest[:, 1] >= 0.0
+        held = np.flatnonzero(np.tile(sheet.rest[:, 1] < 0.0399, 2))
+        cloth = Cloth(
+            meshes.together(sheet, sheet), MATERIAL, CERTIFIED, held=held, self_contact=SelfContact(0.5, THICKNESS)
+        )
+        start = np.concatenate([flat(sheet, 0.005), flat(sheet)])
+        cloth.set_state(start)
+        ends = start.copy()
+        ends[:count, 2] = np.where(away, 0.005, end)
+        cloth.step(0.02, held=ends[held])
+        assert cloth.unconverged_steps == unconverged
+        assert bool((cloth.positions[held] == ends[held]).all()) is not bool(unconverged)
+
     def test_sheets_that_collide_keep_their_momentum(self) -> None:
         a, b = meshes.grid(0.05, 0.05, 4, 4), meshes.unstructured(0.05, 0.05, 0.012, 2)
         mesh = meshes.together(a, b)
