@@ -10,6 +10,7 @@ November 2026 that stepped by 20 ms (gray-interlock, mu 0.5, `certified`, 131 s)
 import argparse
 import time
 
+import numpy as np
 from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
@@ -30,7 +31,8 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     cloth.set_state(hung.positions)
     hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
     motion = hands.driving(cloth_drag.motion_of(hung, len(mesh.rest), [plane(mu)]))
-    cloth.advance(seconds, motion)
+    floor = np.tile(plane(mu).pose, (64, 1, 1, 1))
+    cloth.advance(seconds, motion, path=lambda times: (hands.at(times), floor[: len(times)]))
     cpu = time.process_time() - start
     phases = ", ".join(f"{name} {part:.1f}" for name, part in cloth.phases().items())
     steps = cloth.steps

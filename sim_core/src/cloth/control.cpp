@@ -10,7 +10,7 @@ namespace {
 
 // Share of an interval by which instants differ that rounding has parted.
 constexpr double same_instant = 1e-9;
-// What accelerates by a is a dt^2 from where it was predicted, and a dt^2/8 from an even motion between the ends.
+// What accelerates by a is a dt^2 off its prediction, and a dt^2/8 off an even motion between the ends of a step.
 constexpr double even_to_predicted = 8.0;
 
 int level_of(int steps, const char* name) {

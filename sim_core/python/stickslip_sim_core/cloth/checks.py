@@ -56,8 +56,7 @@ CHECKS = (
     ),
     Check(
         "jumps",
-        "largest distance of a body, a holder or a surface from an even motion within a step, over the preset's step "
-        "error",
+        "distance of a body, holder or surface from an even motion within a step, over the preset's step error",
         "1",
         lambda seen: seen.cloth.uneven / (seen.cloth.preset.step_error or 2e-4),
         1.0,

@@ -37,11 +37,11 @@ FRAME_RATE = 2.4
 """[1/s]"""
 
 
-def travel(time: ArrayLike, distance: float) -> Floats:
-    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`: ([T])."""
+def travel(time: Floats, distance: Floats) -> Floats:
+    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`."""
     ramp = SPEED / ACCELERATION
-    duration = duration_of(distance)
-    t = np.clip(time, 0.0, duration)
+    duration = distance / SPEED + ramp
+    t = np.minimum(np.maximum(time, 0.0), duration)
     late = np.where(t > duration - ramp, distance - 0.5 * ACCELERATION * (duration - t) ** 2, SPEED * (t - 0.5 * ramp))
     return np.where(t < ramp, 0.5 * ACCELERATION * t * t, late)
 
@@ -53,9 +53,10 @@ def duration_of(distance: float) -> float:
 
 def holder_path(time: ArrayLike) -> Floats:
     """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]: ([T,] 2)."""
-    start, leg = duration_of(DROP), duration_of(DRAG)
-    x = sum((-1.0) ** i * travel(np.asarray(time) - start - i * leg, DRAG) for i in range(LEGS))
-    return np.stack([x, -travel(time, DROP)], axis=-1)
+    legs = np.arange(LEGS)
+    since = np.asarray(time, float)[..., None] - np.append(0.0, LEGS * [duration_of(DROP)])
+    ways = travel(since - np.append(0.0, legs * duration_of(DRAG)), np.append(DROP, LEGS * [DRAG]))
+    return np.stack([(ways[..., 1:] * (-1.0) ** legs).sum(axis=-1), -ways[..., 0]], axis=-1)
 
 
 DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
