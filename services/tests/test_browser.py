@@ -93,7 +93,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
         for upload in uploads
     ]
-    shown = [page for clip in clips for page in (clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")]
+    shown = [page for job, clip in clips for page in (job, clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")]
     return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", *shown]
 
 
@@ -104,8 +104,8 @@ SCENES = (
 """Small scenes: one with a floor and a ball, one with a table and a holder, but without a floor."""
 
 
-def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict[str, Any]) -> str:
-    """Make a dataset of true motions and invented pictures; return its page."""
+def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict[str, Any]) -> tuple[str, str]:
+    """Make a dataset of true motions and invented pictures; return the pages of the job and of the dataset."""
     spec = parsed(
         {
             "kind": "cloth_scene",
@@ -128,7 +128,7 @@ def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict
     worker.record = {}
     dataset = show_job(context, submitted.id).dataset
     assert dataset is not None
-    return f"/datasets/{dataset.dataset}/v{dataset.version}"
+    return f"/jobs/{submitted.id}", f"/datasets/{dataset.dataset}/v{dataset.version}"
 
 
 def certificate(extent: Literal["full", "quick"]) -> Certificate:

@@ -91,6 +91,7 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert "samples_per_shard: 2" in page
     assert page.count("/v1/previews/") == 6
     assert "gamma 1, phi1 1: 1 of 1 done" in read(client, f"/ui/jobs/{job}/map")
+    assert re.search(r"[\d.]+ s of CPU time so far; without cached tasks, about [\d.]+ s is usual", page)
     path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
     assert path is not None
     dataset = read(client, path[0])
@@ -167,6 +168,7 @@ def test_what_failed_is_shown_with_its_reproducer(
         sweep(app.state.context)
     page = read(client, f"/jobs/{job}")
     assert "it crashed at line 7" in page
+    assert "quarantined: 1 of the newest 1" in page
     assert "python -m stickslip_workers replay" in page
 
 

@@ -224,9 +224,7 @@ def cancel(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     with Client(url) as client:
         job = client.cancel(job_id)
-    console().print(
-        f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: finished tasks are cached"
-    )
+    console().print(f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: results are cached")
 
 
 @shows_errors

@@ -15,15 +15,12 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Axis(NamedTuple):
-    """An axis of the grid, divided into cells."""
+    """An axis of the grid: the values of each cell and of all, as text, and the cell of each sample, by slot."""
 
     name: str
     texts: list[str]
-    """The values of each cell."""
     range: str
-    """The first and the last value."""
     cell: npt.NDArray[np.int64]
-    """The cell of each sample, by slot."""
 
 
 def grid_maps(spec: JobSpec, done: Flags, lost: Flags, *, most: int | None = None) -> list[dict[str, Any]]:

@@ -12,6 +12,8 @@ from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.plan.costs import estimated
+from stickslip_schemas.plan.grid import count
 
 from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
@@ -115,6 +117,7 @@ def _job(context: Context, connection: Connection, job_id: str) -> dict[str, Any
         "job": job,
         "durations": stage_durations(connection, seq),
         "elapsed": _elapsed(job, context),
+        "costs": estimated(job.spec, count(job.spec), {}, 0),
         "previews": newest_previews(connection, seq, 24),
         "rejected": rejected,
         "failed": failed_tasks(connection, seq, context.settings, SHOWN_LOST),
