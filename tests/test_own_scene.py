@@ -13,12 +13,14 @@ import yaml
 from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
+from stickslip_services.cli.main import app
 from stickslip_services.cli.scenes import spec_of
 from stickslip_services.local.simulating import why_uncertified
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
 from stickslip_sim_core.scenes.cloth_scene import KIND
 from stickslip_workers.builds import solver_build
+from typer.testing import CliRunner
 
 SOLVER = "stickslip_sim_core.cloth"
 SCENE: dict[str, Any] = {
@@ -113,6 +115,23 @@ def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path)
     assert ended.returncode == 1
     said = " ".join(ended.stderr.split())
     assert "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in said
+
+
+def test_a_scene_is_checked_and_its_cost_named() -> None:
+    """The cost is an interval: the rates of the samples that were measured, per vertex and second of a scene."""
+    said = json.loads(CliRunner().invoke(app, ["scene", "check", "belt", "--json"]).stdout)
+    assert said["axes"]["mu"]["values"] == "0.02 to 1 [1]"
+    assert {"cloth.positions", "cloth.contact", "mu", "fabric"} <= {array["name"] for array in said["arrays"]}
+    cost = said["cost"]
+    assert (cost["vertices"], cost["frames"]) == (441, 61)
+    least, most = cost["cpu_seconds_a_sample"]
+    results = Path(__file__).parents[1] / "benchmarks/results/scenes.json"
+    rows = json.loads(results.read_text())["rows"]
+    rates = [rate for row in rows for rate in row["CPU ms a vertex and scene second, least, median, most"]]
+    seconds = 1e-3 * 441 * 4.0  # at 1 ms a vertex and second
+    assert (least, most) == pytest.approx((seconds * min(rates), seconds * max(rates)), rel=0.1)
+    shown = CliRunner().invoke(app, ["scene", "check", "belt"], env={"COLUMNS": "200"}).output
+    assert f"takes {least:.2g} to {most:.2g} CPU s" in " ".join(shown.split())
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,10 @@ from stickslip_services.units import size
 
 scenes = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
 
+CPU_COST = (0.05e-3, 20e-3)
+"""CPU time of a vertex and a second of a scene [s]: of a sheet that lies flat on what carries it, and of one that folds
+on a body that turns. The least and the most of all samples of benchmarks/scenes.py."""
+
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="a scene, YAML or JSON, or the name of a built-in one")
 ]
@@ -63,7 +67,7 @@ def simulate(
 @scenes.command()
 @shows_errors
 def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
-    """Check a scene and the files that it names; list its axes and the arrays of a dataset of it."""
+    """Check a scene and the files that it names; list its axes, the arrays of a dataset of it, and costs."""
     given, files = _scene(scene)
     spec = spec_of(given)
     arrays: list[dict[str, Any]] = [
@@ -71,16 +75,17 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
         for each in layout(spec)
     ]
     axes = {name: _axis(given, name) for name in given.parameters}
-    step_frames = sum(mesh.mesh.shape[0] for mesh in given.sheets.values()) * given.frames
+    vertices = sum(sheet.mesh.shape[0] for sheet in given.sheets.values())
+    seconds = (given.frames - 1) / given.frame_rate
     said: dict[str, Any] = {
         "scene": given.name,
         "digest": given.digest,
         "axes": axes,
         "arrays": arrays,
         "cost": {
-            "vertices": sum(sheet.mesh.shape[0] for sheet in given.sheets.values()),
+            "vertices": vertices,
             "frames": given.frames,
-            "vertices_times_frames": step_frames,
+            "cpu_seconds_a_sample": [rate * vertices * seconds for rate in CPU_COST],
             "bytes_a_sample": sum(each.sample_bytes for each in layout(spec)),
             "files_bytes": sum(map(len, files.values())),
         },
@@ -96,9 +101,10 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
         listed.add_row(each["name"], each["dtype"], str(tuple(each["shape"])), escape(each["description"]))
     console().print(listed)
     cost = said["cost"]
+    least, most = cost["cpu_seconds_a_sample"]
     say(
-        f"{cost['vertices']} vertices, {cost['frames']} frames, {size(cost['bytes_a_sample'])} a sample before "
-        f"compression; digest {given.digest}"
+        f"{cost['vertices']} vertices, {cost['frames']} frames. A sample has {size(cost['bytes_a_sample'])} before "
+        f"compression, and takes {least:.2g} to {most:.2g} CPU s, the more its cloth folds. Digest {given.digest}"
     )
     return None
 
