@@ -198,6 +198,7 @@ def main() -> None:
         said = {
             "what": "Validity and CPU time of the built-in scenes, all parameters over their declared ranges",
             "command": COMMAND,
+            "commit": commit(),
             "conditions": "one thread; two cores shared with other work; CPU time of this process",
             "rows": rows,
         }

@@ -120,12 +120,9 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     assert batch["video"].shape == (8, 2, 224, 224, 3)
     assert set(batch.names("fabric")) == {"gray-interlock", "camel-ponte-roma"}
 
-    # The same again: nothing runs. One more friction: only its simulations.
-    again = service.finished(service.submit({**spec(upload(service, 0.02)), "name": "again"}))
-    assert again["dataset"] == job["dataset"]
-    for stage, progress in again["progress"]["stages"].items():
-        assert progress["cached"] == sum(progress["counts"].values()), stage
-        assert progress["cpu_seconds"] == 0
+    # The same again: nothing is left to do. One more friction: only its simulations.
+    again = httpx.post(f"{service.url}/v1/jobs:validate", json=spec(upload(service, 0.02)), timeout=60).json()
+    assert again["cached_count"] == again["task_count"]
     more = spec(upload(service, 0.02), mu=[0.2, 0.8, 1.0])
     known = httpx.post(f"{service.url}/v1/jobs:validate", json=more, timeout=60).json()
     assert known["cached_count"] == 16  # simulations and renders of two frictions

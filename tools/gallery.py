@@ -1,10 +1,11 @@
-"""Pictures of the built-in scenes for docs/scenes.md, by the stages of the queue: four instants side by side.
+"""Pictures of the built-in scenes, by the stages of the queue: four instants side by side.
 
-    .venv/bin/python tools/gallery.py [SCENE ...] [--out docs/figures/scenes] [--views] [--axis NAME=VALUE ...]
-                                      [--set PATH=VALUE ...]
+    .venv/bin/python tools/gallery.py [SCENE ...] [--out pictures] [--views] [--axis NAME=VALUE ...]
+                                      [--set PATH=VALUE ...] [--record FILE]
 
-Simulates one sample of each scene with its default parameters, and renders it from its first camera, or from all with
---views, one below the other. No coordinator is needed, but the environment of Blender is. CPU time: docs/scenes.md.
+Simulates one sample of each scene with its default parameters, and renders it from the camera `high`, or from all with
+--views, one below the other. --record takes the arrays of a sample that `benchmarks/scenes.py --keep` has simulated. No
+coordinator is needed, but the environment of Blender is.
 """
 
 import argparse
@@ -29,6 +30,8 @@ from stickslip_schemas.store import open_store
 from stickslip_workers.replay import replay
 
 INSTANTS = 4
+VIEW = "high"
+"""A camera that all built-in scenes have."""
 SIDE = 160
 """Of a picture [px]."""
 BLENDER_PYTHON = Path(sys.prefix).parent / ".venv-blender/bin/python"
@@ -46,7 +49,7 @@ def strip(name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views:
             "frames": INSTANTS,
             "quality": "draft",
             "allow_uncertified": True,
-            "axes": {"texture": "checker", "viewpoint": views if all_views else views[:1], **axes},
+            "axes": {"texture": "checker", "viewpoint": views if all_views else VIEW, **axes},
         }
     )
     points = list(grid(spec))
@@ -81,7 +84,7 @@ def main() -> None:
     """Write a WebP file for each scene."""
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     arguments.add_argument("scenes", nargs="*", default=scene_names())
-    arguments.add_argument("--out", type=Path, default=Path("docs/figures/scenes"))
+    arguments.add_argument("--out", type=Path, default=Path("pictures"))
     arguments.add_argument("--views", action="store_true", help="all cameras, one below the other")
     arguments.add_argument("--axis", nargs="*", default=[], metavar="NAME=VALUE")
     arguments.add_argument("--set", nargs="*", default=[], metavar="PATH=VALUE")

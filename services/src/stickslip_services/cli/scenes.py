@@ -21,10 +21,6 @@ from stickslip_services.units import size
 
 scenes = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
 
-CPU_COST = (0.05e-3, 20e-3)
-"""CPU time of a vertex and a second of a scene [s]: of a sheet that lies flat on what carries it, and of one that folds
-on a body that turns. The least and the most of all samples of benchmarks/scenes.py."""
-
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="a scene, YAML or JSON, or the name of a built-in one")
 ]
@@ -75,17 +71,16 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
         for each in layout(spec)
     ]
     axes = {name: _axis(given, name) for name in given.parameters}
-    vertices = sum(sheet.mesh.shape[0] for sheet in given.sheets.values())
-    seconds = (given.frames - 1) / given.frame_rate
+    usual = spec.usual_costs
     said: dict[str, Any] = {
         "scene": given.name,
         "digest": given.digest,
         "axes": axes,
         "arrays": arrays,
         "cost": {
-            "vertices": vertices,
+            "vertices": sum(sheet.mesh.shape[0] for sheet in given.sheets.values()),
             "frames": given.frames,
-            "cpu_seconds_a_sample": [rate * vertices * seconds for rate in CPU_COST],
+            "cpu_seconds_a_sample": [usual.simulate / usual.unsure, usual.simulate * usual.unsure],
             "bytes_a_sample": sum(each.sample_bytes for each in layout(spec)),
             "files_bytes": sum(map(len, files.values())),
         },
@@ -104,7 +99,7 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
     least, most = cost["cpu_seconds_a_sample"]
     say(
         f"{cost['vertices']} vertices, {cost['frames']} frames. A sample has {size(cost['bytes_a_sample'])} before "
-        f"compression, and takes {least:.2g} to {most:.2g} CPU s, the more its cloth folds. Digest {given.digest}"
+        f"compression, and its simulation most likely takes {least:.2g} to {most:.2g} CPU s. Digest {given.digest}"
     )
     return None
 
