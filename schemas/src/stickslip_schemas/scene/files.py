@@ -32,14 +32,9 @@ Triangles = npt.NDArray[np.int64]
 Arrays = dict[str, npt.NDArray[Any]]
 
 _Shapes = dict[str, tuple[str | int, ...]]
-_FRAMES: _Shapes = {"positions": ("frame", "vertex", 3), "triangles": ("triangle", 3), "times": ("frame",)}
-_SKIN: _Shapes = {
-    "rest": ("vertex", 3),
-    "weights": ("vertex", "bone"),
-    "bones": ("frame", "bone", 3, 4),
-    "times": ("frame",),
-    "triangles": ("triangle", 3),
-}
+_MESH: _Shapes = {"triangles": ("triangle", 3), "times": ("frame",)}
+_FRAMES: _Shapes = {"positions": ("frame", "vertex", 3), **_MESH}
+_SKIN: _Shapes = {"rest": ("vertex", 3), "weights": ("vertex", "bone"), "bones": ("frame", "bone", 3, 4), **_MESH}
 
 
 class UnfitFileError(ValueError):
