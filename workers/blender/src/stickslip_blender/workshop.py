@@ -27,7 +27,7 @@ FRAME_MARGIN = 1.0
 """Least distance of a rod or a cloth from the edge of the frame [px]."""
 
 SHADING_BYTES = 4 * 2**30
-"""Limit of the shadings kept in a store [bytes]: about 500 clips of 30 frames."""
+"""Limit of the shadings kept in a store [bytes]: some hundred clips of 30 frames."""
 
 Array = npt.NDArray[Any]
 

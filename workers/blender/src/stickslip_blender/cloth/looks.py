@@ -13,12 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_blender.cloth.surface import Surface
+from stickslip_blender.cycles.pixels import encode
+from stickslip_blender.raster import decoded
 
 if TYPE_CHECKING:
     from stickslip_schemas.spec.appearance import LampNumbers
 
 Field = npt.NDArray[np.float64]
-Grain = Literal["plain", "twill", "melange", "rib", "sparkle", "ribbon", "mesh", "pin-dots"]
+Grain = Literal["plain", "twill", "check", "melange", "rib", "sparkle", "ribbon", "target", "waves", "pin-dots"]
+
+WHITE = 0.85  # largest albedo: no fabric scatters more, and grain shows on a white print
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Look:
     grain: Grain
     """Pattern of the weave or knit in the colour."""
     contrast: float
-    """Of the grain: 0 is none."""
+    """Of the grain, in the share of light that the fabric scatters: 0 is none."""
 
 
 @cache
@@ -48,7 +52,7 @@ def looks() -> dict[str, Look]:
     return {material: Look(**numbers) for material, numbers in data.items()}
 
 
-PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.05)
+PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.1)
 """Of a fabric that is not in fabrics.toml: a user's own."""
 
 
@@ -60,15 +64,17 @@ def look_of(material: str) -> Look:
 def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
     """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its fabric and a hem.
 
-    Row 0 is the lower edge of the sheet; the picture covers the longer side.
+    Row 0 is the lower edge of the sheet; the picture covers the longer side. White has at most the albedo WHITE.
     """
     wide, high = (1e3 * side for side in surface.size)
     across = (np.arange(len(picture)) + 0.5) / len(picture) * max(wide, high)
     u, v = np.meshgrid(across, across)
     shade = 1.0 + look.contrast * _GRAINS[look.grain](u, v)
     if surface.is_rectangle:
-        shade *= 1.0 - 0.3 * _stitches(u, v, wide, high)
-    return np.rint(np.clip(picture * shade[..., None], 0.0, 255.0)).astype(np.uint8)
+        shade *= 1.0 - 0.55 * _stitches(u, v, wide, high)
+    brightest = max(1.0, float(np.quantile(shade, 0.95)))  # sparkles are brighter, and saturate
+    light = WHITE / brightest * decoded(picture) * shade[..., None]
+    return encode(np.clip(light, 0.0, WHITE).astype(np.float32))
 
 
 def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
@@ -89,16 +95,18 @@ def _noise(shape: tuple[int, ...], blur: tuple[int, int], seed: int) -> Field:
 
 
 # Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of 224 is 1.5 to 3 mm, so
-# threads are drawn too coarse: periods are those that a camera sees at all.
+# threads are drawn too coarse: a period of 5 mm and more is seen, a finer one would be moire.
 _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
     "plain": lambda u, v: 0.5 * _noise(u.shape, (6, 6), 1),
-    "twill": lambda u, v: 0.7 * np.sin(2.0 * np.pi * (u + v) / 4.0) + 0.3 * _noise(u.shape, (24, 2), 2),
-    "melange": lambda u, v: 0.8 * _noise(u.shape, (2, 12), 3),
-    "rib": lambda u, v: np.cos(2.0 * np.pi * u / 5.0),
-    "sparkle": lambda u, v: np.where(_noise(u.shape, (3, 3), 4) > 2.6, 2.4, -0.12),
-    "ribbon": lambda u, v: np.where(np.mod(v, 16.0) < 8.0, 0.7, -0.7),
-    "mesh": lambda u, v: 0.6 * np.cos(2.0 * np.pi * u / 4.0) * np.cos(2.0 * np.pi * v / 4.0) - 0.2,
-    "pin-dots": lambda u, v: np.where(np.hypot(np.mod(u, 7.0) - 3.5, np.mod(v, 7.0) - 3.5) < 1.2, 0.95, -0.25),
+    "twill": lambda u, v: 0.8 * np.sin(2.0 * np.pi * (u + v) / 9.0) + 0.2 * _noise(u.shape, (24, 6), 2),
+    "check": lambda u, v: np.where(np.minimum(np.mod(u, 12.5), np.mod(v, 12.5)) < 3.0, -1.0, 0.3),
+    "melange": lambda u, v: 0.6 * _noise(u.shape, (8, 40), 3),
+    "rib": lambda u, v: np.cos(2.0 * np.pi * u / 7.0),
+    "sparkle": lambda u, v: np.where(_noise(u.shape, (6, 6), 4) > 2.0, 2.0, -0.35),
+    "ribbon": lambda u, v: np.where(np.mod(v, 20.0) < 10.0, 0.7, -0.7),
+    "target": lambda u, v: np.cos(np.pi * np.hypot(np.mod(u, 50.0) - 25.0, np.mod(v, 50.0) - 25.0) / 5.0),
+    "waves": lambda u, v: np.sin(2.0 * np.pi * (u + 4.0 * np.sin(2.0 * np.pi * v / 40.0)) / 20.0),
+    "pin-dots": lambda u, v: np.where(np.hypot(np.mod(u, 10.0) - 5.0, np.mod(v, 10.0) - 5.0) < 2.2, 0.95, -0.35),
 }
 
 
@@ -118,10 +126,9 @@ _SOURCES = {
     "drawn": Source(((-75.0, 15.0), (42.0, 62.0), (0.8, 1.25))),
     "held-out": Source(((25.0, 80.0), (25.0, 40.0), (0.6, 0.8))),  # what no training light has
     "room": Source(((-75.0, 15.0), (55.0, 80.0), (0.5, 0.8)), diameter=1.6, surround=0.45),
-    "window": Source(((-160.0, -115.0), (20.0, 34.0), (0.9, 1.3)), diameter=1.2, surround=0.12),
+    "window": Source(((-125.0, -95.0), (20.0, 34.0), (0.9, 1.3)), diameter=1.2, surround=0.12),
 }
 LIGHTS = tuple(_SOURCES)
-"""Names of the ranges that lights are drawn from."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +151,9 @@ class Light:
 
 def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Light:
     """Draw a lamp from a named range, or from custom ones in a studio."""
-    if custom is not None:
-        source = Source((custom.azimuth, custom.elevation, custom.power))
-    elif name in _SOURCES:
-        source = _SOURCES[name]
-    else:
+    if custom is None and name not in LIGHTS:
         raise ValueError(f"light must be one of {', '.join(LIGHTS)}; got {name!r}")
+    source = Source((custom.azimuth, custom.elevation, custom.power)) if custom else _SOURCES[name]
     uniform = np.random.Generator(np.random.PCG64(seed)).uniform
     azimuth, elevation, power = (float(uniform(low, high)) for low, high in source.ranges)
     return Light(azimuth, elevation, power, source)

@@ -27,7 +27,6 @@ class Sampling:
     """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
     skipped: int = 0
     """Paths per pixel that are left out first. Cycles sends the very first one through the middle of the pixel."""
-
     noise: float = 0.0
     """Noise at which a pixel gets no more paths, as Cycles estimates it; at 0, all pixels get the same number."""
 

@@ -16,9 +16,7 @@ _CLIP = (1e-3, 1e3)  # [scene units]
 SHARP = np.radians(40.0)
 """Angle between faces above which an edge is no part of a smooth skin [rad]."""
 
-SOFT = 0.6
-"""Least roughness that rays meet which do not come from the camera: at 0.4, the light of a steel floor was twice as
-noisy."""
+SOFT = 0.6  # least roughness that other rays than a camera's meet: at 0.4, light of a steel floor was twice as noisy
 
 Array = npt.NDArray[np.float64]
 

@@ -23,10 +23,8 @@ from stickslip_blender.cycles.blender import import_bpy
 from stickslip_blender.cycles.exr import read_exr
 from stickslip_blender.raster import Window
 
-FIRST_SECONDS = 300.0
-"""What a first frame may take besides its paths: a GPU may load its kernels [s]."""
-LEAST_SECONDS = 60.0
-"""What any later frame may take besides its paths, on a machine that has a lot else to do [s]."""
+FIRST_SECONDS = 300.0  # besides its paths, for a first frame: a GPU may load its kernels
+LEAST_SECONDS = 60.0  # besides their paths, for later frames, on a machine that has a lot else to do
 _PATH_SECONDS = 5e-6  # of a path before one is measured: a slow core
 _SLOWER = 20.0  # times as long as its paths took before, and a frame hangs
 
@@ -100,8 +98,8 @@ class FrameReader:
         finally:
             faulthandler.cancel_dump_traceback_later()
         took = (time.monotonic() - start) / paths
-        first = self._besides == FIRST_SECONDS
-        self._besides, self._path_seconds = LEAST_SECONDS, took if first else max(took, self._path_seconds)
+        self._path_seconds = took if self._besides == FIRST_SECONDS else max(took, self._path_seconds)
+        self._besides = LEAST_SECONDS
 
 
 def _set_window(render: Any, window: Window | None, fine: int) -> None:
