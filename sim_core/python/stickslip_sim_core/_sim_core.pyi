@@ -176,16 +176,6 @@ class StepReport:
     def seen(self) -> Observed: ...
 
     @property
-    def contacts(self) -> int: ...
-
-    @property
-    def sliding(self) -> int: ...
-
-    @property
-    def pairs(self) -> int:
-        """Pairs of cloth with cloth that bear a force."""
-
-    @property
     def sharpest(self) -> float:
         """Least radius of a skeleton that cloth touched, in cells."""
 

@@ -89,9 +89,6 @@ void bind_cloth(nb::module_& m) {
       .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
       .def_ro("halvings", &StepReport::halvings)
       .def_ro("seen", &StepReport::seen)
-      .def_ro("contacts", &StepReport::contacts)
-      .def_ro("sliding", &StepReport::sliding)
-      .def_ro("pairs", &StepReport::pairs, "Pairs of cloth with cloth that bear a force.")
       .def_ro("sharpest", &StepReport::sharpest, "Least radius of a skeleton that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,
               "Distance of what drives the cloth from an even motion within a step of the controller [m].")

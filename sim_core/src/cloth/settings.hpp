@@ -23,7 +23,7 @@ struct StepReport {
   double residual = 0.0;           // N: worst over the parts
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
   int missed = 0;                  // of those, by steps of the controller that are further off than it allows
-  int newton = 0, krylov = 0, flips = 0, halvings = 0, contacts = 0, sliding = 0, pairs = 0;
+  int newton = 0, krylov = 0, flips = 0, halvings = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest = std::numeric_limits<double>::infinity();        // cells: least radius of a skeleton that bears
   double uneven = 0.0;          // m: distance of what drives the cloth from an even motion in a step of the controller
@@ -44,9 +44,6 @@ struct StepReport {
     missed += other.missed;
     converged = converged && other.converged;
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
-    contacts = other.contacts;
-    sliding = other.sliding;
-    pairs = other.pairs;
     least_distance = std::min(least_distance, other.least_distance);
     sharpest = std::min(sharpest, other.sharpest);
     uneven = std::max(uneven, other.uneven);

@@ -199,7 +199,7 @@ void Stepper::accept(const Drive& drive, StepReport& report) {
   take(tried_dt_, tried_.residual, drive, bodies_before_, drive.bodies, report);
   ++report.steps;
   bodies_before_ = drive.bodies;
-  count_contacts(report);
+  if (newton.pairs) report.sharpest = std::min(report.sharpest, newton.pairs->sharpest());
 }
 
 void Stepper::reject() { x = start_; }
@@ -210,16 +210,6 @@ double Stepper::missed() const {
     largest = std::max(largest, (at_node(x, i) - at_node(predicted_, i)).squaredNorm());
   }
   return std::sqrt(largest);
-}
-
-void Stepper::count_contacts(StepReport& report) const {
-  for (int mode : newton.contact.mode) {
-    report.contacts += mode != contact_open;
-    report.sliding += mode == contact_slip;
-  }
-  if (!newton.pairs) return;
-  report.pairs = newton.pairs->active_count();
-  report.sharpest = std::min(report.sharpest, newton.pairs->sharpest());
 }
 
 void Stepper::check(double dt, const Drive& drive) {
@@ -283,7 +273,7 @@ StepReport Stepper::step(double dt, const Drive& drive) {
   bodies_before_ = drive.bodies;
   ++report.steps;
   report.unconverged += !report.converged;
-  count_contacts(report);
+  if (newton.pairs) report.sharpest = std::min(report.sharpest, newton.pairs->sharpest());
   return report;
 }
 

@@ -62,7 +62,6 @@ class Stepper {
   Eigen::Vector3d forced(int node, const std::vector<Body>& at_start) const;
   void take(double dt, double residual, const Drive& drive, const std::vector<Body>& at_start,
             const std::vector<Body>& at_end, StepReport& report);
-  void count_contacts(StepReport& report) const;
   bool solve_part(double begin, double end, double dt, const Drive& drive, StepReport& report);
   void drive_nodes(double begin, double end, double part, const Drive& drive, const std::vector<Body>& bodies);
   void place_skeletons(const std::vector<Body>& bodies);

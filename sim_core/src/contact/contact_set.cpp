@@ -100,10 +100,6 @@ double ContactSet::smoothed_force() const {
   return pairs_.empty() ? 0.0 : smoothing * sum / static_cast<double>(pairs_.size());
 }
 
-int ContactSet::active_count() const {
-  return static_cast<int>(std::count_if(pairs_.begin(), pairs_.end(), [](const Pair& pair) { return pair.active(); }));
-}
-
 void ContactSet::solved(const Buffer<float>& change) {
   for (Pair& pair : pairs_) {
     pair.change = pair.force_change(change, free_nodes_);

@@ -61,7 +61,6 @@ class ContactSet {
   double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
-  int active_count() const;
   // Mean error of the forces by smoothing, N.
   double smoothed_force() const;
   double least_distance() const { return detection_.least_distance(); }
