@@ -13,7 +13,9 @@ from stickslip_services.app import main, make_app
 from stickslip_services.cli.main import app as commands
 from stickslip_services.client import Client, pull, signer_of, verify
 from stickslip_services.client.errors import ChangedError, ClientError, DamagedError, UnknownSignerError, UnsignedError
+from stickslip_services.client.signing import sign
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
@@ -142,6 +144,33 @@ def test_a_signed_version_is_not_passed_off_as_another(origin: Origin, signers: 
         client.request = other  # type: ignore[method-assign,assignment]
         with pytest.raises(DamagedError, match=r"of .*:v2 is that of .*:v1"):
             pull(client, origin.dataset, 2, tmp_path / "d", allowed_signers=signers.allowed)
+
+
+@pytest.mark.parametrize("damage", ["none", "lost", "flipped", "of another version", "by another key"])
+def test_a_scrub_signs_again_what_has_no_good_signature(
+    origin: Origin, signers: Signers, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    signature = origin.shown("manifest.sha256.sig")
+    good = signature.read_bytes()
+    if damage == "lost":
+        signature.unlink()
+    elif damage == "flipped":
+        signature.write_bytes(good[:200] + bytes([good[200] ^ 1]) + good[201:])  # in place: the artifact rots with it
+    elif damage == "of another version":
+        signature.write_bytes(sign(b"another seal", signers.lab))
+    elif damage == "by another key":
+        assert run("sign", origin.shown(""), "--key", signers.stranger)[0] == 0
+    is_broken = damage not in ("none", "by another key")
+    command = ("scrub", "--data", origin.context.settings.data)
+    if is_broken:
+        assert run(*command)[0] == 0  # without a key nobody knows that it should be signed
+    monkeypatch.setenv("STICKSLIP_SIGNING_KEY", str(signers.lab))
+    status, said = run(*command)
+    assert (status, f"{origin.dataset}:v1  manifest.sha256.sig" in said) == (is_broken, is_broken), said
+    assert run(*command)[0] == 0
+    assert (signature.read_bytes() == good) == (damage != "by another key")
+    with origin.context.database.read() as connection:
+        assert not has_runnable_job(connection)
 
 
 def test_a_coordinator_does_not_start_with_a_key_that_cannot_sign(

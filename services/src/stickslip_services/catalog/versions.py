@@ -23,7 +23,7 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
-from stickslip_services.client.signing import sign
+from stickslip_services.client.signing import is_signature, sign
 from stickslip_services.database.tables import dataset_versions, datasets
 
 HEADS_AT_ONCE = 128
@@ -83,10 +83,23 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     )
 
 
-def sign_version(store: Store, version: ManifestSummary, key: Path) -> None:
+def sign_version(store: Store, dataset: str, version: int, seal: bytes, key: Path) -> None:
     """Sign a version; raise ClientError if the key cannot sign."""
-    signature = store.publish(sign(seal_text(version.manifest, version.group), key))
-    store.show(signature, version.dataset, version.version, SIGNATURE_NAME)
+    store.show(store.publish(sign(seal, key)), dataset, version, SIGNATURE_NAME)
+
+
+def mend_signature(store: Store, dataset: str, version: int, seal: bytes, key: Path) -> bool:
+    """Sign a version whose signature is not there or broken; return whether it was.
+
+    Raises ClientError if the key cannot sign, OSError where the store is out of reach.
+    """
+    try:
+        if is_signature(store.read_shown(dataset, version, SIGNATURE_NAME), seal):
+            return False
+    except FileNotFoundError:
+        pass
+    sign_version(store, dataset, version, seal, key)
+    return True
 
 
 def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:

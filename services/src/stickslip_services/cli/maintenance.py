@@ -120,7 +120,8 @@ def scrub(
 ) -> None:
     """Read all datasets, beside a running service or without one; exit with 1 if a file is damaged.
 
-    Workers recompute damaged files. Versions that were read longest ago come first, also after a stop.
+    Workers recompute damaged files. With STICKSLIP_SIGNING_KEY, versions without a good signature are signed again.
+    Versions that were read longest ago come first, also after a stop.
     """
     count = bad = 0
     settings = _settings(data, store, database, Role.visitor)

@@ -31,6 +31,14 @@ def sign(seal: bytes, key: Path) -> bytes:
     return ended.stdout
 
 
+def is_signature(signature: bytes, seal: bytes) -> bool:
+    """Return whether somebody signed a seal with a signature."""
+    with NamedTemporaryFile() as file:
+        file.write(signature)
+        file.flush()
+        return _keygen("check-novalidate", "-n", NAMESPACE, "-s", file.name, data=seal).returncode == 0
+
+
 def sign_directory(target: Path, key: Path) -> None:
     """Write the signature of the dataset in a directory; raise DamagedError if the seal is broken."""
     manifest, group, seal = ((target / name).read_bytes() for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))

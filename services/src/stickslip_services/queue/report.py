@@ -14,6 +14,7 @@ from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
+from stickslip_schemas.format.manifest import seal_text
 from stickslip_schemas.store import is_unavailable
 
 from stickslip_services.catalog.versions import (
@@ -132,7 +133,8 @@ def _checked_in_store(context: Context, report: Report, versions: dict[str, Mani
         if isinstance(output, PublishOutput):
             version = read_version(context.store, output)
             if context.settings.signing_key is not None:
-                sign_version(context.store, version, context.settings.signing_key)
+                seal = seal_text(version.manifest, version.group)
+                sign_version(context.store, version.dataset, version.version, seal, context.settings.signing_key)
             versions[report.task_id] = version
         else:
             check_output(context.store, output)

@@ -5,9 +5,9 @@ from math import inf
 
 from sqlalchemy import or_, select, update
 from stickslip_schemas.base.states import JobState
-from stickslip_schemas.format.manifest import MANIFEST_NAME
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 
-from stickslip_services.catalog.versions import damaged_files
+from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
@@ -25,8 +25,9 @@ IDLE_RATE = 50e6
 def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, list[str]] | None:
     """Read the version that was read longest ago, at `rate` [bytes/s]; return its name, and paths of damaged files.
 
-    A damaged version gets a job with the terms that it was made with, which recomputes the files (`recompute`). Returns
-    None if all versions were read since `before` [s]. Raises OSError where the store is out of reach.
+    A damaged version gets a job with the terms that it was made with, which recomputes the files (`recompute`). With a
+    signing key, a version without a good signature is signed again. Returns None if all versions were read since
+    `before` [s]. Raises OSError where the store is out of reach, ClientError if the key cannot sign.
     """
     columns = dataset_versions.c
     is_due = or_(columns.scrubbed_at < before, columns.scrubbed_at > context.clock())  # by a clock that was ahead
@@ -47,6 +48,9 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
                 job = insert_job(book, spec, project=made[0].project)
                 begin_planning(book, job, terms)
                 set_job_state(book.connection, job, JobState.planning, book.now)
+    key, seal = context.settings.signing_key, seal_text(row.manifest, row.group_digest)
+    if found is not None and key is not None and mend_signature(context.store, row.dataset, row.version, seal, key):
+        damaged.append(SIGNATURE_NAME)
     return f"{row.dataset}:v{row.version}", damaged
 
 
