@@ -86,7 +86,7 @@ check: setup
 	@$(MAKE) --no-print-directory size
 	$(PY) -m mypy $(SOURCES)
 	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
-	$(PY) -m pytest --quiet sim_core/tests/test_stub.py services/tests/test_openapi.py
+	$(PY) -m pytest --quiet services/tests/test_openapi.py
 
 # The official library of LeRobot, which opens exports in a test; 8 GB.
 .venv-lerobot:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 FOLDERS = ("schemas/src", "services/src", "workers", "training/src", "sim_core/src", "sim_core/python")
 ENDINGS = (".py", ".pyi", ".cpp", ".hpp", ".html", ".js", ".css")
-GENERATED = (".min.js", "_sim_core.pyi")
 
 MAX_SOURCE_LINES = 56_266
 """The goal is 50,000. Lower this with every change that removes lines; never raise it.
@@ -50,8 +49,6 @@ def main() -> int:
     for path in source_files():
         text = path.read_text(encoding="utf-8")
         total += text.count("\n")
-        if path.name.endswith(GENERATED):
-            continue
         lines = sum(1 for line in text.splitlines() if line.strip() and not line.strip().startswith("//"))
         if path.suffix == ".py":
             code, classes = python_code_lines(text)
