@@ -27,7 +27,7 @@ MOST_TOGETHER = 12
 
 ENOUGH_SECONDS = 2.0
 """Renders that share no shading are one call if they take so long together, and calls that wait here for each CPU are
-enough for so long [s]. A call costs 10 ms, and so does a request for tasks; but another dispatcher may have nothing."""
+enough for twice as long [s]. A call costs 10 ms, a request for tasks too; but another dispatcher may have nothing."""
 
 LARGEST_BATCH = max(kind(name).batch for name in kind_names())
 """How many tasks to ask for at once at most: one call takes as many simulations."""
@@ -124,7 +124,7 @@ class Pace:
 
     def ahead(self, stage: Stage) -> int:
         """Return how many calls of a stage should wait here, for each CPU."""
-        return round(min(ENOUGH_SECONDS / self.call(stage), MOST_TOGETHER))
+        return round(min(2 * ENOUGH_SECONDS / self.call(stage), MOST_TOGETHER))
 
     def calls(self, leases: Iterable[Lease], *, is_short: bool) -> Iterator[Call]:
         """Yield the calls that do what has been leased."""

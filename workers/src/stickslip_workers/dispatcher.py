@@ -119,7 +119,7 @@ class Dispatcher:
         if worker_id is None or time.monotonic() < self._backoff.next_try:
             return
         try:
-            if time.monotonic() >= self._report_time() and self._outbox.send(worker_id):
+            if time.monotonic() >= self._report_time(calls) and self._outbox.send(worker_id):
                 self._next_lease = 0.0  # what has ended may have made new tasks possible
             if self._lease(calls, worker_id):
                 self._give_work(calls)
@@ -131,13 +131,14 @@ class Dispatcher:
 
     def _wait_seconds(self, calls: Calls) -> float:
         """Return how long there is nothing to do unless Ray has news."""
-        due = min(self._report_time(), self._next_lease if self._wanted(calls) else math.inf)
+        due = min(self._report_time(calls), self._next_lease if self._wanted(calls) else math.inf)
         wait = max(due, self._backoff.next_try) - time.monotonic()
         return min(max(wait, 0.0 if self._session.worker_id else LONGEST_WAIT / 10), LONGEST_WAIT)
 
-    def _report_time(self) -> float:
+    def _report_time(self, calls: Calls) -> float:
         """Return when to report: at once where the coordinator's next tasks may hang on it."""
-        return self._outbox.due if self._waiting or not self._outbox else 0.0
+        is_busy = self._waiting or any(one.parts and not one.node for one in calls)
+        return self._outbox.due if is_busy or not self._outbox else 0.0
 
     def _collect(self, calls: Calls, timeout: float) -> None:
         """Take in what Ray says until nothing is left to take."""
@@ -158,8 +159,7 @@ class Dispatcher:
         """Put the results of a call into the outbox."""
         if isinstance(said, list):
             seconds = time.monotonic() - one.started_at
-            each = {"call_seconds": seconds / len(one.parts)}
-            results = [result.model_copy(update=each) for result in one.results(said)]
+            results = [r.model_copy(update={"call_seconds": seconds / len(one.parts)}) for r in one.results(said)]
             self._pace.note(one, seconds, results)
         elif one.cancelled:
             results = [failed(Reason.exec_timeout, one.cancelled)] * len(one.leases)
