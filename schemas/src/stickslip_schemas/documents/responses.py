@@ -110,8 +110,7 @@ class Validation(Document):
         description="file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
     )
     estimate: Estimate = Field(
-        description="time of all tasks, without cached results: of stages that this service has measured, how long "
-        "such tasks held a slot; of others, the records of the package"
+        description="time of all tasks, without cached results, from what this service or the package has measured"
     )
     certificate: Sha256 | None = Field(description="certificate that covers the dataset; null: none")
     refusal: str | None = Field(

@@ -31,7 +31,9 @@ class Estimate(Document):
     """What a job costs without cached results."""
 
     cpu_seconds: Interval
-    wall_seconds: Interval | None = Field(description="on the slots of the workers that are there; null: none is there")
+    wall_seconds: Interval | None = Field(
+        description="on the slots of the workers that are there, a core each; null: none is there"
+    )
     slots: int = Field(description="tasks that can run at once")
     stages: dict[Stage, Interval] = Field(description="CPU time by stage [s]")
     measured: tuple[Stage, ...] = Field(description="stages whose cost this service has measured")

@@ -19,7 +19,7 @@ from stickslip_services.access.audit_log import note
 from stickslip_services.access.projects import check_quota
 from stickslip_services.catalog.uploads import check_files
 from stickslip_services.database.database import Database, batches
-from stickslip_services.database.tables import dataset_versions, idempotency_keys, jobs, tasks
+from stickslip_services.database.tables import dataset_versions, idempotency_keys, job_stages, jobs, tasks
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.context import Context
@@ -166,9 +166,18 @@ def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Sta
             StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))
             for group, share in groups.items()
         ]
+    kept = job_stages.c  # groups have slot time, whose share of CPU time is that of all jobs of the kind
+    spent = select(kept.stage, func.sum(kept.cpu_seconds) / func.sum(kept.wall_sum)).join(jobs, jobs.c.seq == kept.job)
+    share: dict[str, float] = dict(
+        connection.execute(spent.where(jobs.c.kind == spec.kind, kept.wall_sum > 0).group_by(kept.stage)).all()
+    )
     known = [stage for stage, items in work.items() if all(item.timings is not None for item in items)]
-    found = [(stage, estimate({stage: work[stage]}, slots=1)) for stage in known]
-    return {stage: Interval(median=eta.seconds, low=eta.low, high=eta.high) for stage, eta in found if eta is not None}
+    found = [(estimate({stage: work[stage]}, slots=1), stage, share.get(stage, 1.0)) for stage in known]
+    return {
+        stage: Interval(median=cpu * eta.seconds, low=cpu * eta.low, high=cpu * eta.high)
+        for eta, stage, cpu in found
+        if eta
+    }
 
 
 def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:

@@ -63,16 +63,11 @@ def get_version(request: Request, dataset: str, version: Version, context: Conte
         histograms=histograms(data),
         splits=SPLITS,
         file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
-        card=_listed(data, "README.md"),
-        picture=_listed(data, "preview.webp"),
+        card="README.md" if data.contents.file("README.md") else None,
+        picture="preview.webp" if data.contents.file("preview.webp") else None,
         url=context.settings.url,
         **values,
     )
-
-
-def _listed(data: SampleData, path: str) -> str | None:
-    """Return the path of a file if the version has it, else None."""
-    return None if data.contents.file(path) is None else path
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")

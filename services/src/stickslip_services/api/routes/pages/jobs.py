@@ -113,10 +113,11 @@ def _job(context: Context, connection: Connection, job_id: str) -> dict[str, Any
     seq = int(find_job(connection, job_id).seq)
     job: JobDetail = show_job(context, connection, seq)
     rejected = list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items
+    end = context.clock() if job.finished_at is None else job.finished_at.timestamp()
     return {
         "job": job,
         "durations": stage_durations(connection, seq),
-        "elapsed": _elapsed(job, context),
+        "elapsed": None if job.started_at is None else end - job.started_at.timestamp(),
         "costs": estimated(job.spec, count(job.spec), {}, 0),
         "previews": newest_previews(connection, seq, 24),
         "rejected": rejected,
@@ -124,13 +125,6 @@ def _job(context: Context, connection: Connection, job_id: str) -> dict[str, Any
         "states": JobState,
         "url": context.settings.url,
     }
-
-
-def _elapsed(job: JobDetail, context: Context) -> float | None:
-    if job.started_at is None:
-        return None
-    end = context.clock() if job.finished_at is None else job.finished_at.timestamp()
-    return end - job.started_at.timestamp()
 
 
 @router.get("/ui/jobs/{job_id}/map")
