@@ -12,13 +12,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
-from harness import wait_for
+from harness import command_line, pids, wait_for
 from sqlalchemy import func, select, text
+from stickslip_schemas.base.states import Stage
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import tasks, workers
 from stickslip_testing.invariants import violations
@@ -26,7 +27,7 @@ from stickslip_testing.invariants import violations
 HUB = "10.213.0.1"
 URL = f"http://{HUB}:8765"
 BUCKET = "s3://lab/store"
-RODS = 300
+RODS = 120
 """Samples of each job; there is always one that is not over."""
 CLONE_NEWNET = 0x40000000
 
@@ -113,6 +114,22 @@ class Machine:
             self._process.kill()
             self._process.wait()
             self._process = None
+
+    def processes(self) -> Iterator[tuple[int, str]]:
+        """Yield the pid and the command line of each process."""
+        for pid in pids():
+            with suppress(OSError):
+                if pid != self._holder and Path(f"/proc/{pid}/ns/net").samefile(f"/proc/{self._holder}/ns/net"):
+                    yield pid, command_line(pid)
+
+    def is_at_work(self) -> bool:
+        """Return whether a task runs here: Ray names processes after their tasks."""
+        return any(line.startswith(tuple(f"ray::{stage.value}" for stage in Stage)) for _, line in self.processes())
+
+    def freeze(self) -> None:
+        """Let all processes stop, as those of a machine that hangs."""
+        for pid, _ in self.processes():
+            os.kill(pid, signal.SIGSTOP)
 
     def plug(self, how: str) -> None:
         """Plug the cable in (`up`), or pull it (`down`)."""
@@ -202,6 +219,11 @@ class Lab:
                 error.add_note("\n".join([f"{log.name}:", *(line[:200] for line in lines)]))
             raise
         return time.monotonic() - begin
+
+    def worker(self, name: str) -> dict[str, Any]:
+        """Return the live worker of a name, with how it says that it is, if one exists; otherwise {}."""
+        workers: list[dict[str, Any]] = self._http.get("/v1/workers").json()
+        return next((one for one in workers if one["name"] == name and one["alive"]), {})
 
     def finished(self) -> list[str]:
         """Wait until all jobs are over; return their states."""
