@@ -309,7 +309,9 @@ class Cloth:
                 found = [motion(time) for time in times]
                 held = np.array([np.asarray(one[1], float) for one in found])
                 poses = np.array([[body.pose for body in one[2]] for one in found])
-            corners = [self._surfaces_at(time) for time in times]
+            corners: ArrayLike = np.empty((len(at), 0, 3))
+            if self.surfaces:
+                corners = [self._surfaces_at(time) for time in times]
             points = np.concatenate([np.reshape(held, (len(at), -1, 3)), corners], axis=1)
             return points.reshape(-1, 3), np.reshape(np.asarray(poses, float), (-1, 4))
 
