@@ -84,15 +84,15 @@ class Soak:
         self.clients = [Client(url, patience=PATIENCE) for url in self.urls]
         for number, url in enumerate(self.urls):
             data = settings.data if number == 0 else place / f"data-{number}"
-            words = ["-c", COORDINATOR, "--data", str(data), "--port", url.rpartition(":")[2]]
-            words += ["--store", settings.store_place]
-            self.coordinators.append(Node(f"coordinator {number}", words, place / f"coordinator-{number}.log"))
+            words = ["--data", str(data), "--port", url.rpartition(":")[2], "--store", settings.store_place]
+            log = place / f"coordinator-{number}.log"
+            self.coordinators.append(Node(f"coordinator {number}", COORDINATOR, words, log))
         for number, url in enumerate(self.urls * (3 - coordinators)):
             wait_until(lambda url=url: is_ready(url), seconds=PATIENCE)  # type: ignore[misc]
             data = settings.data if number == 0 or coordinators == 1 else place / f"data-{number}"
             key = (data / "worker-key").read_text().strip()
-            words = ["-c", WORKER, f"worker-{number}", key, settings.store_place, url]
-            self.workers.append(Node(f"worker {number}", words, place / f"worker-{number}.log"))
+            words = [f"worker-{number}", key, settings.store_place, url]
+            self.workers.append(Node(f"worker {number}", WORKER, words, place / f"worker-{number}.log"))
 
     @property
     def client(self) -> Client:
@@ -299,7 +299,7 @@ def main() -> int:
     parser.add_argument("--postgresql", action="store_true")
     options = parser.parse_args()
     random.seed(options.seed)
-    os.environ["STICKSLIP_LEASE_SECONDS"] = "5"
+    os.environ["STICKSLIP_LEASE_SECONDS"] = "10"
     with (
         tempfile.TemporaryDirectory() as folder,
         database_and_bucket() if options.postgresql else nullcontext() as store,

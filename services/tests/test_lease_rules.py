@@ -309,6 +309,19 @@ def test_calls_that_wait_are_gathered_and_fail_together() -> None:
     assert isinstance(four, asyncio.CancelledError)
 
 
+def test_reports_and_requests_show_that_a_worker_is_alive(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit(context)
+    first, second, third = worker.lease(simulate=3)
+    for seconds, act in ((25, lambda: worker.finish(first)), (25, worker.lease)):
+        clock.advance(seconds)
+        act()
+        sweep(context)
+    assert row(context, second.task_id).owner == worker.id
+    assert worker.finish(second, third) == ["accepted"] * 2
+
+
 def test_a_worker_that_was_heard_in_the_future_can_be_lost(
     context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:

@@ -47,6 +47,7 @@ from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
     insert_worker,
+    is_silent,
     note_heard,
     note_seen,
     note_stranded,
@@ -78,6 +79,9 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         waiting = ready or has_runnable_job(connection)
     if due:
         take_back(context)
+    if is_silent(context, worker):
+        with context.database.touch() as connection:
+            note_heard(connection, [worker.id], context.clock())
     if context.store_watch.trouble:
         return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
     if not (ready or due):
@@ -97,7 +101,7 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[LeaseState] | None]:
     """Renew the leases of workers, with two statements for all; return what `sort_out` must look at, None for nothing.
 
-    The time of a worker's last message renews all its leases.
+    The time of a worker's last message, of any sort, renews all its leases.
     """
     now, ids = context.clock(), [message.worker_id for message in messages]
     held: dict[str, dict[tuple[bytes | None, int], Sequence[Any]]] = {worker: {} for worker in ids}
