@@ -84,7 +84,13 @@ OWNED = {
     ("GET", "/datasets/{dataset}/v{version}/samples/{slot}"),
     *(
         ("GET", f"/ui/datasets/{{dataset}}/v{{version}}/{rest}")
-        for rest in ("thumbs", "samples/{slot}/{array}/{index}.png", "samples/{slot}/{array}.json")
+        for rest in (
+            "thumbs",
+            "spec.yaml",
+            "samples/{slot}/motion.json",
+            "samples/{slot}/{array}.mp4",
+            "samples/{slot}/{array}/{index}.png",
+        )
     ),
 }
 """Operations on a thing of a project: 404 for the others."""
