@@ -47,7 +47,6 @@ from stickslip_services.queue.workers import (
     RegisteredWorker,
     find_worker,
     insert_worker,
-    is_silent,
     note_heard,
     note_seen,
     note_stranded,
@@ -79,15 +78,13 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
         waiting = ready or has_runnable_job(connection)
     if due:
         take_back(context)
-    if is_silent(context, worker):
-        with context.database.touch() as connection:
-            note_heard(connection, [worker.id], context.clock())
     if context.store_watch.trouble:
         return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
     if not (ready or due):
         return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
     with context.ledger() as book:
         worker = _unsuperseded(book.connection, worker.id)
+        note_heard(book.connection, [worker.id], book.now)
         grants = grant_leases(book, worker, wanted, context.settings, at_most=request.at_most_seconds)
     # The dependencies of these tasks have ended, so composing them needs no write transaction.
     with context.database.read() as connection:
@@ -101,7 +98,7 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
 def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[LeaseState] | None]:
     """Renew the leases of workers, with two statements for all; return what `sort_out` must look at, None for nothing.
 
-    The time of a worker's last message, of any sort, renews all its leases.
+    The time of a worker's last message, also a report, renews all its leases.
     """
     now, ids = context.clock(), [message.worker_id for message in messages]
     held: dict[str, dict[tuple[bytes | None, int], Sequence[Any]]] = {worker: {} for worker in ids}

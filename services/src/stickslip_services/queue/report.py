@@ -36,7 +36,7 @@ from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.ledger import HELD_COLUMNS, LIVE, Ending, HeldTask, Ledger, start_tasks
 from stickslip_services.queue.recompute import recompute
 from stickslip_services.queue.retries import fail_tries, give_back, lose
-from stickslip_services.queue.workers import find_worker, is_silent, note_heard
+from stickslip_services.queue.workers import find_worker, note_heard
 
 Verdict = Literal["accepted", "duplicate", "stale"]
 
@@ -94,8 +94,7 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
     reports = [_checked_in_store(context, report, versions) for report in batch.reports]
     with context.ledger() as book:
         worker = find_worker(book.connection, batch.worker_id)
-        if is_silent(context, worker):
-            note_heard(book.connection, [worker.id], book.now)
+        note_heard(book.connection, [worker.id], book.now)
         verdicts, released, ended = _judged(book, worker.id, reports, versions)
         failed = _take_results(book, ended, versions)
         give_back(book, released)

@@ -144,11 +144,6 @@ def note_seen(connection: Connection, worker_id: str, now: float, condition: Wor
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
 
-def is_silent(context: Context, worker: RegisteredWorker) -> bool:
-    """Return whether a worker's last message is older than a quarter of a lease."""
-    return context.clock() - worker.last_seen_at > context.settings.lease_seconds / 4
-
-
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:
     """Return the number of tasks of a job that can run at once; `builds` is JSON, None for an unplanned job."""
     if builds is None:
