@@ -91,6 +91,9 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert "samples_per_shard: 2" in page
     assert page.count("/v1/previews/") == 6
     assert "gamma 1, phi1 1: 1 of 1 done" in read(client, f"/ui/jobs/{job}/map")
+    slowest = read(client, f"/ui/jobs/{job}/slowest")
+    assert slowest.count("/v1/tasks/") == 8
+    assert slowest.count("<td>1.0 s</td><td>2.0 s</td>") == 8  # PretendWorker reports so much each
     assert re.search(r"[\d.]+ s of CPU time so far; without cached tasks, about [\d.]+ s is usual", page)
     path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
     assert path is not None
@@ -169,6 +172,7 @@ def test_what_failed_is_shown_with_its_reproducer(
     page = read(client, f"/jobs/{job}")
     assert "it crashed at line 7" in page
     assert "quarantined: 1 of the newest 1" in page
+    assert "No task of this job has ended yet" in read(client, f"/ui/jobs/{job}/slowest")
     assert "python -m stickslip_workers replay" in page
 
 

@@ -12,12 +12,12 @@ from stickslip_services.access.asker import own, own_task
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest, read_page
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import job_stages, jobs, previews, samples, tasks
+from stickslip_services.database.tables import job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.damage import check_results, check_samples, terms_of
 from stickslip_services.queue.eta import StageTimings, read_costs
-from stickslip_services.queue.ids import SAMPLE_COLUMNS
+from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
@@ -154,6 +154,18 @@ def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTiming
     """Return the measured durations of the tasks that a job had to run, by stage."""
     rows = connection.execute(select(job_stages).where(job_stages.c.job == job))
     return {Stage(row.stage): StageTimings(row.wall_count, row.wall_sum, row.wall_squares) for row in rows}
+
+
+def slowest_tasks(connection: Connection, job: int, count: int) -> list[dict[str, Any]]:
+    """Return the finished tasks of a job that took longest, with names, cost groups and durations [s]."""
+    rows = connection.execute(
+        select(*(tasks.c[name] for name in ("key", "stage", "cost_group", "cpu_seconds", "wall_seconds")))
+        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+        .where(job_tasks.c.job == job, tasks.c.wall_seconds.is_not(None))
+        .order_by(tasks.c.wall_seconds.desc())
+        .limit(count)
+    )
+    return [{**row, "task_id": task_id(row.stage, row.key)} for row in rows.mappings()]
 
 
 def is_preview(connection: Connection, digest: str) -> bool:

@@ -31,6 +31,7 @@ from stickslip_services.queue.jobs import (
     list_samples,
     newest_previews,
     show_job,
+    slowest_tasks,
     stage_durations,
 )
 from stickslip_services.queue.retries import failed_tasks
@@ -42,6 +43,8 @@ router = APIRouter()
 SHOWN_JOBS = 50
 
 SHOWN_LOST = 50
+
+SHOWN_SLOWEST = 8
 
 MOST_SAMPLES = 20_000
 """Larger grids have no map, because reading the states of so many samples takes seconds."""
@@ -141,6 +144,14 @@ def get_job_map(job_id: str, context: ContextDep) -> Response:
     states = [[sample.state in of for sample in samples] for of in ((TaskState.succeeded,), LOST)]
     maps = grid_maps(spec, *(np.array(flags) for flags in states), most=3)
     return html_page("map.html", maps=maps, count=spec.sample_count)
+
+
+@router.get("/ui/jobs/{job_id}/slowest")
+def get_slowest(job_id: str, context: ContextDep) -> Response:
+    """Show the finished tasks of a job that took longest."""
+    with context.database.read() as connection:
+        slowest = slowest_tasks(connection, int(find_job(connection, job_id).seq), SHOWN_SLOWEST)
+    return html_page("slowest.html", slowest=slowest)
 
 
 @router.post("/ui/jobs/{job_id}/{verb}")
