@@ -154,12 +154,22 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
 
 
 @pytest.mark.physics
-def test_half_of_each_batch_is_of_the_clips(few):
-    black = replace(some_clips(few).train, mu=np.full(18, 9.0))
-    learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=6), RenderedClips(black, some_clips(few).validation))
-    crops, direction, material, mu, _ = learner.batch(0)
-    assert len(crops) == len(direction) == len(material) == 6
-    assert (mu == 9.0).tolist() == [False] * 3 + [True] * 3
+def test_half_of_each_batch_is_of_the_clips_and_some_of_them_are_mirrored(few):
+    clips = some_clips(few)
+    known = replace(clips.train, mu=np.full(18, 9.0))
+    learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16), RenderedClips(known, clips.validation))
+    crops, direction, material, mu, cover = learner.batch(0)
+    assert len(crops) == len(direction) == len(material) == 16
+    assert (mu == 9.0).tolist() == [False] * 8 + [True] * 8
+
+    def likest(flipped):
+        """Return how far each cover is from the nearest of the clips."""
+        parts = known.cover.flip(3) if flipped else known.cover
+        return torch.cdist(cover[8:].flatten(1), parts.flatten(1)).min(dim=1).values
+
+    mirrored = likest(True) < likest(False)
+    assert 0 < mirrored.sum() < 8
+    assert (direction[8:][mirrored, None] * torch.tensor([1.0, -1.0, 1.0]) == known.direction).all(2).any(1).all()
 
 
 @pytest.mark.physics

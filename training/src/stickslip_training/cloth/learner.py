@@ -218,7 +218,8 @@ class FrictionLearner(Learner):
         seeds = (self.settings.seed, TRAINING, step)
         random = np.random.default_rng(seeds)
         generator = torch.Generator().manual_seed(seed_of_step(*seeds))
-        count = self.settings.batch_size
+        some = 0 if self.clips is None else self.settings.batch_size // 2
+        count = self.settings.batch_size - some
         chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
         share = random.random(count, dtype=np.float32)
         near = torch.from_numpy(share)[:, None, None, None, None]
@@ -235,24 +236,27 @@ class FrictionLearner(Learner):
         rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, cover
         if self.clips is None:
             return rendered
-        some = self.clips.train[random.integers(len(self.clips.train), size=count // 2)]
-        given = self.elsewhere(some, generator)
-        kept = count - len(some)
-        a, b, c, d, e = (torch.cat([first[:kept], second]) for first, second in zip(rendered, given, strict=True))
+        given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
+        a, b, c, d, e = (torch.cat(both) for both in zip(rendered, given, strict=True))
         return a, b, c, d, e
 
     def elsewhere(
         self, clips: Clips, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return clips over dark floors as part of a batch: each in a world that is drawn about its cloth."""
+        """Return clips over dark floors as part of a batch: half of them mirrored, each in a world that is drawn about
+        its cloth."""
+        mirrored = torch.rand(len(clips), 1, 1, 1, generator=generator) < 0.5
+        dark, cover = (torch.where(mirrored, part.flip(3), part) for part in (clips.crops, clips.cover))
+        across = torch.tensor([1.0, -1.0, 1.0])
+        direction = torch.where(mirrored[:, 0, 0], across * clips.direction, clips.direction)
         looks = draw_style(len(clips), len(self.frames), generator)
-        cloth, world = cloth_of_clip(clips.crops, clips.cover, looks, draw_world(len(clips), generator), generator)
+        cloth, world = cloth_of_clip(dark, cover, looks, draw_world(len(clips), generator), generator)
         axes = torch.stack([torch.tensor(camera.rotation[2]) for camera in self.rig])
-        near = torch.cdist(clips.direction, axes).argmin(dim=1)
+        near = torch.cdist(direction, axes).argmin(dim=1)
         cameras = Cameras.of([self.rig[place] for place in near.tolist()])
         crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
         mu = torch.from_numpy(clips.mu.astype(np.float32))
-        return crops, clips.direction, torch.from_numpy(clips.material), mu, cloth.alpha
+        return crops, direction, torch.from_numpy(clips.material), mu, cloth.alpha
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
