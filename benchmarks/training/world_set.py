@@ -199,15 +199,16 @@ def main() -> None:
     parser.add_argument("model", type=Path, nargs="?", default=WEIGHTS)
     parser.add_argument("runs", type=Path)
     parser.add_argument("clips", type=Path, nargs="+")
+    parser.add_argument("--factors", nargs="+", choices=FACTORS, default=list(FACTORS), metavar="FACTOR")
     parser.add_argument("--record", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
     model = load_friction(args.model)
     rows: dict[str, Any] = {}
     started = time.process_time()
-    for name, steps in FACTORS.items():
-        for floor, parts in [("", args.clips), *((f" / {path.stem}", [path]) for path in args.clips)]:
-            clips = Clips.joined([filmed(path, model.materials, steps) for path in parts])
+    for name in args.factors:
+        films = [(f" / {path.stem}", filmed(path, model.materials, FACTORS[name])) for path in args.clips]
+        for floor, clips in [("", Clips.joined([clips for _, clips in films])), *films]:
             found = estimates(model.estimate(clips).mu, model.bins)
             told = errors(found, clips.mu, clips.run)
             refused = sum(reason is not None for reason in model.judge(clips)[1])
