@@ -66,11 +66,11 @@ def finish(context: Context, worker: PretendWorker, clock: ManualClock, job: str
 
 
 @pytest.mark.slow
-def test_200_rotten_artifacts_are_mended(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_100_rotten_artifacts_are_mended(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
     rng = random.Random(3)
     gammas = [1.0, 2.0, 3.0]
     finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
-    for round_ in range(20):
+    for round_ in range(10):
         for path in rng.sample(artifacts(directory(worker)), 10):
             rot(path, rng)
         finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
