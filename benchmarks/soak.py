@@ -258,7 +258,8 @@ class Soak:
         """Compare each coordinator's last life after its warm-up with its end; yield what grows."""
         for node in self.coordinators:
             life = self.use.get(node.pid, [])
-            early = [use for use in life if WARM_UP <= use.at - life[0].at < WARM_UP + 30]
+            warm = [use for use in life if use.at - life[0].at >= WARM_UP]
+            early = [use for use in warm if use.at < warm[0].at + 30]
             late = [use for use in life if use.at > life[-1].at - 30]
             if not early or early[-1].at > late[0].at:
                 yield f"{node.name}: its last life is too short to tell whether its memory grows; run for longer"
