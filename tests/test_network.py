@@ -10,6 +10,7 @@ import re
 import secrets
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 import pytest
 import stickslip_workers
 import yaml
+from harness import wait_for
 from machines import BUCKET, URL, Lab, Machine, dispatch
 
 CHART = Path(__file__).parents[1] / "deploy" / "helm" / "stickslip"
@@ -165,4 +167,100 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
         states = lab.finished()
     assert states == ["succeeded"] * len(states)
     assert lab.sums()[0] == 0
+    assert lab.faults() == []
+
+
+PROVIDER = """
+from ray.autoscaler._private.fake_multi_node.node_provider import FakeMultiNodeProvider
+
+class Provider(FakeMultiNodeProvider):
+    # Ray takes no `memory` among the resources of a node that it starts, and finds out how much there is.
+    def _create_node_with_resources_and_labels(self, node_config, tags, count, resources, labels):
+        resources = {name: value for name, value in resources.items() if name != "memory"}
+        super()._create_node_with_resources_and_labels(node_config, tags, count, resources, labels)
+"""
+AUTOSCALING = """
+cluster_name: fake
+max_workers: 2
+idle_timeout_minutes: 0.1
+setup_commands: []
+head_setup_commands: []
+worker_setup_commands: []
+initialization_commands: []
+head_start_ray_commands: []
+worker_start_ray_commands: []
+file_mounts: {{}}
+cluster_synced_files: []
+file_mounts_sync_continuously: false
+auth: {{}}
+upscaling_speed: 1.0
+provider:
+  type: external
+  module: fake_nodes.Provider
+  gcs_address: {address}
+  head_node_id: {head}
+  launch_multiple: true
+head_node_type: ray.head.default
+available_node_types:
+  ray.head.default: {{resources: {{CPU: 0}}, node_config: {{}}, max_workers: 0}}
+  worker:
+    resources: {{CPU: 1, memory: 4294967296, object_store_memory: 134217728}}
+    node_config: {{}}
+    min_workers: 0
+    max_workers: 2
+"""
+
+
+def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
+    hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ray's autoscaler, version 2, with nodes that are processes of one machine, and without a token."""
+    head = "f" * 51 + "0" * 5
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", raising=False)
+    for name, value in {
+        "RAY_AUTH_MODE": "disabled",
+        "RAY_FAKE_CLUSTER": "1",
+        "RAY_enable_autoscaler_v2": "1",
+        "RAY_CLOUD_INSTANCE_ID": head,
+        "RAY_OVERRIDE_NODE_ID_FOR_TESTING": head,
+        "AUTOSCALER_UPDATE_INTERVAL_S": "1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    with ExitStack() as stack:
+        machine = Machine("head", 41, hub, stack)
+        address = f"{machine.address}:6379"
+        (tmp_path / "fake_nodes.py").write_text(PROVIDER)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        config = tmp_path / "autoscaling.yaml"
+        config.write_text(AUTOSCALING.format(address=address, head=head))
+        ray = f"ray start --head --node-ip-address={machine.address} --port=6379 --num-cpus=0 --include-dashboard=false"
+        ray += f" --object-store-memory=134217728 --disable-usage-stats --autoscaling-config={config}"
+        words = [*dispatch("scaled", tmp_path), "--ray-address", address]
+        words = [word for word in words if word not in ("--max-cpus", "1")]
+        machine.start(["sh", "-c", f'{ray} && exec "$@"', "sh", *words], tmp_path / "head.log")
+
+        wait_for(
+            "the dispatcher", lambda: lab.worker("scaled").get("condition", {}).get("state") == "ready" or None, 240
+        )
+        from ray._raylet import GcsClient  # type: ignore[attr-defined]
+
+        found = GcsClient(address=address).get_all_node_info  # what `ray status` asks
+
+        def nodes() -> int:
+            """Return how many nodes there are beside the head."""
+            return int(sum(node.state == 0 for node in found().values())) - 1
+
+        assert nodes() == 0
+        begin = time.monotonic()
+        lab.keep_busy()
+        wait_for("two nodes", lambda: True if nodes() == 2 else None, 240)
+        up = time.monotonic() - begin
+        states = lab.finished()
+        begin = time.monotonic()
+        wait_for("no nodes", lambda: True if nodes() == 0 else None, 120)
+        with capsys.disabled():
+            down, load = time.monotonic() - begin, os.getloadavg()[0]
+            print(f"    0 -> 2 nodes after {up:.1f} s, 2 -> 0 {down:.1f} s after the job, load {load:.1f}", flush=True)
+    assert states == ["succeeded"]
     assert lab.faults() == []
