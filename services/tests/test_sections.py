@@ -13,7 +13,6 @@ from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 from stickslip_services.app import make_app
-from stickslip_services.cli import app
 from stickslip_services.client.errors import ForeignFilesError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
@@ -28,7 +27,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker, rejection
-from typer.testing import CliRunner
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)
 """With two phi1 and two slots to a shard: slots 0 to 7, and a section for each two of them."""
@@ -91,7 +89,6 @@ def test_a_pull_brings_the_sections_and_a_second_one_nothing(
         keys = list(contents.sample_keys())
 
         assert list(client.contents(dataset, 1).sample_keys()) == keys
-    assert CliRunner().invoke(app, ["datasets", "diff", dataset, str(tmp_path / "d"), "--url", url]).exit_code == 0
 
 
 def test_files_and_pages_of_sections_are_served(origin: tuple[str, str, PretendWorker]) -> None:

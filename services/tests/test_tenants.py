@@ -77,7 +77,7 @@ OWNED = {
         for rest in ("", "/manifest", "/files/{path:path}")
     ),
     ("GET", "/jobs/{job_id}"),
-    *(("GET", f"/ui/jobs/{{job_id}}{rest}") for rest in ("", "/map")),
+    *(("GET", f"/ui/jobs/{{job_id}}{rest}") for rest in ("", "/map", "/slowest")),
     ("POST", "/ui/jobs/{job_id}/{verb}"),
     ("GET", "/datasets/{dataset}"),
     ("GET", "/datasets/{dataset}/v{version}"),

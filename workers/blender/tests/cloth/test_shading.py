@@ -82,4 +82,4 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
     for channel, video in enumerate(videos):
         found = pooled([(reference.errors(video, channel), reference.regions)])
         assert min(found.psnr) > 27.0, names[channel]
-        assert found.psnr[0] > 36.0, names[channel]
+        assert found.psnr[0] > 35.0, names[channel]
