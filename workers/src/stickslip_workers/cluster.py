@@ -3,7 +3,9 @@
 import contextlib
 import logging
 import os
+import signal
 import socket
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +47,10 @@ class Place:
                 host, _, port = address.rpartition(":")
                 if host:  # Ray itself would wait for long where nobody listens
                     socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
+                handler = signal.getsignal(signal.SIGTERM)
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+                if threading.current_thread() is threading.main_thread():
+                    signal.signal(signal.SIGTERM, handler)  # Ray has put its own in place, which exits at once
                 return
             except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
                 log.info("no Ray at %s yet: %s", self.where, error)
