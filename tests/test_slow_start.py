@@ -17,7 +17,8 @@ if os.environ["SLOW"] == "all" or "agent" in line:
     time.sleep({"all": 20, "agents": 25}[os.environ["SLOW"]])
 """
 
-pytestmark = [pytest.mark.slow, pytest.mark.real, pytest.mark.timeout(400)]
+# One after the other: each takes half of its time limit alone.
+pytestmark = [pytest.mark.slow, pytest.mark.real, pytest.mark.timeout(400), pytest.mark.xdist_group("slow-start")]
 
 
 @pytest.mark.parametrize("what", ["agents", "all"])
