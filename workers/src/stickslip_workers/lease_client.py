@@ -308,7 +308,7 @@ class Session(threading.Thread):
         self._coordinator.close()
 
     def run(self) -> None:
-        """Keep the session until `stop`."""
+        """Keep the session until `close`."""
         backoff = Backoff()
         while not self._ended:
             try:

@@ -17,6 +17,8 @@ PACK_SECONDS = 0.03
 """CPU time of packing a sample [s]."""
 PUBLISH_SECONDS = 0.1
 """CPU time of publishing a shard [s]."""
+UNSURE = 2.0
+"""80 % of renders, packs and publishes are taken to be within this factor of their usual time."""
 
 
 class Interval(Document):
@@ -45,9 +47,9 @@ def estimated(spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval],
     shaded = 0.0 if not counts.renders else usual.start + counts.shadings * usual.shade + counts.renders * usual.render
     stages = {
         Stage.simulate: _within(counts.simulations * usual.simulate, usual.unsure),
-        Stage.render: _within(shaded, 2.0),
-        Stage.pack: _within(counts.samples * PACK_SECONDS, 2.0),
-        Stage.publish: _within(counts.shards * PUBLISH_SECONDS, 2.0),
+        Stage.render: _within(shaded, UNSURE),
+        Stage.pack: _within(counts.samples * PACK_SECONDS, UNSURE),
+        Stage.publish: _within(counts.shards * PUBLISH_SECONDS, UNSURE),
     } | dict(measured)
     totals = {name: sum(getattr(stage, name) for stage in stages.values()) for name in Interval.model_fields}
     wall = Interval(**{name: total / slots for name, total in totals.items()}) if slots else None

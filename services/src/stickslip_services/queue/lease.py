@@ -225,9 +225,8 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
 def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:
     """Renew every lease: while the coordinator was down, no heartbeat could arrive."""
     connection.execute(update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + lease_seconds))
-    connection.execute(
-        update(workers).where(workers.c.last_seen_at > now).values(last_seen_at=now)
-    )  # a clock was ahead
+    ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
+    connection.execute(update(workers).where(ahead).values(last_seen_at=now))
 
 
 def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:

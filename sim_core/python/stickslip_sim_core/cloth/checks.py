@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.presets import STEP_ERROR
 from stickslip_sim_core.cloth.solver import Cloth
 
 
@@ -58,7 +59,7 @@ CHECKS = (
         "jumps",
         "distance of a body, holder or surface from an even motion within a step, over the preset's step error",
         "1",
-        lambda seen: seen.cloth.uneven / (seen.cloth.preset.step_error or 2e-4),
+        lambda seen: seen.cloth.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
         1.0,
         "steps are halved until it is 0.25; where the shortest are not enough, something jumps or is shaken by 40 g",
     ),

@@ -9,6 +9,9 @@ import numpy as np
 
 from stickslip_sim_core import _sim_core
 
+STEP_ERROR = 2e-4
+"""Step error of `certified` [m]. Presets that choose no steps are judged by it, too."""
+
 
 @dataclass(frozen=True)
 class SolverSettings:
@@ -43,7 +46,7 @@ class SolverSettings:
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
 
-    step_error: float | None = 2e-4
+    step_error: float | None = STEP_ERROR
     """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
 
     longest_step: float = 0.125
