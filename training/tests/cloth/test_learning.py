@@ -8,16 +8,15 @@ from stickslip_training.cloth.runs import split_runs
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)  # two minutes of CPU time, on machines that may have a lot else to do
+@pytest.mark.timeout(1800)  # three minutes of CPU time, on machines that may have a lot else to do
 def test_friction_of_unseen_simulations_is_learned_from_clips(runs):
     train, validation, test = split_runs(runs, (0.1, 0.22), 0)
     assert 65 <= len(train) <= 70
-    model = train_friction(train, validation, ClothTraining(steps=450, worlds=False), epoch=150)
+    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False), epoch=150)
     clips = render_clips(test, 6, 99)
     scores = score(model.estimate(clips), clips)
     assert scores.blind.simulations >= 20
-    # Measured 0.134 and 0.74 (900 steps: under 0.13 and over 0.75); the prior has 0.4 and 0.25.
-    assert scores.blind.mae.value <= 0.16
-    assert scores.blind.within_02.value >= 0.68
+    assert scores.blind.mae.value <= 0.13
+    assert scores.blind.within_02.value >= 0.75
     assert scores.top_1 is not None
     assert scores.top_1.value >= 0.7
