@@ -1,10 +1,10 @@
 """A job of a million samples, with workers that only pretend: what the service itself costs.
 
-    python benchmarks/million.py plan [--samples 1000000]
+    python benchmarks/million.py plan [--samples 1000000] [--database postgresql://...]
     python benchmarks/million.py publish [--samples 1000000] [--delay 0.025]
 
 `plan`: how long the answer to the submission takes; then, while the coordinator plans, how long leases of another job
-take, and what planning costs it.
+take, and what planning costs it; then the same while the job is cancelled. `--database` is empty.
 
 `publish`: a planned job of which every task but the last is said to have ended, in a store that answers each request
 after `--delay` seconds, whatever it asks. How long the coordinator takes to compose the last task, a worker to publish,
@@ -36,6 +36,7 @@ from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
+from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest
 from stickslip_services.queue.planner import Planner
@@ -47,6 +48,9 @@ from stickslip_testing.worker import DirectApi, PretendWorker
 
 BEFORE_SECONDS = 5.0
 """How long leases are measured while nothing is planned [s]."""
+
+MOST_SECONDS = 120.0
+"""How long leases are measured while a job is cancelled [s]."""
 
 
 def cpu_seconds(pid: int) -> float:
@@ -114,7 +118,21 @@ def plan(samples: int) -> dict[str, Any]:
         result["state"], result["tasks"] = job["state"], job["progress"]["total"]
         result["lease_seconds_before"], result["lease_seconds_while_planning"] = told(before), told(during)
         result["coordinator_peak_mb"] = round(peak_megabytes(pid), 1)
-        result["database_mb"] = round((Path(directory) / "coordinator.sqlite3").stat().st_size / 1e6, 1)
+        if (file := Path(directory) / "coordinator.sqlite3").exists():
+            result["database_mb"] = round(file.stat().st_size / 1e6, 1)
+        begin = time.perf_counter()
+        client.post(f"/v1/jobs/{job['id']}:cancel").raise_for_status()
+        result["cancel_seconds"] = round(time.perf_counter() - begin, 3)
+        leases: list[float] = []
+        reads: list[float] = []
+        while job["state"] != "cancelled" and time.perf_counter() < begin + MOST_SECONDS:
+            leases.append(worker.lease())
+            asked = time.perf_counter()
+            job = client.get(f"/v1/jobs/{job['id']}").json()
+            reads.append(time.perf_counter() - asked)
+            time.sleep(0.05)
+        result["state"], result["cancelling_seconds"] = job["state"], round(time.perf_counter() - begin, 1)
+        result["lease_seconds_while_cancelling"], result["read_seconds_while_cancelling"] = told(leases), told(reads)
     return result
 
 
@@ -316,8 +334,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("plan", "publish"))
     parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--database", help="URL of an empty PostgreSQL database, for plan")
     parser.add_argument("--delay", type=float, default=0.025, help="of each request to the store [s]")
     arguments = parser.parse_args()
+    if arguments.database is not None:
+        os.environ[DATABASE_VARIABLE] = arguments.database
     measure = plan if arguments.what == "plan" else partial(publish, delay=arguments.delay)
     print(json.dumps(measure(arguments.samples), indent=2))
 

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
+from stickslip_schemas.documents.worker_api import Heartbeat
 from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods
@@ -126,6 +127,15 @@ def test_a_body_that_is_not_json_is_refused(
     untouched: tuple[httpx.Client, PretendWorker], what: str, path: str
 ) -> None:
     problem(untouched[0].post(path, content=BAD_BODIES[what], headers=JSON), 400, "malformed_body")
+
+
+def test_a_key_twice_is_refused_in_a_message_that_is_right_otherwise(
+    client: httpx.Client, worker: PretendWorker
+) -> None:
+    body = Heartbeat(worker_id=worker.id, leases=(), condition=worker.condition).model_dump_json()
+    assert client.post("/v1/worker/heartbeat", content=body, headers=JSON).json() == {"drop": []}
+    twice = body.replace('"leases":[]', '"leases":[],"leases":[]')
+    problem(client.post("/v1/worker/heartbeat", content=twice, headers=JSON), 400, "malformed_body")
 
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e400"])

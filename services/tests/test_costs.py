@@ -298,6 +298,9 @@ def test_frames_of_running_simulations_are_shown(context: Context, worker: Prete
     assert told() == (60, 300)
     worker.finish(first)
     assert told() is None  # what has ended does not count, though the worker has told nothing new
+    beat((second, (100, 300)))
+    worker.register().start(*worker.lease(simulate=2))
+    assert told() is None  # what an earlier session has told does not count either
 
 
 def test_no_time_is_told_before_enough_was_measured(context: Context, worker: PretendWorker) -> None:

@@ -9,6 +9,7 @@ standard output means that requests are answered.
 
 import argparse
 import asyncio
+import gc
 import json
 import logging
 import socket
@@ -109,6 +110,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         openapi_url="/openapi.json",
+        telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.context = context
     app.state.metrics = metrics
@@ -116,10 +118,9 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.renewals = workers.Gathering(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
-    routers = [module.router for module in (workers, jobs, uploads, datasets, certificates, health, pages)]
-    for router in routers:
-        app.include_router(router)
-    app.state.routes = [route for router in routers for route in router.routes]
+    modules = (workers, jobs, uploads, datasets, certificates, health, pages)
+    app.state.routes = [route for module in modules for route in module.router.routes]
+    app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
@@ -146,6 +147,7 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        gc.freeze()  # what is made by now stays: to look through it again and again stops all requests for 50 ms
         if self.started:
             sys.stdout.write(f"listening on {self._url}\n")
             sys.stdout.flush()

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import secrets
-from functools import lru_cache
 
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.base.states import Stage
@@ -28,7 +27,6 @@ def task_id(stage: str, key: bytes) -> str:
     return f"{stage}-{key.hex()}"
 
 
-@lru_cache(maxsize=10_000)
 def task_key(name: str) -> bytes | None:
     """Return the content key in the name of a task; None for any other text."""
     stage, _, key = name.partition("-")

@@ -63,6 +63,8 @@ def register_worker(context: Context, registration: WorkerRegistration) -> Worke
         worker = insert_worker(book.connection, registration, book.now)
         message = f"worker {registration.name} was started anew"
         lose(book, find_held(book, old), context.settings, message=message)
+    for earlier in old:
+        context.frames_by_worker.pop(earlier, None)
     plan_waiting_jobs(context)
     note_stranded(context)
     return WorkerSession(worker_id=worker.id, lease_seconds=context.settings.lease_seconds)
@@ -101,12 +103,12 @@ def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[L
     The time of a worker's last message, also a report, renews all its leases.
     """
     now, ids = context.clock(), [message.worker_id for message in messages]
-    held: dict[str, dict[tuple[bytes | None, int], Sequence[Any]]] = {worker: {} for worker in ids}
+    held: dict[str, dict[tuple[str, int], Sequence[Any]]] = {worker: {} for worker in ids}
     is_news = False
     with context.database.touch() as connection:
         known = note_heard(connection, ids, now)
         for worker, key, token, *state in _HELD.tuples(connection, {"b_workers": ids}):
-            held[worker][key, token] = state
+            held[worker][key.hex(), token] = state
         for message in messages:
             before = known.get(message.worker_id, message.condition)
             if message.condition != before:
@@ -118,7 +120,7 @@ def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[L
     for message in messages:
         mine, left, listed = held[message.worker_id], [], set()
         for lease in message.leases:
-            name = task_key(lease.task_id), lease.token
+            name = lease.task_id.rpartition("-")[2], lease.token
             state, _, runnable_job = mine.get(name, _GONE)
             if runnable_job is None or state not in _GOES_ON[lease.started]:
                 left.append(lease)

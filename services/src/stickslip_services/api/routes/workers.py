@@ -38,9 +38,9 @@ MOST_ON_LOOP = 64 * 2**10
 MOST_TOGETHER = 64
 """Heartbeats that are answered with one statement: about 5 ms."""
 
-_LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest)
-_HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat)
-_REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch)
+_LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest, from_workers=True)
+_HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat, from_workers=True)
+_REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch, from_workers=True)
 
 
 class _Plain(APIRoute):
