@@ -147,7 +147,7 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
-        gc.freeze()  # what is made by now stays: to look through it again and again stops all requests for 50 ms
+        gc.freeze()  # modules and application stay: each look through them would stop all requests for 50 ms
         if self.started:
             sys.stdout.write(f"listening on {self._url}\n")
             sys.stdout.flush()
