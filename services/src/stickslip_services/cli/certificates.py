@@ -30,7 +30,7 @@ def certify(
 ) -> None:
     """Measure a preset on the physical protocols, and register the certificate with the coordinator.
 
-    A full certificate of a cloth preset takes about three minutes of CPU time. It vouches for this build and preset
+    A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this build and preset
     only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     screen = console()
