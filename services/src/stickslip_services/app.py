@@ -44,7 +44,7 @@ from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
-from stickslip_services.local.process import configure_logging, listen, locked
+from stickslip_services.local.process import configure_logging, limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import give_up_waiting
@@ -183,6 +183,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.write(f"error: {error}\n")
         return 2
     configure_logging()
+    limit_arenas()
     try:
         if is_migrating:
             check_database(settings, Role.visitor, with_store=True)
