@@ -31,7 +31,7 @@ from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 from stickslip_schemas.scene.sheets import FileMesh
-from stickslip_schemas.spec.axes import SobolAxis, range_values
+from stickslip_schemas.spec.axes import SobolAxis, drawn_values
 from stickslip_schemas.spec.fabrics import Material
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import Cloth
@@ -73,7 +73,7 @@ def spec(name: str, samples: int, files: dict[str, bytes], *, coarse: bool, defa
             found: list[Any] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
         else:
             sobol = SobolAxis[float](type="sobol", low=given.low or 0.0, high=given.high or 0.0, num=samples)
-            found = range_values(sobol, dimension=dimension).tolist()
+            found = drawn_values(sobol, dimension=dimension).tolist()
         axes[parameter] = [default, *found[1:]] if defaults else found
     cameras = scene.looks.cameras
     viewpoint = next(iter(cameras)) if isinstance(cameras, dict) else "front"

@@ -4,7 +4,7 @@ from importlib import metadata
 
 project = "stickslip"
 author = "The stickslip authors"
-release = metadata.version("stickslip-services")
+release = metadata.version("stickslip")
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["README.md"]
 html_theme = "furo"

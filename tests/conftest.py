@@ -49,7 +49,7 @@ def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
     """The coordinator with its database and its bucket."""
     pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip-services[postgresql]'")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'")
     from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner, Result
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
@@ -14,7 +15,6 @@ from stickslip_services.client.http import Client
 from stickslip_services.local.certifying import read_certificate
 from stickslip_testing.servers import RunningServer, served
 from stickslip_testing.worker import BUILDS
-from typer.testing import CliRunner, Result
 
 CLOTH = {
     "kind": "cloth_drag",

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from click.testing import CliRunner
 from stickslip_services.app import main as coordinator
 from stickslip_services.cli import app
 from stickslip_workers.__main__ import main as workers
-from typer.testing import CliRunner
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
@@ -20,7 +21,6 @@ from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
 from stickslip_sim_core.scenes.cloth_scene import KIND
 from stickslip_workers.builds import solver_build
-from typer.testing import CliRunner
 
 SOLVER = "stickslip_sim_core.cloth"
 SCENE: dict[str, Any] = {

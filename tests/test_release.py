@@ -1,6 +1,7 @@
 """What a release needs: one version, licences, complete metadata, and wheels that install into a bare environment."""
 
 import os
+import resource
 import subprocess
 import sys
 import tomllib
@@ -54,18 +55,41 @@ def test_the_version_is_written_once() -> None:
         assert f'version = "{VERSION}"' not in text
 
 
+PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("wheels")
+    for name in (*PURE, "sim_core"):
+        subprocess.run([*PIP, "wheel", "--no-deps", "--wheel-dir", str(found), str(ROOT / name)], check=True)
+    return found
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_wheels_install_into_a_bare_environment(tmp_path: Path) -> None:
+def test_the_client_is_15_packages_of_60_megabytes(wheels: Path, tmp_path: Path) -> None:
+    place = tmp_path / "venv"
+    venv.create(place, with_pip=False)
+    python = str(place / "bin" / "python")
+    install = [*PIP, "--python", python, "install", "--find-links", str(wheels)]
+    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), "stickslip"], check=True, cwd=tmp_path)
+    packages = list(place.glob("lib/python3*/site-packages/*.dist-info"))
+    assert len(packages) <= 15, packages
+    assert sum(file.stat().st_size for file in place.rglob("*") if file.is_file() and not file.is_symlink()) < 60e6
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    subprocess.run([str(place / "bin" / "stickslip"), "--help"], check=True, stdout=subprocess.DEVNULL)
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_wheels_install_into_a_bare_environment(wheels: Path, tmp_path: Path) -> None:
     """Constraints pin what the index resolves; pip's own configuration says where it is."""
-    wheels = tmp_path / "wheels"
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    for name in (*PURE, "sim_core"):
-        subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", str(wheels), str(ROOT / name)], check=True)
     place = tmp_path / "venv"
     venv.create(place, with_pip=True)
     python = str(place / "bin" / "python")
-    names = ["stickslip-services[server]", "stickslip-training", "stickslip-sim-core"]
+    names = ["stickslip[arrays,server,train]", "stickslip-sim-core"]
     install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--find-links", str(wheels)]
     subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), *names], check=True, cwd=tmp_path)
     bare = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}

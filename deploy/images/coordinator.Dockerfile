@@ -11,7 +11,7 @@ COPY schemas schemas
 COPY services services
 # The constraints fix the version of every package.
 RUN python -m venv /opt/stickslip/.venv \
- && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[s3,sobol]" "./services[server,postgresql]"
+ && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt "./schemas[arrays,s3,sobol]" "./services[server,postgresql]"
 # A third of all that is pip, tests, symbols, and bytecode of SciPy, without which a Sobol sequence takes 0.4 s longer, once.
 # Libraries that auditwheel has changed do not outlive `strip`.
 WORKDIR /opt/stickslip/.venv/lib/python3.11/site-packages

@@ -41,7 +41,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def postgresql() -> Iterator["PostgresqlServer"]:
     """A PostgreSQL server, started with the first test that needs it."""
     if find_spec("psycopg") is None:
-        pytest.skip("psycopg is not installed: pip install 'stickslip-services[server,postgresql]'")
+        pytest.skip("psycopg is not installed: pip install 'stickslip[server,postgresql]'")
     from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()

@@ -6,6 +6,7 @@ from typing import Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
 from stickslip_services.access.asker import NOBODY, Asker, asking
@@ -24,7 +25,6 @@ from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed, rods
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import PretendWorker
-from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases
 

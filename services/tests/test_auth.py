@@ -9,6 +9,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from fastapi import FastAPI
 from pydantic import ValidationError
 from stickslip_services.access.keys import create_key, list_keys, revoke_key
@@ -19,7 +20,6 @@ from stickslip_services.cli import app as cli
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving, start_server, wait_until
-from typer.testing import CliRunner
 
 WORKER_PATHS = ("/v1/workers", "/v1/worker/lease", "/v1/worker/heartbeat", "/v1/worker/report")
 

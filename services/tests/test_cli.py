@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 import yaml
+from click.testing import CliRunner, Result
 from stickslip_services.cli import app
 from stickslip_services.client import Client
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import RunningServer, start_server, wait_until
 from stickslip_testing.worker import PretendWorker, rejection
-from typer.testing import CliRunner, Result
 
 
 @pytest.fixture

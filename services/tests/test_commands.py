@@ -1,12 +1,17 @@
 """The table of commands, of which each is imported when it is called."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
+import click
 import pytest
-import typer
+from click.testing import CliRunner
+from stickslip_services.cli import common
 from stickslip_services.cli.main import _COMMANDS, _Commands, _loaded, app
-from typer.testing import CliRunner
+
+SCRIPT = Path(sys.executable).with_name("stickslip")
 
 
 def test_help_imports_no_command() -> None:
@@ -25,9 +30,8 @@ except SystemExit:
 
 @pytest.mark.parametrize("name", _COMMANDS)
 def test_the_list_says_what_the_command_says(name: str) -> None:
-    group = typer.main.get_group(app)
-    assert isinstance(group, _Commands)
-    listed = group.get_command(typer.Context(group), name)
+    assert isinstance(app, _Commands)
+    listed = app.get_command(click.Context(app), name)
     assert listed is not None
     assert listed.help
     assert listed.help.split("\n\n")[0].split() == (_loaded(name).help or "").split("\n\n")[0].split()
@@ -44,3 +48,43 @@ def test_a_client_without_the_server_says_what_is_missing() -> None:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert run.returncode == 1
     assert "needs the server, and sqlalchemy is not installed" in run.stderr
+
+
+def test_narrow_terminals_show_fewer_columns_and_break_no_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(common, "room", lambda: 40)
+    rows = [("ds-0123456789abcdef:v1", "a-long-name", "succeeded"), ("ds-1", "b", click.style("failed", fg="red"))]
+    common.print_table(("dataset", "name", "state"), rows)
+    shown = capsys.readouterr()
+    assert [line.split() for line in click.unstyle(shown.out).splitlines()] == [
+        ["dataset", "name"],
+        ["ds-0123456789abcdef:v1", "a-long-name"],
+        ["ds-1", "b"],
+    ]
+    assert "not shown in 40 columns: state; --json shows all" in shown.err
+    common.print_table(
+        ("slot", "message"), [("3", "its centreline leaves the frame by 12 px at the left")], sentences=True
+    )
+    assert [line.strip() for line in click.unstyle(capsys.readouterr().out).splitlines()] == [
+        "slot  message",
+        "3     its centreline leaves the frame by",
+        "12 px at the left",
+    ]
+
+
+@pytest.mark.parametrize(("shell", "file"), [("bash", ".bashrc"), ("zsh", ".zshrc")])
+def test_completion_is_installed_once(shell: str, file: str, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert CliRunner().invoke(app, ["--install-completion", shell], env={"HOME": str(tmp_path)}).exit_code == 0
+    assert (tmp_path / file).read_text() == f'eval "$(_STICKSLIP_COMPLETE={shell}_source stickslip)"\n'
+
+
+def test_commands_and_options_are_completed() -> None:
+    env = os.environ | {
+        "_STICKSLIP_COMPLETE": "bash_complete",
+        "COMP_CWORD": "2",
+        "COMP_WORDS": "stickslip validate --j",
+    }
+    run = subprocess.run([SCRIPT], capture_output=True, text=True, check=False, env=env)
+    assert run.stdout.split() == ["plain,--json"]

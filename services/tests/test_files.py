@@ -14,6 +14,7 @@ import zarr
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import make_app
+from stickslip_services.client import Client, ProblemError
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
@@ -175,3 +176,11 @@ def test_zarr_readers_open_the_url(published: Published) -> None:
     with xarray.open_zarr(url, consolidated=True) as dataset:
         assert dataset["mu"].dims == ("sample",)
         assert float(dataset["mu"].sum()) == 6.0
+
+
+def test_the_client_opens_a_dataset(published: Published) -> None:
+    with Client(str(published.client.base_url)) as client:
+        opened = client.open(published.manifest.dataset)
+        assert np.array_equal(np.asarray(opened["mu"]), np.arange(4.0))
+        with pytest.raises(ProblemError, match="version 9"):
+            client.open(published.manifest.dataset, 9)

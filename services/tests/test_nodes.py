@@ -17,6 +17,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from sqlalchemy import select
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import open_store
@@ -30,7 +31,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import rods
 from stickslip_testing.nodes import COORDINATOR, WORKER, Node, free_port, is_ready
 from stickslip_testing.servers import wait_until
-from typer.testing import CliRunner
 
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
 PATIENCE = 300.0

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner, Result
 from stickslip_schemas.format.selection import SELECTION_NAME, Selection
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
@@ -16,7 +17,6 @@ from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
-from typer.testing import CliRunner, Result
 
 GAMMAS = (1.0, 2.0, 3.0, 4.0)
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from sqlalchemy import select
 from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents.responses import Progress
@@ -24,7 +25,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving, start_server, wait_until
 from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, failure, rejection
-from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases
 

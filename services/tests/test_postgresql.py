@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from httpx_sse import connect_sse
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import OperationalError
@@ -35,7 +36,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.servers import HttpApi, RunningServer, start_server, wait_until
 from stickslip_testing.worker import DirectApi, PretendWorker, failure
-from typer.testing import CliRunner
 
 if TYPE_CHECKING:
     from stickslip_testing.postgresql import PostgresqlServer
@@ -473,5 +473,5 @@ def test_a_password_is_not_shown(tmp_path: Path) -> None:
 
 def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stickslip_services.database.opening.find_spec", lambda _name: None)
-    with pytest.raises(DatabaseRefusedError, match=r"pip install 'stickslip-services\[server,postgresql\]'"):
+    with pytest.raises(DatabaseRefusedError, match=r"pip install 'stickslip\[server,postgresql\]'"):
         connect(Settings.chosen(data=tmp_path, database="postgresql://me@host/name"))

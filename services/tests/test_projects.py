@@ -6,6 +6,7 @@ from typing import Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from stickslip_schemas.base.states import JobState
 from stickslip_services.access.asker import Asker, asking
 from stickslip_services.access.audit_log import read_audit_log
@@ -21,7 +22,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import parsed, rods, show_job
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import PretendWorker
-from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases
 

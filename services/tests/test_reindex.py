@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner, Result
 from sqlalchemy import text
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.base.states import JobState
@@ -24,7 +25,6 @@ from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.servers import served
 from stickslip_testing.worker import DirectApi, PretendWorker, rejection
-from typer.testing import CliRunner, Result
 
 
 @pytest.fixture

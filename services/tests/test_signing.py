@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest_digest
 from stickslip_services.app import main, make_app
@@ -20,7 +21,6 @@ from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
-from typer.testing import CliRunner
 
 pytestmark = pytest.mark.skipif(
     shutil.which("ssh-keygen") is None, reason="no ssh-keygen: apt-get install openssh-client"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import zarr
 import zarr.storage
+from click.testing import CliRunner, Result
 from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_services import app as program
@@ -22,7 +23,6 @@ from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, show_job
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
-from typer.testing import CliRunner, Result
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
 

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 from stickslip_schemas.base.keys import referred
 from stickslip_schemas.documents.responses import JobDetail
@@ -22,7 +23,6 @@ from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import parsed
 from stickslip_testing.servers import RunningServer
 from stickslip_testing.worker import DirectApi, PretendWorker
-from typer.testing import CliRunner
 
 KINDS = ("rod_hang", "cloth_drag")
 AXES = {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "logo"], "viewpoint": "calibrated"}

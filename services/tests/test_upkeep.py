@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner, Result
 from sqlalchemy import select, update
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.documents.responses import JobDetail
@@ -30,7 +31,6 @@ from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker
-from typer.testing import CliRunner, Result
 
 pytestmark = pytest.mark.databases(slow=True)
 

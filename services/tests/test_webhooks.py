@@ -13,6 +13,7 @@ from typing import Any
 
 import httpx
 import pytest
+from click.testing import CliRunner
 from cryptography.fernet import Fernet
 from sqlalchemy import select
 from standardwebhooks import Webhook as Verifier
@@ -35,7 +36,6 @@ from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import ManualClock, parsed, rods
 from stickslip_testing.servers import RunningServer, wait_until
 from stickslip_testing.worker import PretendWorker
-from typer.testing import CliRunner
 
 pytestmark = pytest.mark.databases
 

@@ -75,7 +75,7 @@ def test_looking_at_puts_the_target_in_the_middle_and_up_on_top() -> None:
     assert depth[0] == pytest.approx(2.0)
     assert above[0] == pytest.approx(31.5)
     assert above[1] < 23.5
-    offset = camera.position - (0.1, -0.2, 0.3)
+    offset = np.subtract(camera.position, (0.1, -0.2, 0.3))
     assert np.degrees(np.arctan2(offset[1], offset[0])) == pytest.approx(30.0)
     assert np.degrees(np.arcsin(offset[2] / 2.0)) == pytest.approx(20.0)
 

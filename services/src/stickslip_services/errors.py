@@ -98,7 +98,3 @@ class SettingsError(CommandError):
 
 class SupervisorError(CommandError):
     """`stickslip up` cannot go on."""
-
-
-class ServerNotInstalledError(CommandError):
-    """A server command was called where only the client is installed."""

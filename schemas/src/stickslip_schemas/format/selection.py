@@ -6,10 +6,8 @@ Labels are small and come with every part, so `arrays` chooses among the others:
 import operator
 import re
 from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from stickslip_schemas.base.document import Document
@@ -18,10 +16,14 @@ from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import GROUP_NAME, Contents, FileEntry
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
 SELECTION_NAME = "selection.json"
 """The file that says which part of a version a directory holds; it is not in a directory that holds all of it."""
 
-Labels = Callable[[str], npt.NDArray[Any]]
+Labels = Callable[[str], "npt.NDArray[Any]"]
 """Gives a label of all slots, (slots,) or (slots, n), by its name."""
 
 _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
@@ -72,7 +74,7 @@ class Selection(Document):
                 raise ValueError(f"arrays must be some of {', '.join(names)}, got {name!r}")
         return tuple(array for array in arrays if array.is_label or array.name in self.arrays)
 
-    def choose_samples(self, arrays: Iterable[ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:
+    def choose_samples(self, arrays: Iterable[ArrayLayout], label: Labels) -> "npt.NDArray[np.bool_]":
         """Return which slots are of the part, bool (slots,): they are valid, of the split, and hold to the conditions.
 
         Raises ValueError for a condition that makes no sense for its label.
@@ -93,6 +95,8 @@ def part_files(contents: Contents, selection: Selection, label: Labels | None) -
     """
     if selection.is_everything:
         return list(contents.files())
+    import numpy as np  # the extra `arrays`
+
     manifest = contents.manifest
     arrays = layout(manifest.spec)
     chosen_arrays = selection.choose_arrays(arrays)
@@ -117,6 +121,8 @@ def part_files(contents: Contents, selection: Selection, label: Labels | None) -
 
 def sections_of(contents: Contents, selection: Selection, label: Labels) -> list[int]:
     """Return the numbers of the sections of a manifest that list the samples of a part; 0 is all of a small one."""
+    import numpy as np
+
     slots = np.flatnonzero(selection.choose_samples(layout(contents.manifest.spec), label))
     return sorted({contents.number_of(slot) for slot in slots.tolist()})
 
@@ -128,7 +134,9 @@ class PartDocument(Document):
     selection: Selection
 
 
-def _holds(condition: str, arrays: dict[str, ArrayLayout], label: Labels) -> npt.NDArray[np.bool_]:
+def _holds(condition: str, arrays: dict[str, ArrayLayout], label: Labels) -> "npt.NDArray[np.bool_]":
+    import numpy as np
+
     parts = _CONDITION.fullmatch(condition)
     if parts is None:
         raise ValueError(

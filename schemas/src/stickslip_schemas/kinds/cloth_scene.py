@@ -29,7 +29,6 @@ from stickslip_schemas.kinds.cloth.scene_arrays import parameter_label, scene_ar
 from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
-from stickslip_schemas.scene.files import with_arrays
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.looks import View
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
@@ -106,6 +105,8 @@ class ClothSceneSimulation(Simulation):
 
     def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
         """Return the scene with arrays instead of files, and the seed."""
+        from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
+
         return {"scene": with_arrays(self.scene, read), "seed": self.seed}
 
 

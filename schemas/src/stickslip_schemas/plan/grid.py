@@ -6,8 +6,6 @@ from itertools import pairwise, product
 from math import ceil, prod
 from typing import Any
 
-import numpy as np
-
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.axes import axis_values
@@ -93,6 +91,8 @@ def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     # A narrow range holds fewer numbers than it may be asked for, and zipped lists may repeat values.
     if spec.combine == "product":
         return prod(len(set(axis_values(axis))) for _, axis in axes)
+    import numpy as np  # the extra `arrays`
+
     rows = np.zeros(spec.sample_count, dtype=np.int64)
     for place, axis in axes:
         values = axis_values(axis, dimension=place)

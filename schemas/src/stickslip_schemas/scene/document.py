@@ -30,6 +30,8 @@ MAX_FRAMES = 10_000
 """Of a scene."""
 MAX_VERTICES = 100_000
 """Of all sheets of a scene."""
+MAX_DOCUMENT_BYTES = 64 * 2**10
+"""Of the document of a scene, as JSON."""
 MAX_TRACK = 2**31 // 12
 """Vertices times frames of a sheet: a chunk of its positions, in single precision, has at most 2 GiB."""
 

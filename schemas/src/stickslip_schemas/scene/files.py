@@ -24,8 +24,6 @@ MAX_TRIANGLES = 2 * MAX_VERTICES
 """Of one mesh."""
 FARTHEST = 100.0
 """Largest coordinate in a file [m]."""
-MAX_DOCUMENT_BYTES = 64 * 2**10
-"""Of the document of a scene, as JSON."""
 
 Floats = npt.NDArray[np.float64]
 Triangles = npt.NDArray[np.int64]

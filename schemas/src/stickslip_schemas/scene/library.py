@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.scene.files import inlined
 from stickslip_schemas.spec.fabrics import did_you_mean
 
 
@@ -56,6 +55,10 @@ def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
     """Return a built-in scene, and its files by digest."""
     text = _folder().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
     scene = Scene.model_validate({"name": name, **parse_yaml(text)})
+    if not any(scene.files()):
+        return scene, {}
+    from stickslip_schemas.scene.files import inlined  # needs the extra `arrays`
+
     return inlined(scene, lambda file: _folder().joinpath(file).read_bytes())
 
 

@@ -1,8 +1,9 @@
 """What of a scene is seen, and how: nothing here enters the key of a simulation."""
 
+import math
+from operator import mul
 from typing import Annotated, Self
 
-import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from stickslip_schemas.base.document import Document, Float
@@ -39,20 +40,21 @@ class View(Document):
                 f"position must be within {FARTHEST:g} m of the middle and {LOWEST:g} m or more above the floor, and "
                 f"it is {list(self.position)} m"
             )
-        if float(np.linalg.norm(np.cross(self._forward, (0.0, 0.0, 1.0)))) < 1e-6:
+        if math.hypot(*self._forward[:2]) < 1e-6:
             raise ValueError(f"target must not be straight above or below position, and it is {list(self.target)} m")
         return self
 
     @property
-    def _forward(self) -> np.ndarray:
-        return np.subtract(self.target, self.position)
+    def _forward(self) -> tuple[float, float, float]:
+        x, y, z = (b - a for a, b in zip(self.position, self.target, strict=True))
+        return x, y, z
 
     def camera(self, name: str) -> Camera:
         """Return the calibrated camera: upright, with the principal point in the middle."""
-        forward = self._forward / np.linalg.norm(self._forward)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        x, y, z = (value / math.hypot(*self._forward) for value in self._forward)
+        level = math.hypot(x, y)
+        rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
+        a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
         focal, middle = self.focal_length / FILM * CLIP_SIZE, (CLIP_SIZE - 1) / 2
         return Camera(
             name=name,
@@ -62,8 +64,8 @@ class View(Document):
             fy=focal,
             cx=middle,
             cy=middle,
-            rotation=rotation.tolist(),
-            translation=(-rotation @ np.asarray(self.position)).tolist(),
+            rotation=rotation,
+            translation=(a, b, c),
         )
 
 

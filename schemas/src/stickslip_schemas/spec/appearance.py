@@ -1,9 +1,9 @@
 """Lamps, floors and cameras: the built-in ones by name, custom ones as numbers in a spec."""
 
+import math
 from enum import StrEnum
 from typing import Annotated, Self
 
-import numpy as np
 from pydantic import Field, Strict, model_validator
 
 from stickslip_schemas.base.document import WHOLE, Document, Float
@@ -152,14 +152,14 @@ class Calibration(Document):
                 f"no skew; it is {[list(row) for row in self.camera_matrix]}"
             )
         for axis, f, c, side in zip("xy", (fx, fy), (cx, cy), self.image_size, strict=True):
-            least, most = (0.5 * side / np.tan(np.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW))
+            least, most = (0.5 * side / math.tan(math.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW))
             for name, value, low, high in (("f", f, least, most), ("c", c, -0.5 * side, 1.5 * side)):
                 if not low <= value <= high:
                     raise ValueError(
                         f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, for a field of view of "
                         f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; it is {value:g} px"
                     )
-        x, y, z = self.camera("own").position.tolist()
+        x, y, z = self.camera("own").position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
                 f"rvec and tvec must put the camera within {FARTHEST:g} m of the scene's middle and {LOWEST:g} m or "
@@ -190,13 +190,14 @@ class Calibration(Document):
 
 def _rotation(rvec: Row) -> tuple[Row, Row, Row]:
     """Return the rotation by a = |r| about r: I + sin(a) K + (1 - cos(a)) K^2, K v = r / a x v [Rodrigues]."""
-    r = np.asarray(rvec)
-    angle = float(np.linalg.norm(r))
-    x, y, z = r / angle if angle > _TOLERANCE else r
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    R = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
-    a, b, c = (tuple(row) for row in R.tolist())
-    return a, b, c
+    angle = math.hypot(*rvec)
+    x, y, z = (value / angle if angle > _TOLERANCE else value for value in rvec)
+    s, c = math.sin(angle), 1.0 - math.cos(angle)
+    return (
+        (1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y),
+        (c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x),
+        (c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)),
+    )
 
 
 def shown_frames(count: int, instants: int) -> tuple[int, ...]:

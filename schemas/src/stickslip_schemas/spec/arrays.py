@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, fields
 from math import prod
 from typing import Any, Literal
 
-import numpy as np
-
 FORMAT: Literal["stickslip-dataset/3"] = "stickslip-dataset/3"
 
 LABEL_SAMPLES = 65_536
@@ -23,6 +21,11 @@ LABEL_CHUNK_BYTES = 2**21
 SAMPLE_KEY_BYTES = 32
 
 NAN = float("nan")
+
+
+def item_bytes(dtype: str) -> int:
+    """Return the size of a number of a type such as `float64`, `uint8` or `bool` [bytes]."""
+    return 1 if dtype == "bool" else int(dtype.lstrip("uintfloa")) // 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +54,7 @@ class ArrayLayout:
     @property
     def sample_bytes(self) -> int:
         """Decoded size of one sample [bytes]."""
-        return prod(self.shape) * np.dtype(self.dtype).itemsize
+        return prod(self.shape) * item_bytes(self.dtype)
 
     @property
     def is_label(self) -> bool:
@@ -77,7 +80,7 @@ def array(
     `of` has the size of each dimension of a sample, by name; a sample is one number without it.
     """
     of = of or {}
-    missing = {"f": NAN, "i": -1, "b": False}.get(np.dtype(dtype).kind, 0)
+    missing = {"f": NAN, "i": -1, "b": False}.get(dtype[0], 0)
     return ArrayLayout(name, dtype, tuple(of.values()), tuple(of), text, **{"fill": missing, **more})
 
 

@@ -3,15 +3,17 @@
 The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 """
 
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVar
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from stickslip_schemas.base.document import WHOLE, Document
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 MAX_SAMPLES = 1_000_000
 """The most samples that one job may ask for."""
@@ -129,7 +131,15 @@ def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
     `dimension` keeps axes apart that are sampled together: it selects the dimension of the Sobol sequence and
     the stream of the random generator.
     """
-    return list(axis.values) if isinstance(axis, ListAxis) else range_values(axis, dimension=dimension).tolist()
+    match axis:
+        case ListAxis():
+            return list(axis.values)
+        case LinspaceAxis(start=start, stop=stop, num=num):
+            step = (stop - start) / max(1, num - 1)  # these are the bits of numpy.linspace
+            return [float(position * step + start) for position in range(num - 1)] + [float(stop if num > 1 else start)]
+        case _:
+            drawn: list[Any] = drawn_values(axis, dimension=dimension).tolist()
+            return drawn
 
 
 def extremes(axis: AnyAxis) -> list[tuple[tuple[str | int, ...], Any]]:
@@ -140,12 +150,10 @@ def extremes(axis: AnyAxis) -> list[tuple[tuple[str | int, ...], Any]]:
     return [((end,), getattr(axis, end)) for end in ends]
 
 
-def range_values(
-    axis: LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0
-) -> npt.NDArray[np.float64]:
-    """Return the values of an axis that is a range; see `axis_values`."""
-    if isinstance(axis, LinspaceAxis):
-        return np.linspace(axis.start, axis.stop, axis.num, dtype=np.float64)
+def drawn_values(axis: RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0) -> "npt.NDArray[np.float64]":
+    """Return the values of an axis that is drawn; see `axis_values`."""
+    import numpy as np  # the extra `arrays`
+
     if isinstance(axis, SobolAxis):
         unit = _sobol(axis.num, axis.seed, dimension)
     else:
@@ -154,7 +162,8 @@ def range_values(
     return values
 
 
-def _sobol(num: int, seed: int, dimension: int) -> npt.NDArray[np.float64]:
+def _sobol(num: int, seed: int, dimension: int) -> "npt.NDArray[np.float64]":
+    import numpy as np
     from scipy.stats import qmc  # an extra: only who expands a spec needs it
 
     exponent = max(0, int(num - 1).bit_length())

@@ -16,15 +16,18 @@ import tomllib
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from operator import mul
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import content_key
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
@@ -57,26 +60,30 @@ class Camera(Document):
     @field_validator("rotation")
     @classmethod
     def _is_rotation(cls, rotation: Matrix3) -> Matrix3:
-        R = np.asarray(rotation)
-        error = float(np.abs(R @ R.T - np.eye(3)).max())
-        if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        products = ((i, j, sum(map(mul, rotation[i], rotation[j]))) for i in range(3) for j in range(3))
+        error = max(abs(product - (i == j)) for i, j, product in products)
+        (a, b, c), (d, e, f), (g, h, k) = rotation
+        det = a * (e * k - f * h) - b * (d * k - f * g) + c * (d * h - e * g)
+        if error > ROTATION_TOLERANCE or det < 0:
             raise ValueError(
                 f"rotation must be orthonormal to {ROTATION_TOLERANCE:g} and right-handed; "
-                f"R R^T is off by {error:.2g}, det R = {np.linalg.det(R):.6g}"
+                f"R R^T is off by {error:.2g}, det R = {det:.6g}"
             )
         return rotation
 
     @property
-    def position(self) -> npt.NDArray[np.float64]:
-        """The camera's centre in the world, -R^T t [scene units], shape (3,)."""
-        center: npt.NDArray[np.float64] = -np.asarray(self.rotation).T @ np.asarray(self.translation)
-        return center
+    def position(self) -> Vector3:
+        """The camera's centre in the world, -R^T t [scene units]."""
+        x, y, z = (0.0 - sum(map(mul, axis, self.translation)) for axis in zip(*self.rotation, strict=True))
+        return x, y, z
 
     def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...) [scene units].
 
         A point that is not in front of the camera has no image: its pixel is NaN.
         """
+        import numpy as np  # the extra `arrays`
+
         x = np.asarray(points, dtype=np.float64) @ np.asarray(self.rotation).T + np.asarray(self.translation)
         depth = x[..., 2]
         inverse = 1.0 / np.where(depth > 0.0, depth, np.nan)
@@ -95,6 +102,8 @@ class Camera(Document):
         The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's image is taken as a
         disc, which is right to first order in its angular size. Infinite if a ball reaches behind the camera.
         """
+        import numpy as np
+
         pixels, depth = self.project(points)
         if not bool(np.all(depth > radius)):
             return float("inf")
@@ -122,6 +131,8 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
         size: Width and height of the frame [px].
         turn: By which it goes around the points, from +x towards +y [degree].
     """
+    import numpy as np
+
     a, e = np.radians(FRAMING[name]) + np.array([np.radians(turn), 0.0])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])

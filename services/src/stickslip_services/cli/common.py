@@ -1,65 +1,90 @@
-"""Options, the console and JSON output, shared by the commands."""
+"""Options, tables and JSON output, shared by the commands."""
 
 import json
+import shutil
 import sys
+import textwrap
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
+import click
 from pydantic import BaseModel
-from rich.console import Console
-from rich.table import Table
 
-from stickslip_services.errors import ServerNotInstalledError
+from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.client.errors import MissingExtraError
 
-UrlOption = Annotated[str, typer.Option("--url", envvar="STICKSLIP_URL", help="where the coordinator is")]
-JsonOption = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
-SpecArgument = Annotated[Path, typer.Argument(metavar="FILE", help="a JobSpec, YAML or JSON")]
-DatabaseOption = Annotated[
-    str | None,
-    typer.Option("--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"),
-]
-StoreOption = Annotated[
-    str | None, typer.Option(help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
-]
-DataOption = Annotated[Path, typer.Option(help="data directory of the coordinator")]
+FILE = click.Path(path_type=Path)
 DEFAULT_DATA = Path("stickslip-data")
 _SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
-JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="id of a job")]
+_LEAST_SENTENCE = 30
+"""Least width of a column of sentences [characters]."""
 
-
-def console() -> Console:
-    """Return a console as wide as the terminal, or 200 columns wide if the output is no terminal."""
-    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
+url_option = click.option("--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, help="where the coordinator is")
+json_option = click.option("--json", "as_json", is_flag=True, help="print JSON for programs")
+spec_argument = click.argument("file", type=FILE, help="a JobSpec, YAML or JSON")
+job_argument = click.argument("job_id", metavar="JOB", help="id of a job")
+data_option = click.option("--data", type=FILE, default=DEFAULT_DATA, help="data directory of the coordinator")
+database_option = click.option(
+    "--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"
+)
+store_option = click.option("--store", help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
 
 
 def say(text: str) -> None:
     """Print a message for people on standard error; standard output is for programs."""
-    typer.echo(text, err=True)
+    click.echo(text, err=True)
 
 
 def print_json(value: BaseModel | list[Any]) -> None:
     """Print documents as JSON."""
     if isinstance(value, BaseModel):
-        typer.echo(value.model_dump_json(indent=2))
+        click.echo(value.model_dump_json(indent=2))
     else:
-        typer.echo(json.dumps([item.model_dump(mode="json") for item in value], indent=2))
+        click.echo(json.dumps([item.model_dump(mode="json") for item in value], indent=2))
 
 
-def table(*columns: str, no_wrap: tuple[str, ...] = ()) -> Table:
-    """Return an empty table; columns in `no_wrap` are never wrapped."""
-    made = Table(box=None, header_style="bold")
-    for column in columns:
-        made.add_column(column, overflow="fold", no_wrap=column in no_wrap)
-    return made
+def room() -> int:
+    """Return the width of the terminal; there is no limit if the output is no terminal."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, sentences: bool = False) -> None:
+    """Print rows under their heads. Columns come by importance: in a narrow terminal the last ones are left out.
+
+    With `sentences`, the last column is text, which stays and is wrapped between words.
+    """
+    lines = [tuple(click.style(head, bold=True) for head in heads), *rows] if any(heads) else list(rows)
+    widths = [max(map(_width, column)) for column in zip(*lines, strict=True)]
+    columns = list(range(len(widths)))
+    if sentences and widths:
+        widths[-1] = min(widths[-1], max(_LEAST_SENTENCE, room() - sum(widths[:-1]) - 2 * len(widths) + 2))
+    while len(columns) > 1 + sentences and sum(widths[column] + 2 for column in columns) - 2 > room():
+        columns.pop(-1 - sentences)
+    for line in lines:
+        cells = [line[column] for column in columns]
+        text = textwrap.wrap(cells[-1], widths[-1], break_long_words=False, break_on_hyphens=False) if sentences else []
+        start = cells[:-1] if sentences else cells
+        padded = [cell + " " * (widths[column] - _width(cell)) for column, cell in zip(columns, start, strict=False)]
+        indent = "\n" + " " * sum(widths[column] + 2 for column in columns[:-1])
+        click.echo("  ".join([*padded, indent.join(text)] if sentences else padded).rstrip())
+    if len(columns) < len(widths):
+        left_out = ", ".join(head for column, head in enumerate(heads) if column not in columns)
+        say(f"not shown in {room()} columns: {left_out}; --json shows all")
+
+
+def print_fields(fields: Iterable[tuple[str, str]]) -> None:
+    """Print names and their values, one a line."""
+    print_table(("", ""), fields, sentences=True)
+
+
+def _width(text: str) -> int:
+    return len(click.unstyle(text))
 
 
 def require_server() -> None:
-    """Raise ServerNotInstalledError if a package of the server is missing."""
+    """Raise MissingExtraError if a package of the server is missing."""
     missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
     if missing:
-        raise ServerNotInstalledError(
-            f"this command needs the server, and {', '.join(missing)} is not installed: "
-            "pip install 'stickslip-services[server]'"
-        )
+        raise MissingExtraError("server", f"this command needs the server, and {', '.join(missing)}")

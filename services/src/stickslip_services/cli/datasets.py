@@ -6,88 +6,89 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from threading import Lock
 
-import typer
-from rich.markup import escape
-from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+import click
+from click.exceptions import Exit
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
-from stickslip_services.addresses import DEFAULT_URL, coordinator_url
-from stickslip_services.cli.common import JsonOption, UrlOption, console, print_json, say, table
-from stickslip_services.cli.errors import shows_errors
+from stickslip_services.addresses import coordinator_url
+from stickslip_services.cli.common import FILE, json_option, print_json, print_table, say
+from stickslip_services.cli.errors import asks, shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.signing import sign_directory, signer_of
+from stickslip_services.client.verifying import READS_ARRAYS
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
 
-ArraysOption = Annotated[
-    str | None, typer.Option(help="arrays to take, with commas between; labels always come; without, all")
-]
-SplitOption = Annotated[str | None, typer.Option(help="train, validation or test; without, all")]
-WhereOption = Annotated[
-    list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
-]
-
-AllowedSignersOption = Annotated[
-    Path | None, typer.Option(help="refuse a dataset that nobody of this file of ssh-keygen(1) has signed")
-]
-
-datasets = typer.Typer(help="List datasets and their versions, newest first.")
+allowed_signers_option = click.option(
+    "--allowed-signers", type=FILE, help="refuse a dataset that nobody of this file of ssh-keygen(1) has signed"
+)
 
 
-@datasets.callback(invoke_without_command=True)
-@shows_errors
-def _list(context: typer.Context, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
-    if context.invoked_subcommand is not None:
-        return None
+@click.command()
+@json_option
+@asks
+def datasets(url: str, as_json: bool) -> None:
+    """List datasets and their versions, newest first."""
     with Client(url) as client:
         found = list(client.datasets())
     if as_json:
         return print_json(found)
-    shown = table("dataset", "name", "kind", "samples", "valid", "size", "made", no_wrap=("dataset",))
-    for dataset in found:
-        for version in dataset.versions:
-            shown.add_row(
-                f"{dataset.id}:v{version.version}",
-                dataset.name or "",
-                dataset.kind,
-                str(version.sample_count),
-                str(version.valid_count),
-                size(version.bytes),
-                f"{version.created_at:%Y-%m-%d %H:%M} UTC",
-            )
-    return console().print(shown)
+    rows = (
+        (
+            f"{dataset.id}:v{version.version}",
+            dataset.name or "",
+            str(version.sample_count),
+            str(version.valid_count),
+            size(version.bytes),
+            dataset.kind,
+            f"{version.created_at:%Y-%m-%d %H:%M} UTC",
+        )
+        for dataset in found
+        for version in dataset.versions
+    )
+    return print_table(("dataset", "name", "samples", "valid", "size", "kind", "made"), rows)
 
 
-@shows_errors
+@click.command()
+@click.argument("dataset", metavar="DATASET[:vN]", help="without :vN, the newest version")
+@click.argument("target", metavar="DEST", type=FILE, help="directory to write to")
+@click.option("--arrays", help="arrays to take, with commas between; labels always come; without, all")
+@click.option("--split", help="train, validation or test; without, all")
+@click.option("--where", multiple=True, help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
+@allowed_signers_option
+@asks
 def pull_dataset(
-    dataset: Annotated[str, typer.Argument(metavar="DATASET[:vN]", help="without :vN, the newest version")],
-    target: Annotated[Path, typer.Argument(metavar="DEST", help="directory to write to")],
-    arrays: ArraysOption = None,
-    split: SplitOption = None,
-    where: WhereOption = None,
-    allowed_signers: AllowedSignersOption = None,
-    url: UrlOption = DEFAULT_URL,
+    dataset: str,
+    target: Path,
+    arrays: str | None,
+    split: str | None,
+    where: tuple[str, ...],
+    allowed_signers: Path | None,
+    url: str,
 ) -> None:
     """Download a dataset or a part of it. Every file is checked, and intact files are not downloaded again.
 
     A part has all labels and, of the other arrays, the shards that hold a chosen sample. The reader of
     stickslip-training shows only the chosen samples; other readers show fill values for missing samples.
     """
-    screen = console()
     try:
         selection = Selection.of_options(arrays, split, where)
     except ValueError as error:
         raise ClientError(str(error)) from error
     with Client(url) as client:
         name, version = _resolve(client, dataset)
-        columns = (BarColumn(bar_width=32), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=screen, disable=not screen.is_terminal) as bar:
-            row = bar.add_task("pull", total=None)
+        counting = Lock()  # files are downloaded by several threads
+        with click.progressbar(length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr) as bar:
+
+            def on_bytes(count: int) -> None:
+                with counting:
+                    bar.update(count)
+
             done = pull(
                 client,
                 name,
@@ -95,19 +96,21 @@ def pull_dataset(
                 target,
                 selection=selection,
                 allowed_signers=allowed_signers,
-                on_plan=lambda _files, count: bar.update(row, total=count),
-                on_bytes=lambda count: bar.advance(row, count),
+                on_plan=lambda _files, count: setattr(bar, "length", count),
+                on_bytes=on_bytes,
             )
     there = done.files - done.downloaded_files
-    screen.print(
-        f"{name}:v{version} is in {escape(str(target))}: {done.downloaded_files} files downloaded "
+    click.echo(
+        f"{name}:v{version} is in {target}: {done.downloaded_files} files downloaded "
         f"({size(done.downloaded_bytes)}), {there} already there"
     )
     say(f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}")
 
 
-@shows_errors
-def export(context: typer.Context, url: UrlOption = DEFAULT_URL) -> None:
+@click.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+@click.pass_context
+@asks
+def export(context: click.Context, url: str) -> None:
     """Export a dataset to a format of another library.
 
     Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes the URL of a version.
@@ -121,7 +124,7 @@ def export(context: typer.Context, url: UrlOption = DEFAULT_URL) -> None:
         env=os.environ | ({"STICKSLIP_API_KEY": key} if key else {}),
         check=False,
     )
-    raise typer.Exit(ended.returncode)
+    raise Exit(ended.returncode)
 
 
 def _version_url(dataset: str, url: str) -> str:
@@ -136,43 +139,40 @@ _ID = re.compile(r"ds-[0-9a-f]{16}(:|$)")
 def _resolve(client: Client, dataset: str) -> tuple[str, int]:
     name, colon, version = dataset.partition(":v")
     if not colon:
-        versions = client.dataset(name).versions
-        if not versions:
-            raise ClientError(f"dataset {name} has no version yet")
-        return name, versions[-1].version
+        return name, client.newest(name)
     if not version.isdecimal() or len(version) > 9:
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {dataset!r}")
     return name, int(version)
 
 
+@click.command()
+@click.argument("target", metavar="DIR", type=FILE, help="a dataset that was pulled, or a version in a store")
+@click.option(
+    "--key", type=FILE, required=True, help="private key of OpenSSH, or a public key whose private one an agent has"
+)
 @shows_errors
-def sign(
-    target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled, or a version in a store")],
-    key: Annotated[Path, typer.Option(help="private key of OpenSSH, or a public key whose private one an agent has")],
-) -> None:
+def sign(target: Path, key: Path) -> None:
     """Sign a dataset with a key of OpenSSH. The signature, manifest.sha256.sig, covers all of its files."""
     sign_directory(target, key)
-    console().print(f"{escape(str(target / SIGNATURE_NAME))} is written")
+    click.echo(f"{target / SIGNATURE_NAME} is written")
 
 
+@click.command()
+@click.argument("target", metavar="DIR", type=FILE, help="a dataset that was pulled")
+@allowed_signers_option
 @shows_errors
-def verify(
-    target: Annotated[Path, typer.Argument(metavar="DIR", help="a dataset that was pulled")],
-    allowed_signers: AllowedSignersOption = None,
-) -> None:
+def verify(target: Path, allowed_signers: Path | None) -> None:
     """Check every file of a dataset against its manifest, and who signed it; exit with 1 if anything is wrong."""
-    screen = console()
     signed = "" if allowed_signers is None else f", signed by {signer_of(target, allowed_signers)}"
     faults = find_faults(target)
     if not faults:
-        screen.print(escape(f"{target}: all files are present and unchanged{signed}"))
+        click.echo(f"{target}: all files are present and unchanged{signed}")
+        if not READS_ARRAYS:
+            say("sample keys were not compared with the manifest: that needs pip install 'stickslip[arrays]'")
         return
-    shown = table("file", "fault", "detail")
-    for fault in faults:
-        shown.add_row(escape(fault.path), fault.fault, escape(fault.detail))
-    screen.print(shown)
+    print_table(("file", "fault", "detail"), ((each.path, each.fault, each.detail) for each in faults), sentences=True)
     files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
-    screen.print(
-        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.", style="red"
+    click.secho(
+        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.", fg="red"
     )
-    raise typer.Exit(1)
+    raise Exit(1)

@@ -4,12 +4,12 @@ import functools
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-import typer
-from rich.console import Console
-from rich.markup import escape
+import click
+from click.exceptions import Exit
 
+from stickslip_services.cli.common import data_option, database_option, say, url_option
 from stickslip_services.cli.specs import field_line
-from stickslip_services.client.errors import ClientError, ProblemError, UnreachableError
+from stickslip_services.client.errors import ClientError, MissingExtraError, ProblemError, UnreachableError
 from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")
@@ -26,9 +26,9 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ProblemError as error:
             _print(error.problem.detail if not error.problem.errors else "the document is not valid")
             for field in error.problem.errors:
-                _print_line(escape(field_line(field)))
+                say(field_line(field))
             if error.problem.request_id and error.problem.status >= 500:
-                _print_line(f"  request {escape(error.problem.request_id)}; the coordinator's log says more")
+                say(f"  request {error.problem.request_id}; the coordinator's log says more")
         except UnreachableError as error:
             _print(
                 f"{error}. Is a coordinator running there? `stickslip up` starts one on this machine; "
@@ -38,14 +38,24 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
             _print(str(error))
         except OSError as error:
             _print(f"{error.filename or 'the file system'}: {error.strerror or error}")
-        raise typer.Exit(1)
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.startswith("stickslip"):
+                raise
+            _print(str(MissingExtraError("arrays", f"this needs arrays, and {error.name}")))
+        raise Exit(1)
 
     return run
 
 
+def asks(command: Callable[P, R]) -> Callable[P, R]:
+    """Give a command the option `--url` of a coordinator, and show its errors."""
+    return url_option(shows_errors(command))
+
+
+def administers(command: Callable[P, R]) -> Callable[P, R]:
+    """Give a command the options of a coordinator's database, and show its errors."""
+    return data_option(database_option(shows_errors(command)))
+
+
 def _print(message: str) -> None:
-    _print_line(f"[bold red]error:[/] {escape(message)}")
-
-
-def _print_line(markup: str) -> None:
-    Console(stderr=True, soft_wrap=True, highlight=False).print(markup)
+    say(f"{click.style('error:', bold=True, fg='red')} {message}")

@@ -2,14 +2,12 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
 
-import typer
-from rich.markup import escape
-from rich.table import Table
+import click
+from click.exceptions import Exit
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import FileUpload, JobDetail, TextureEntry
 from stickslip_schemas.format.layout import bytes_estimate
@@ -17,19 +15,18 @@ from stickslip_schemas.plan.costs import Estimate, estimated
 from stickslip_schemas.plan.grid import count
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import (
-    JobArgument,
-    JsonOption,
-    SpecArgument,
-    UrlOption,
-    console,
+    FILE,
+    job_argument,
+    json_option,
+    print_fields,
     print_json,
+    print_table,
     say,
-    table,
+    spec_argument,
 )
-from stickslip_services.cli.errors import shows_errors
+from stickslip_services.cli.errors import asks
 from stickslip_services.cli.specs import check_spec, read_job
 from stickslip_services.cli.watch import GOOD, watch
 from stickslip_services.client.errors import ClientError, UnreachableError
@@ -38,12 +35,15 @@ from stickslip_services.units import duration, size
 
 SHOWN_REJECTS = 50
 
-PRIORITY = "tasks of the job with the highest number come first; jobs of one number share evenly"
-PriorityOption = Annotated[int, typer.Option(min=-100, max=100, help=PRIORITY)]
+PRIORITY = click.IntRange(-100, 100)
+PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of one number share evenly"
 
 
-@shows_errors
-def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+@click.command()
+@spec_argument
+@json_option
+@asks
+def validate(file: Path, url: str, as_json: bool) -> None:
     """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused. Works offline."""
     document, files = read_job(file)
     spec = check_spec(document, file)
@@ -56,203 +56,207 @@ def validate(file: SpecArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOpti
     refused = answer.refusal is not None
     if as_json:
         print_json(answer)
-        raise typer.Exit(int(refused))
+        raise Exit(int(refused))
     cached = "unknown" if answer.cached_count is None else f"{answer.cached_count}"
-    shown = _counts(answer.spec)
-    shown.add_row("tasks cached", f"{cached} of {answer.task_count}")
+    numbers = answer.sample_count, answer.simulation_count, answer.render_count, answer.bytes_estimate
+    fields = [
+        *_counts(*numbers, answer.expected_splits, answer.spec_digest),
+        ("tasks cached", f"{cached} of {answer.task_count}"),
+    ]
     if answer.stored_bytes_estimate is not None:
-        shown.add_row("size of the files, about", size(answer.stored_bytes_estimate))
-    _add_costs(shown, answer.estimate)
-    shown.add_row("certificate", answer.certificate or "none")
-    console().print(shown)
+        fields.append(("size of the files, about", size(answer.stored_bytes_estimate)))
+    print_fields([*fields, *_costs(answer.estimate), ("certificate", answer.certificate or "none")])
     if refused:
         say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
-        raise typer.Exit(1)
+        raise Exit(1)
     return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
 
 
 def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
-    costs = estimated(spec, count(spec), {}, os.cpu_count() or 1)
+    counts = count(spec)
+    costs = estimated(spec, counts, {}, os.cpu_count() or 1)
     if as_json:
-        return typer.echo(json.dumps({"estimate": costs.model_dump(mode="json")}, indent=2))
-    shown = _counts(spec)
-    _add_costs(shown, costs)
-    console().print(shown)
+        return click.echo(json.dumps({"estimate": costs.model_dump(mode="json")}, indent=2))
+    numbers = counts.samples, counts.simulations, counts.renders, bytes_estimate(spec)
+    print_fields([*_counts(*numbers, counts.expected_splits, spec.content_digest), *_costs(costs)])
     return say(
         f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown, and the "
         "wall time is that of all cores of this machine. To start one here: stickslip up"
     )
 
 
-def _add_costs(shown: Table, costs: Estimate) -> None:
+def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     for stage, interval in costs.stages.items():
         source = "measured by this service" if stage in costs.measured else "by the package's records"
-        shown.add_row(f"CPU time, {stage}", f"{wording.interval(interval)}, {source}")
-    shown.add_row("CPU time, all", wording.interval(costs.cpu_seconds))
+        yield f"CPU time, {stage}", f"{wording.interval(interval)}, {source}"
+    yield "CPU time, all", wording.interval(costs.cpu_seconds)
     wall = "unknown: no worker is there" if costs.wall_seconds is None else wording.interval(costs.wall_seconds)
-    shown.add_row(f"wall time, {costs.slots} at once", wall)
+    yield f"wall time, {costs.slots} at once", wall
 
 
-def _counts(spec: JobSpec) -> Table:
-    counts = count(spec)
-    splits = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
-    shown = Table.grid(padding=(0, 2))
-    shown.add_row("samples", f"{counts.samples} ({splits}, about)")
-    shown.add_row("simulations", f"{counts.simulations}")
-    shown.add_row("renders", f"{counts.renders}")
-    shown.add_row("arrays before compression", size(bytes_estimate(spec)))
-    shown.add_row("digest of the spec", spec.content_digest)
-    return shown
+def _counts(
+    samples: int, simulations: int, renders: int, array_bytes: int, splits: Mapping[str, int], digest: str
+) -> Iterator[tuple[str, str]]:
+    shares = ", ".join(f"{split} {number}" for split, number in splits.items())
+    yield "samples", f"{samples} ({shares}, about)"
+    yield "simulations", f"{simulations}"
+    yield "renders", f"{renders}"
+    yield "arrays before compression", size(array_bytes)
+    yield "digest of the spec", digest
 
 
-@shows_errors
-def submit(
-    file: SpecArgument,
-    url: UrlOption = DEFAULT_URL,
-    then_watch: Annotated[bool, typer.Option("--watch", help="watch the job until it ends")] = False,
-    idempotency_key: Annotated[
-        str | None, typer.Option(help="a key that you choose; two submissions with the same key make one job")
-    ] = None,
-    priority: PriorityOption = 0,
-) -> None:
+@click.command()
+@spec_argument
+@click.option("--watch", "then_watch", is_flag=True, help="watch the job until it ends")
+@click.option("--idempotency-key", help="a key that you choose; two submissions with the same key make one job")
+@click.option("--priority", type=PRIORITY, default=0, help=PRIORITY_HELP)
+@asks
+def submit(file: Path, url: str, then_watch: bool, idempotency_key: str | None, priority: int) -> None:
     """Submit a job and print its id."""
     document, files = read_job(file)
     with Client(url) as client:
         if files:
             _upload(client, check_spec(document, file), files)
         job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
-        typer.echo(job.id)
+        click.echo(job.id)
         if not then_watch:
             say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
         else:
-            raise typer.Exit(0 if watch(client, job.id, console()) in GOOD else 1)
+            raise Exit(0 if watch(client, job.id) in GOOD else 1)
 
 
-@shows_errors
-def jobs(
-    url: UrlOption = DEFAULT_URL,
-    as_json: JsonOption = False,
-    limit: Annotated[int, typer.Option(min=1, help="the most jobs to list")] = 50,
-    search: Annotated[str, typer.Option(help="a part of the name, kind, id or dataset")] = "",
-    state: Annotated[JobState | None, typer.Option(help="only jobs in this state")] = None,
-    project: Annotated[str, typer.Option(help="only jobs of this project")] = "",
-) -> None:
+@click.command()
+@json_option
+@click.option("--limit", type=click.IntRange(1), default=50, help="the most jobs to list")
+@click.option("--search", default="", help="a part of the name, kind, id or dataset")
+@click.option("--state", type=click.Choice(JobState), help="only jobs in this state")
+@click.option("--project", default="", help="only jobs of this project")
+@asks
+def jobs(url: str, as_json: bool, limit: int, search: str, state: JobState | None, project: str) -> None:
     """List jobs, newest first."""
     with Client(url) as client:
         found = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
         return print_json(found)
-    columns = ("job", "name", "kind", "state", "samples", "rejected", "tasks", "time left", "dataset")
-    shown = table(*columns, no_wrap=("job", "dataset"))
-    for job in found:
-        shown.add_row(
+    rows = (
+        (
             job.id,
-            job.name or "",
-            job.kind,
             wording.state(job.state),
-            str(job.sample_count),
-            str(job.rejected_count),
             wording.done_of(job.progress),
             "" if job.progress.eta is None else duration(job.progress.eta.seconds),
             wording.dataset(job.dataset),
+            job.name or "",
+            job.kind,
+            str(job.sample_count),
+            str(job.rejected_count),
         )
-    return console().print(shown)
+        for job in found
+    )
+    return print_table(("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected"), rows)
 
 
-@shows_errors
-def show(job_id: JobArgument, url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+@click.command()
+@job_argument
+@json_option
+@asks
+def show(job_id: str, url: str, as_json: bool) -> None:
     """Show the state and progress of a job, and its rejected samples with reasons."""
     with Client(url) as client:
         job = client.job(job_id)
         if as_json:
             return print_json(job)
         rejects = client.samples(job_id, state=TaskState.rejected) if job.rejected_count else iter(())
-        shown = [reject for reject, _ in zip(rejects, range(SHOWN_REJECTS), strict=False)]
-    screen = console()
-    screen.print(_job_table(job))
+        shown = list(islice(rejects, SHOWN_REJECTS))
+    print_fields(_fields(job))
     if shown:
-        rejected = Table(title=f"rejected samples ({job.rejected_count})", title_justify="left", box=None)
-        for column in ("slot", "reason", "message", "parameters"):
-            rejected.add_column(column, overflow="fold")
-        for reject in shown:
-            labels = ", ".join(f"{name}={value}" for name, value in reject.labels.items())
-            rejected.add_row(str(reject.slot), str(reject.reason), escape(reject.message), escape(labels))
-        screen.print(rejected)
-        if job.rejected_count > len(shown):
-            screen.print(
-                f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected"
+        click.secho(f"rejected samples ({job.rejected_count})", italic=True)
+        rows = (
+            (
+                str(reject.slot),
+                str(reject.reason),
+                ", ".join(f"{name}={value}" for name, value in reject.labels.items()),
+                reject.message,
             )
+            for reject in shown
+        )
+        print_table(("slot", "reason", "parameters", "message"), rows, sentences=True)
+        if job.rejected_count > len(shown):
+            click.echo(f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected")
     return None
 
 
-def _job_table(job: JobDetail) -> Table:
-    shown = Table.grid(padding=(0, 2))
-    shown.add_row("job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}")
-    shown.add_row("state", wording.state(job.state))
+def _fields(job: JobDetail) -> Iterator[tuple[str, str]]:
+    yield "job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}"
+    yield "state", wording.state(job.state)
     if job.message:
-        shown.add_row("", escape(job.message))
+        yield "", job.message
     if job.priority:
-        shown.add_row("priority", str(job.priority))
-    shown.add_row("tasks", escape(wording.stages(job.progress)))
+        yield "priority", str(job.priority)
+    yield "tasks", wording.stages(job.progress)
     if planned := wording.planned(job.progress, job.sample_count):
-        shown.add_row("", planned)
+        yield "", planned
     if job.state.is_open:
-        shown.add_row("time left", wording.eta(job.progress.eta))
-    cpu = sum(stage.cpu_seconds for stage in job.progress.stages.values())
-    shown.add_row("CPU time", duration(cpu))
+        yield "time left", wording.eta(job.progress.eta)
+    yield "CPU time", duration(sum(stage.cpu_seconds for stage in job.progress.stages.values()))
     if job.state in GOOD:
         rate = 1 - job.rejected_count / job.sample_count
-        shown.add_row("accepted", f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})")
+        yield "accepted", f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})"
     else:
-        shown.add_row("samples", f"{job.sample_count}, {job.rejected_count} rejected so far")
+        yield "samples", f"{job.sample_count}, {job.rejected_count} rejected so far"
     if job.dataset is not None:
-        shown.add_row("dataset", wording.dataset(job.dataset))
-        shown.add_row("manifest", job.dataset.manifest)
-    return shown
+        yield "dataset", wording.dataset(job.dataset)
+        yield "manifest", job.dataset.manifest
 
 
-@shows_errors
-def watch_job(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+@click.command()
+@job_argument
+@asks
+def watch_job(job_id: str, url: str) -> None:
     """Watch a job until it ends; exit with 0 if it succeeded, else 1."""
     with Client(url) as client:
-        state = watch(client, job_id, console())
-    raise typer.Exit(0 if state in GOOD else 1)
+        state = watch(client, job_id)
+    raise Exit(0 if state in GOOD else 1)
 
 
-@shows_errors
-def cancel(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+@click.command()
+@job_argument
+@asks
+def cancel(job_id: str, url: str) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     with Client(url) as client:
         job = client.cancel(job_id)
-    console().print(f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: results are cached")
+    click.echo(f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: results are cached")
 
 
-@shows_errors
-def pause(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+@click.command()
+@job_argument
+@asks
+def pause(job_id: str, url: str) -> None:
     """Pause a job: no further task is started, and running tasks finish."""
     with Client(url) as client:
         job = client.pause(job_id)
-    console().print(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
+    click.echo(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
 
 
-@shows_errors
-def resume(job_id: JobArgument, url: UrlOption = DEFAULT_URL) -> None:
+@click.command()
+@job_argument
+@asks
+def resume(job_id: str, url: str) -> None:
     """Resume a paused job."""
     with Client(url) as client:
         job = client.resume(job_id)
-    console().print(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")
+    click.echo(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")
 
 
-@shows_errors
-def prioritise(
-    job_id: JobArgument,
-    priority: Annotated[int, typer.Argument(min=-100, max=100, help=PRIORITY)],
-    url: UrlOption = DEFAULT_URL,
-) -> None:
+@click.command(context_settings={"ignore_unknown_options": True})  # -1 is a priority
+@job_argument
+@click.argument("priority", type=PRIORITY, help=PRIORITY_HELP)
+@asks
+def prioritise(job_id: str, priority: int, url: str) -> None:
     """Change the priority of a job, from its next task on. Running tasks continue."""
     with Client(url) as client:
         job = client.prioritise(job_id, priority)
-    console().print(f"{job.id} has priority {job.priority}")
+    click.echo(f"{job.id} has priority {job.priority}")
 
 
 def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
@@ -264,12 +268,11 @@ def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
             client.upload_file(files[digest])
 
 
-@shows_errors
-def upload(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="PNG or JPEG files; files of scenes")],
-    url: UrlOption = DEFAULT_URL,
-    as_json: JsonOption = False,
-) -> None:
+@click.command()
+@click.argument("files", type=FILE, nargs=-1, required=True, help="PNG or JPEG files; files of scenes")
+@json_option
+@asks
+def upload(files: tuple[Path, ...], url: str, as_json: bool) -> None:
     """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes; print the references that specs use."""
     found: list[TextureEntry | FileUpload] = []
     with Client(url) as client:
@@ -288,10 +291,10 @@ def upload(
     say("In a spec, under any names:")
     pictures = [(file, entry) for file, entry in zip(files, found, strict=True) if isinstance(entry, TextureEntry)]
     for number, (file, picture) in enumerate(pictures):
-        console().print(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
+        click.echo(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
     for entry in found:
         if isinstance(entry, FileUpload):
-            console().print(f"file: {entry.file}" + (f"  # counts: {list(entry.counts)}" if entry.counts else ""))
+            click.echo(f"file: {entry.file}" + (f"  # counts: {list(entry.counts)}" if entry.counts else ""))
     return None
 
 

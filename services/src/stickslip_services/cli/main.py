@@ -1,13 +1,13 @@
 """The commands of `stickslip`, by name."""
 
 import ast
+import os
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-from typer.core import TyperCommand, TyperGroup
+import click
 
 from stickslip_services import __version__
 
@@ -43,13 +43,18 @@ _COMMANDS = {
     "datasets": "datasets.datasets",
     "export": "datasets.export",
 }
-"""Module and function of each command, or module and Typer of a group of commands."""
-_PASSING = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-_SETTINGS: dict[str, dict[str, Any]] = {"export": _PASSING}
+"""Module and function of each command."""
+
+_COMPLETIONS = {
+    "bash": ("~/.bashrc", 'eval "$(_STICKSLIP_COMPLETE=bash_source stickslip)"'),
+    "zsh": ("~/.zshrc", 'eval "$(_STICKSLIP_COMPLETE=zsh_source stickslip)"'),
+    "fish": ("~/.config/fish/completions/stickslip.fish", "_STICKSLIP_COMPLETE=fish_source stickslip | source"),
+}
+"""File of each shell, and the line in it that completes our commands."""
 
 
 @cache
-def _loaded(name: str) -> Any:
+def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
     module, attribute = _COMMANDS[name].split(".")
     if module in ("admin", "maintenance"):  # they import the server, which a client lacks
@@ -57,12 +62,8 @@ def _loaded(name: str) -> Any:
         from stickslip_services.cli.errors import shows_errors
 
         shows_errors(require_server)()
-    command = getattr(import_module(f"stickslip_services.cli.{module}"), attribute)
-    if isinstance(command, typer.Typer):
-        return typer.main.get_group(command)
-    alone = typer.Typer(add_completion=False)
-    alone.command(name, context_settings=_SETTINGS.get(name))(command)
-    return typer.main.get_command(alone)
+    command: click.Command = getattr(import_module(f"stickslip_services.cli.{module}"), attribute)
+    return command
 
 
 @cache
@@ -71,46 +72,51 @@ def _source(module: str) -> list[ast.stmt]:
 
 
 def _help(name: str) -> str:
-    """Return what a command's source says about it: the docstring of a function, or the help of a Typer."""
+    """Return the docstring of a command, from its source."""
     module, attribute = _COMMANDS[name].split(".")
-    for node in _source(module):
-        if isinstance(node, ast.FunctionDef) and node.name == attribute:
-            return ast.get_docstring(node) or ""
-        if (
-            isinstance(node, ast.Assign)
-            and ast.unparse(node.targets[0]) == attribute
-            and isinstance(node.value, ast.Call)
-        ):
-            return next(str(ast.literal_eval(word.value)) for word in node.value.keywords if word.arg == "help")
-    raise LookupError(f"{module}.py defines no {attribute}")
+    found = (node for node in _source(module) if isinstance(node, ast.FunctionDef) and node.name == attribute)
+    return ast.get_docstring(next(found)) or ""
 
 
-class _Commands(TyperGroup):
+class _Commands(click.Group):
     """Imports a command when it is called, and only reads about it when it is listed."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
+    def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
 
-    def get_command(self, ctx: Any, cmd_name: str) -> TyperCommand | None:
-        return TyperCommand(cmd_name, help=_help(cmd_name)) if cmd_name in _COMMANDS else None
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        return click.Command(cmd_name, help=_help(cmd_name)) if cmd_name in _COMMANDS else None
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        self.commands = {known: TyperCommand(known) for known in _COMMANDS}  # near names are looked for here
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[Any, Any, list[str]]:
+        self.commands = {known: click.Command(known) for known in _COMMANDS}  # near names are looked for here
         name, listed, rest = super().resolve_command(ctx, args)
         return name, listed and _loaded(str(name)), rest
 
 
-app = typer.Typer(
-    name="stickslip",
-    cls=_Commands,
-    help="Physically verified synthetic datasets of slender things.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
+def _install_completion(ctx: click.Context, _: click.Parameter, shell: str | None) -> None:
+    if shell is None or ctx.resilient_parsing:
+        return
+    place, line = _COMPLETIONS[shell]
+    file = Path(place).expanduser()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if not file.exists() or line not in file.read_text():
+        with file.open("a") as target:
+            target.write(f"{line}\n")
+    click.echo(f"{file} completes commands of stickslip, from the next {shell} on")
+    ctx.exit()
+
+
+@click.group("stickslip", cls=_Commands, context_settings={"show_default": True})
+@click.version_option(__version__, message="stickslip %(version)s", help="print the version")
+@click.option(
+    "--install-completion",
+    type=click.Choice(list(_COMPLETIONS)),
+    is_flag=False,
+    flag_value=Path(os.environ.get("SHELL", "bash")).name,
+    is_eager=True,
+    expose_value=False,
+    callback=_install_completion,
+    help="complete commands with the tabulator, in the shell that you use or name",
 )
-
-
-@app.callback(invoke_without_command=True)
-def _main(version: Annotated[bool, typer.Option("--version", help="print the version")] = False) -> None:
-    if version:
-        typer.echo(f"stickslip {__version__}")
-        raise typer.Exit
+def app() -> None:
+    """Physically verified synthetic datasets of slender things."""

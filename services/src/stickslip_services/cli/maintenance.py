@@ -5,13 +5,13 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated
 
-import typer
+import click
+from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.asker import asking, this_user
-from stickslip_services.cli.common import DEFAULT_DATA, DatabaseOption, DataOption, StoreOption, say
+from stickslip_services.cli.common import DEFAULT_DATA, FILE, data_option, database_option, say, store_option
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
@@ -24,7 +24,9 @@ from stickslip_services.queue.reindex import reindex as reindexed
 from stickslip_services.queue.scrub import scrub as scrubbed
 from stickslip_services.settings import Settings
 
-StoppedDataOption = Annotated[Path, typer.Option("--data", help="data directory of a coordinator that is stopped")]
+stopped_data_option = click.option(
+    "--data", type=FILE, default=DEFAULT_DATA, help="data directory of a coordinator that is stopped"
+)
 
 
 def _settings(data: Path, store: str | None, database: str | None, role: Role, *, is_new: bool = False) -> Settings:
@@ -55,13 +57,13 @@ def _owned(
             raise CommandError(str(error)) from error
 
 
+@click.command()
+@click.argument("version", metavar="DATASET:vN", help="the version to remove")
+@stopped_data_option
+@store_option
+@database_option
 @shows_errors
-def rm(
-    version: Annotated[str, typer.Argument(metavar="DATASET:vN", help="the version to remove")],
-    data: StoppedDataOption = DEFAULT_DATA,
-    store: StoreOption = None,
-    database: DatabaseOption = None,
-) -> None:
+def rm(version: str, data: Path, store: str | None, database: str | None) -> None:
     """Remove a version of a dataset, with its jobs and the results that no other job needs.
 
     `stickslip gc --delete` then frees the space. Submitting its spec again makes the dataset again.
@@ -71,18 +73,20 @@ def rm(
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
     with _owned(data, store, database) as (opened_database, files):
         jobs, tasks = remove(opened_database, files, parts[1], int(parts[2]))
-    typer.echo(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
-    typer.echo("to free the space: stickslip gc --delete --older-than 0")
+    click.echo(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
+    click.echo("to free the space: stickslip gc --delete --older-than 0")
 
 
+@click.command()
+@stopped_data_option
+@store_option
+@click.option(
+    "--older-than", type=click.FloatRange(0), metavar="HOURS", default=24.0, help="keep files that are younger"
+)
+@click.option("--delete", is_flag=True, help="delete the files; default: only count them")
+@database_option
 @shows_errors
-def gc(
-    data: StoppedDataOption = DEFAULT_DATA,
-    store: StoreOption = None,
-    older_than: Annotated[float, typer.Option(min=0, metavar="HOURS", help="keep files that are younger")] = 24.0,
-    delete: Annotated[bool, typer.Option("--delete", help="delete the files; default: only count them")] = False,
-    database: DatabaseOption = None,
-) -> None:
+def gc(data: Path, store: str | None, older_than: float, delete: bool, database: str | None) -> None:
     """Find the files of the store that nothing refers to, and delete them with --delete."""
     count = size = 0
     with _owned(data, store, database) as (opened_database, files):
@@ -92,11 +96,15 @@ def gc(
             if delete:
                 files.delete(file.name)
     done = "were deleted" if delete else "may be deleted: add --delete"
-    typer.echo(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}")
+    click.echo(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}")
 
 
+@click.command()
+@stopped_data_option
+@store_option
+@database_option
 @shows_errors
-def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, database: DatabaseOption = None) -> None:
+def reindex(data: Path, store: str | None, database: str | None) -> None:
     """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
     counts = Counter[str]()
     with _owned(data, store, database, is_new=True) as (opened_database, files):
@@ -104,20 +112,20 @@ def reindex(data: StoppedDataOption = DEFAULT_DATA, store: StoreOption = None, d
             if found.fault:
                 say(f"left out: {found.name}: {found.fault}")
             elif found.is_new:
-                typer.echo(f"{found.name}  {found.samples} samples")
+                click.echo(f"{found.name}  {found.samples} samples")
             counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
     say(f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out")
     say("certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`")
-    raise typer.Exit(1 if counts["bad"] else 0)
+    raise Exit(1 if counts["bad"] else 0)
 
 
+@click.command()
+@data_option
+@store_option
+@database_option
+@click.option("--rate", type=click.FloatRange(0.1), metavar="MB/S", default=100.0, help="read so much a second at most")
 @shows_errors
-def scrub(
-    data: DataOption = DEFAULT_DATA,
-    store: StoreOption = None,
-    database: DatabaseOption = None,
-    rate: Annotated[float, typer.Option(min=0.1, metavar="MB/S", help="read so much a second at most")] = 100.0,
-) -> None:
+def scrub(data: Path, store: str | None, database: str | None, rate: float) -> None:
     """Read all datasets, beside a running service or without one; exit with 1 if a file is damaged.
 
     Workers recompute damaged files. With STICKSLIP_SIGNING_KEY, versions without a good signature are signed again.
@@ -131,6 +139,6 @@ def scrub(
             version, damaged = found
             count, bad = count + 1, bad + bool(damaged)
             for path in damaged:
-                typer.echo(f"{version}  {path}")
+                click.echo(f"{version}  {path}")
     say(f"{count} versions read, {bad} damaged" + (": a service with workers recomputes their files" if bad else ""))
-    raise typer.Exit(1 if bad else 0)
+    raise Exit(1 if bad else 0)

@@ -2,10 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-from rich.markup import escape
+import click
+from click.exceptions import Exit
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
@@ -13,32 +13,30 @@ from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
-from stickslip_services.cli.common import JsonOption, console, say, table
+from stickslip_services.cli.common import FILE, json_option, print_table, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.cli.specs import read_scene
 from stickslip_services.local import certifying, simulating
 from stickslip_services.units import size
 
-scenes = typer.Typer(help="Check and preview scenes.", no_args_is_help=True)
-
-SceneArgument = Annotated[
-    str, typer.Argument(metavar="SCENE", help="a scene, YAML or JSON, or the name of a built-in one")
-]
+scene_argument = click.argument("scene", help="a scene, YAML or JSON, or the name of a built-in one")
 
 
+@click.command()
+@scene_argument
+@click.argument("out", metavar="DIR", type=FILE, help="a new directory for the trajectories")
+@click.option(
+    "--certificate",
+    metavar="DIR",
+    type=FILE,
+    help="what `stickslip certify` wrote (certificates/PRESET, if it is there)",
+)
+@click.option("--allow-uncertified", is_flag=True, help="simulate even where no certificate vouches for the preset")
+@click.option("--obj", is_flag=True, help="write an OBJ file for each sheet and frame, too")
+@json_option
 @shows_errors
 def simulate(
-    scene: SceneArgument,
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="a new directory for the trajectories")],
-    certificate: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="what `stickslip certify` wrote (certificates/PRESET, if it is there)"),
-    ] = None,
-    allow_uncertified: Annotated[
-        bool, typer.Option("--allow-uncertified", help="simulate even where no certificate vouches for the preset")
-    ] = False,
-    obj: Annotated[bool, typer.Option("--obj", help="write an OBJ file for each sheet and frame, too")] = False,
-    as_json: JsonOption = False,
+    scene: str, out: Path, certificate: Path | None, allow_uncertified: bool, obj: bool, as_json: bool
 ) -> None:
     """Simulate one sample of a scene on this machine, by the stages of the queue, with its default parameters.
 
@@ -51,18 +49,25 @@ def simulate(
     spec = spec_of(given, allow_uncertified=allow_uncertified)
     result = simulating.simulate(spec, files, out, certificate=found, obj=obj)
     if as_json:
-        typer.echo(json.dumps(result, indent=2))
+        click.echo(json.dumps(result, indent=2))
     else:
-        console().print(f"{spec.instants} frames of {len(given.sheets)} sheets: {escape(str(out))}")
+        click.echo(f"{spec.instants} frames of {len(given.sheets)} sheets: {out}")
         say("certified" if result["certified"] else f"NOT certified: {result['why_not_certified']}")
         if not result["valid"]:
             say(f"NOT valid: {result['reason']}")
-    raise typer.Exit(0 if result["valid"] else 1)
+    raise Exit(0 if result["valid"] else 1)
+
+
+@click.group()
+def scenes() -> None:
+    """Check and preview scenes."""
 
 
 @scenes.command()
+@scene_argument
+@json_option
 @shows_errors
-def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
+def check(scene: str, as_json: bool) -> None:
     """Check a scene and the files that it names; list its axes, the arrays of a dataset of it, and costs."""
     given, files = _scene(scene)
     spec = spec_of(given)
@@ -86,15 +91,10 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
         },
     }
     if as_json:
-        return typer.echo(json.dumps(said, indent=2))
-    shown = table("axis", "default", "values")
-    for name, axis in axes.items():
-        shown.add_row(name, str(axis["default"]), axis["values"])
-    console().print(shown)
-    listed = table("array", "type", "shape", "meaning")
-    for each in arrays:
-        listed.add_row(each["name"], each["dtype"], str(tuple(each["shape"])), escape(each["description"]))
-    console().print(listed)
+        return click.echo(json.dumps(said, indent=2))
+    print_table(("axis", "default", "values"), ((n, str(a["default"]), a["values"]) for n, a in axes.items()))
+    rows = ((each["name"], each["dtype"], str(tuple(each["shape"])), each["description"]) for each in arrays)
+    print_table(("array", "type", "shape", "meaning"), rows, sentences=True)
     cost = said["cost"]
     least, most = cost["cpu_seconds_a_sample"]
     say(
@@ -105,19 +105,18 @@ def check(scene: SceneArgument, as_json: JsonOption = False) -> None:
 
 
 @scenes.command()
+@scene_argument
+@click.argument("out", metavar="DIR", type=FILE, help="a directory for the pictures")
+@json_option
 @shows_errors
-def preview(
-    scene: SceneArgument,
-    out: Annotated[Path, typer.Argument(metavar="DIR", help="a directory for the pictures")],
-    as_json: JsonOption = False,
-) -> None:
+def preview(scene: str, out: Path, as_json: bool) -> None:
     """Draw how a scene starts and what moves in it, from all its cameras. Nothing is simulated.
 
     Writes CAMERA.png and motion.webp. No coordinator is needed, but the environment of Blender is.
     """
     pictures = simulating.preview(*_scene(scene), out)
     if as_json:
-        typer.echo(json.dumps({"pictures": pictures}))
+        click.echo(json.dumps({"pictures": pictures}))
     else:
         say(f"{', '.join(pictures)} in {out}")
 

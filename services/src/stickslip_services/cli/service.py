@@ -4,24 +4,23 @@ import re
 from datetime import UTC, datetime
 from pathlib import Path
 from socket import gethostname
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-from rich.markup import escape
+import click
+from click.exceptions import Exit
 
 from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
 from stickslip_services.cli.common import (
     DEFAULT_DATA,
-    DatabaseOption,
-    JsonOption,
-    StoreOption,
-    UrlOption,
-    console,
+    FILE,
+    database_option,
+    json_option,
     print_json,
+    print_table,
     require_server,
-    table,
+    store_option,
 )
-from stickslip_services.cli.errors import shows_errors
+from stickslip_services.cli.errors import asks, shows_errors
 from stickslip_services.client.http import Client
 from stickslip_services.units import duration
 
@@ -38,35 +37,39 @@ def _name(settings: "Settings") -> str:
     return "local" if settings.database is None else re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
 
 
+@click.command()
+@click.option("--data", type=FILE, default=DEFAULT_DATA, help="directory of everything: database, store, logs")
+@click.option("--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, help="port to listen on; 0: any free one")
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    help="address to listen on; off loopback only with keys, and with TLS or behind a proxy",
+)
+@store_option
+@database_option
+@click.option("--name", help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL")
+@click.option("--slots", type=click.IntRange(1), help="tasks at once; as many as there are cores")
+@click.option("--allow-host", multiple=True, help="name that the coordinator may be asked by; repeatable")
+@click.option("--require-keys", is_flag=True, help="refuse every request without a key")
+@click.option("--behind-proxy", is_flag=True, help="a proxy in front speaks TLS to the world; requests need keys")
+@click.option("--tls-certificate", type=FILE, help="file with the certificate and its chain")
+@click.option("--tls-key", type=FILE, help="file with the private key of the certificate")
+@click.option("--signing-key", type=FILE, help="file with the key of OpenSSH that signs new versions")
+@click.option("--workers", hidden=True, help="another program than stickslip_workers, for tests")
 @shows_errors
 def up(
-    data: Annotated[Path, typer.Option(help="directory of everything: database, store, logs")] = DEFAULT_DATA,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = DEFAULT_PORT,
-    host: Annotated[
-        str, typer.Option(help="address to listen on; off loopback only with keys, and with TLS or behind a proxy")
-    ] = "127.0.0.1",
-    store: StoreOption = None,
-    database: DatabaseOption = None,
-    name: Annotated[
-        str | None,
-        typer.Option(help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL"),
-    ] = None,
-    slots: Annotated[int | None, typer.Option(min=1, help="tasks at once; as many as there are cores")] = None,
-    allow_host: Annotated[
-        list[str] | None, typer.Option(help="name that the coordinator may be asked by; repeatable")
-    ] = None,
-    require_keys: Annotated[bool, typer.Option("--require-keys", help="refuse every request without a key")] = False,
-    behind_proxy: Annotated[
-        bool, typer.Option("--behind-proxy", help="a proxy in front speaks TLS to the world; requests need keys")
-    ] = False,
-    tls_certificate: Annotated[Path | None, typer.Option(help="file with the certificate and its chain")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="file with the private key of the certificate")] = None,
-    signing_key: Annotated[
-        Path | None, typer.Option(help="file with the key of OpenSSH that signs new versions")
-    ] = None,
-    workers: Annotated[
-        str | None, typer.Option("--workers", hidden=True, help="another program than stickslip_workers, for tests")
-    ] = None,
+    data: Path,
+    port: int,
+    host: str,
+    store: str | None,
+    database: str | None,
+    name: str | None,
+    slots: int | None,
+    allow_host: tuple[str, ...],
+    require_keys: bool,
+    behind_proxy: bool,
+    workers: str | None,
+    **files: Path | None,
 ) -> None:
     """Run a coordinator, a Ray and a dispatcher on this machine, until Ctrl-C."""
     require_server()
@@ -75,51 +78,41 @@ def up(
     from stickslip_services.local import supervisor
     from stickslip_services.settings import Settings
 
-    screen = console()
-    auth = {
-        "allowed_hosts": tuple(allow_host or ()),
-        "require_keys": require_keys,
-        "behind_proxy": behind_proxy,
-    }
+    auth = {"allowed_hosts": allow_host, "require_keys": require_keys, "behind_proxy": behind_proxy}
     given: dict[str, Any] = {name: value for name, value in auth.items() if value}
-    files = {"tls_certificate": tls_certificate, "tls_key": tls_key, "signing_key": signing_key}
     given |= {name: path.absolute() for name, path in files.items() if path is not None}
     given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
     settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
         supervisor.LocalService(settings, name or _name(settings), slots, workers),
-        on_ready=lambda url: screen.print(
-            f"stickslip is up. Dashboard: [bold]{url}[/]\n"
+        on_ready=lambda url: click.echo(
+            f"stickslip is up. Dashboard: {click.style(url, bold=True)}\n"
             f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"
-            f"Data are in {escape(str(data))}, logs in {escape(str(data / 'logs'))}. "
+            f"Data are in {data}, logs in {data / 'logs'}. "
             "Ctrl-C stops the service; jobs go on when you start it again."
         ),
     )
-    raise typer.Exit(status)
+    raise Exit(status)
 
 
-@shows_errors
-def workers(url: UrlOption = DEFAULT_URL, as_json: JsonOption = False) -> None:
+@click.command()
+@json_option
+@asks
+def workers(url: str, as_json: bool) -> None:
     """List the registered workers, newest first."""
     with Client(url) as client:
         found = client.workers()
     if as_json:
         return print_json(found)
-    shown = table("worker", "kinds", "state", "slots", "tasks", "last seen", no_wrap=("worker",))
-    now = datetime.now(UTC)
+    rows, now = [], datetime.now(UTC)
     for worker in found:
-        ago = duration(max(0.0, (now - worker.last_seen_at).total_seconds()))
-        shown.add_row(
-            worker.name,
-            ", ".join(worker.builds),
-            worker.condition.state,
-            str(worker.condition.slots),
-            str(worker.leased),
-            f"{ago} ago" if worker.alive else f"[red]{ago} ago: not connected[/]",
-        )
-    console().print(shown)
+        ago = f"{duration(max(0.0, (now - worker.last_seen_at).total_seconds()))} ago"
+        seen = ago if worker.alive else click.style(f"{ago}: not connected", fg="red")
+        numbers = str(worker.condition.slots), str(worker.leased)
+        rows.append((worker.name, worker.condition.state, *numbers, seen, ", ".join(worker.builds)))
+    print_table(("worker", "state", "slots", "tasks", "last seen", "kinds"), rows)
     for worker in found:
         if worker.condition.reason:
-            console().print(f"{escape(worker.name)}: {escape(worker.condition.reason)}", soft_wrap=True)
+            click.echo(f"{worker.name}: {worker.condition.reason}")
     return None

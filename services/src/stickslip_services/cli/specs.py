@@ -10,8 +10,7 @@ import yaml
 from pydantic import ValidationError
 from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.scene.files import MAX_DOCUMENT_BYTES, UnfitFileError, frames_of, inlined
+from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
 from stickslip_schemas.scene.library import parse_yaml
 from stickslip_schemas.spec.fabrics import MATERIAL_NAME
 from stickslip_schemas.spec.jobs import JobSpec
@@ -79,6 +78,10 @@ def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, byt
         scene = Scene.model_validate(document)
     except ValidationError as error:
         raise _not_valid(error, document, Scene, path) from error
+
+    if not any(scene.files()):
+        return scene, {}
+    from stickslip_schemas.scene.files import UnfitFileError, frames_of, inlined  # needs the extra `arrays`
 
     def read(name: str) -> bytes:
         place = (path.parent / name).resolve()

@@ -1,5 +1,6 @@
 """States, progress and remaining times as text for the command line."""
 
+import click
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Eta, Progress, StageProgress
 from stickslip_schemas.plan.costs import Interval
@@ -33,8 +34,8 @@ def interval(value: Interval) -> str:
 
 
 def state(value: JobState) -> str:
-    """Return a state in its colour, as rich markup."""
-    return f"[{_COLORS.get(value, 'white')}]{value}[/]"
+    """Return a state in its colour."""
+    return click.style(str(value), fg=_COLORS.get(value))
 
 
 def dataset(value: DatasetRef | None) -> str:

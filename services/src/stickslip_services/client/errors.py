@@ -10,7 +10,8 @@ ClientError
 ├── UnsignedError       the dataset has no signature
 ├── ChangedError        the signature is not that of the dataset
 ├── UnknownSignerError  no allowed signer made the signature
-└── SelectionError      the dataset has no such array or label
+├── SelectionError      the dataset has no such array or label
+└── MissingExtraError   packages of an extra are not installed
 """
 
 import httpx
@@ -64,6 +65,13 @@ class UnknownSignerError(ClientError):
 
 class SelectionError(ClientError):
     """The dataset has no such array or label."""
+
+
+class MissingExtraError(ClientError):
+    """Packages of an extra are not installed."""
+
+    def __init__(self, extra: str, what: str) -> None:
+        super().__init__(f"{what} is not installed: pip install 'stickslip[{extra}]'")
 
 
 def raise_for_problem(response: httpx.Response) -> None:

@@ -2,15 +2,16 @@
 
 import json
 import os
+import random
 import secrets
 import ssl
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from typing import Any, Self, TypeVar
+from itertools import chain, repeat
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import httpx
-from httpx_sse import EventSource, ServerSentEvent
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.certificate import Certificate
@@ -34,10 +35,18 @@ from stickslip_schemas.documents.responses import (
     WorkerEntry,
 )
 from stickslip_schemas.format.manifest import Contents, Manifest
-from tenacity import Retrying, retry_if_exception, stop_after_delay, wait_random_exponential
 
 from stickslip_services.addresses import coordinator_url
-from stickslip_services.client.errors import ClientError, UnexpectedError, UnreachableError, raise_for_problem
+from stickslip_services.client.errors import (
+    ClientError,
+    MissingExtraError,
+    UnexpectedError,
+    UnreachableError,
+    raise_for_problem,
+)
+
+if TYPE_CHECKING:
+    import zarr
 
 T = TypeVar("T")
 
@@ -54,6 +63,8 @@ PAGE_SIZE = "200"
 
 PATIENCE_SECONDS = 60.0
 """How long a failed request is repeated [s]."""
+PAUSES_SECONDS = (0.25, 0.5, 1.0, 2.0, 3.0)
+"""Longest pauses between tries [s], the last one again and again; a drawn share of them is waited."""
 SILENCE_SECONDS = 60.0
 """Read timeout of an event stream [s]; the coordinator sends a keep-alive every 15 s."""
 
@@ -172,7 +183,7 @@ class Client:
             try:
                 for message in self._stream(job_id, last_id):
                     waited = 0.0
-                    last_id = message.id or last_id
+                    last_id = message.get("id", last_id)
                     event = _read_event(message)
                     if event is not None:
                         yield event
@@ -192,7 +203,8 @@ class Client:
             pass
         return self.job(job_id)
 
-    def _stream(self, job_id: str, last_id: str) -> Iterator[ServerSentEvent]:
+    def _stream(self, job_id: str, last_id: str) -> Iterator[dict[str, str]]:
+        """Yield the messages of an event stream, each as its fields."""
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
         timeout = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
@@ -201,7 +213,12 @@ class Client:
             if not response.is_success:
                 response.read()
             raise_for_problem(response)
-            yield from EventSource(response).iter_sse()
+            received = ""
+            for text in response.iter_text():
+                *messages, received = (received + text).split("\n\n")
+                for message in messages:
+                    lines = (line.partition(": ") for line in message.split("\n"))
+                    yield {name: value for name, _, value in lines}
 
     # --- datasets and workers -------------------------------------------------------------------------------------
 
@@ -224,6 +241,35 @@ class Client:
     def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
         response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
         return parsed(Manifest, response), response.content
+
+    def newest(self, dataset: str) -> int:
+        """Return the number of the newest version of a dataset; raise ClientError if it has none yet."""
+        versions = self.dataset(dataset).versions
+        if not versions:
+            raise ClientError(f"dataset {dataset} has no version yet")
+        return versions[-1].version
+
+    def open(self, dataset: str, version: int | None = None) -> "zarr.Group":
+        """Open a version of a dataset, the newest by default, as a Zarr group, whose chunks are downloaded when read.
+
+        A missing chunk reads as the fill value: pull the dataset, or read it with stickslip-training, to get an error.
+
+        Raises:
+            MissingExtraError: The extra `arrays` is not installed.
+            ClientError: The coordinator refused, or does not answer.
+        """
+        try:
+            import zarr
+            from obstore.store import HTTPStore
+            from zarr.storage import ObjectStore
+        except ImportError as error:
+            raise MissingExtraError("arrays", f"to open a dataset needs zarr and obstore, and {error.name}") from error
+        number = self.newest(dataset) if version is None else version
+        self.version(dataset, number)
+        files = f"{self.url}/v1/datasets/{dataset}/versions/{number}/files"
+        key = {name: value for name, value in self._http.headers.items() if name == "authorization"}
+        store = HTTPStore(files, client_options={"allow_http": True, "default_headers": key})
+        return zarr.open_group(ObjectStore(store, read_only=True), mode="r")
 
     def workers(self) -> list[WorkerEntry]:
         return self._call(list[WorkerEntry], "GET", "/v1/workers")
@@ -253,38 +299,26 @@ class Client:
         Raises:
             ClientError: The request failed.
         """
-        attempts = Retrying(
-            retry=retry_if_exception(self._may_pass),
-            wait=wait_random_exponential(multiplier=0.25, max=3),
-            stop=stop_after_delay(self.patience),
-            reraise=True,
-            sleep=self._sleep,
-        )
-        try:
-            return attempts(self._send, method, path, **options)
-        except httpx.TransportError as error:
-            raise UnreachableError(f"{self.url} does not answer: {error or type(error).__name__}") from error
-        except httpx.HTTPStatusError as error:
-            raise_for_problem(error.response)
-            raise UnexpectedError(f"{self.url} answered with status {error.response.status_code}") from error
-
-    def _may_pass(self, error: BaseException) -> bool:
-        """Return whether repeating a request may help: a coordinator that has answered before may be restarting."""
-        if isinstance(error, httpx.ConnectError) and not self._was_answered:
-            return False
-        return isinstance(error, httpx.TransportError | httpx.HTTPStatusError)
+        until = time.monotonic() + self.patience
+        for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):
+            last = time.monotonic() >= until
+            try:
+                response = self._http.request(method, path, **options)
+            except httpx.TransportError as error:
+                # A coordinator that has answered before may be restarting.
+                if last or (isinstance(error, httpx.ConnectError) and not self._was_answered):
+                    raise UnreachableError(f"{self.url} does not answer: {error or type(error).__name__}") from error
+            else:
+                self._was_answered = True
+                if last or response.status_code != 503:
+                    raise_for_problem(response)
+                    return response
+            self._sleep(pause * random.random())
+        raise AssertionError
 
     def stream(self, path: str, headers: Mapping[str, str]) -> AbstractContextManager[httpx.Response]:
         """Open a download; the caller handles connection errors."""
         return self._http.stream("GET", path, headers=headers)
-
-    def _send(self, method: str, path: str, **options: Any) -> httpx.Response:
-        response = self._http.request(method, path, **options)
-        self._was_answered = True
-        if response.status_code == 503:
-            response.raise_for_status()
-        raise_for_problem(response)
-        return response
 
     def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
         """Send a request and return its answer as a model."""
@@ -307,12 +341,13 @@ def parsed(answer: type[T], response: httpx.Response) -> T:
         raise UnexpectedError(f"{response.url} sent an unexpected answer: {error}") from error
 
 
-def _read_event(message: ServerSentEvent) -> Event | None:
+def _read_event(message: Mapping[str, str]) -> Event | None:
     """Return an event, None for one that only newer versions know; raise UnexpectedError."""
-    model = _EVENTS.get(message.event)
+    name = message.get("event", "")
+    model = _EVENTS.get(name)
     if model is None:
         return None
     try:
-        return model.model_validate(json.loads(message.data))
+        return model.model_validate(json.loads(message.get("data", "")))
     except ValueError as error:
-        raise UnexpectedError(f"the event {message.event} has unexpected data: {error}") from error
+        raise UnexpectedError(f"the event {name} has unexpected data: {error}") from error

@@ -6,14 +6,12 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.format.codecs import CorruptChunkError, decode_chunk
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import (
     MANIFEST_NAME,
@@ -31,10 +29,15 @@ from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Sel
 
 from stickslip_services.client.errors import DamagedError, UnsafePathError
 
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
 CONNECTIONS = 4
 """Files that are read or downloaded at once."""
 PART = ".part"
 """Suffix of a file that is being downloaded."""
+READS_ARRAYS = find_spec("numcodecs") is not None
+"""Whether the extra `arrays` is there: without it, `verify` does not look into the array `sample_key`."""
 EVERYTHING = Selection()
 OWN_NAMES = (*SEALED_NAMES, SIGNATURE_NAME, SELECTION_NAME)
 """Files of a directory that no manifest lists."""
@@ -57,8 +60,11 @@ def read_part(target: Path) -> PartDocument:
         raise DamagedError(f"{target / SELECTION_NAME} is damaged: {str(error).splitlines()[0]}") from error
 
 
-def read_label(target: Path, manifest: Manifest, name: str) -> npt.NDArray[Any]:
+def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]":
     """Return a label of all slots, (slots,) or (slots, n), from the verified files of a directory."""
+    import numpy as np  # the extra `arrays`
+    from stickslip_schemas.format.codecs import decode_chunk
+
     array = next(array for array in layout(manifest.spec) if array.name == name)
     numbers = range(-(-manifest.sample_count // manifest.samples_per_file(array)))
     content = b"".join(bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers)
@@ -129,7 +135,7 @@ def verify(target: Path) -> list[Fault]:
     for path in there:
         if path not in wanted and path not in OWN_NAMES:
             faults.append(Fault(path, "extra", "not in the manifest"))
-    if not faults:
+    if not faults and READS_ARRAYS:
         faults = _sample_key_faults(target, contents, numbers)
     return sorted(faults, key=lambda fault: fault.path)
 
@@ -141,6 +147,8 @@ def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
 
 def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int]) -> list[Fault]:
     """Compare the array `sample_key` with the keys that the sections of the manifest list."""
+    from stickslip_schemas.format.codecs import CorruptChunkError
+
     manifest = contents.manifest
     array = next(array for array in layout(manifest.spec) if array.name == "sample_key")
     try:

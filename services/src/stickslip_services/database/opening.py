@@ -27,7 +27,7 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
     if find_spec("psycopg") is None:
         raise DatabaseRefusedError(
             f"the database {settings.database_name} needs psycopg, which is not installed: "
-            "pip install 'stickslip-services[server,postgresql]'"
+            "pip install 'stickslip[server,postgresql]'"
         )
     from stickslip_services.database.postgresql import PostgresqlDatabase
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
@@ -46,6 +45,8 @@ def simulate(
     Raises:
         SimulateError: It was not run.
     """
+    import numpy as np  # the extra `arrays`
+
     if out.exists():
         raise SimulateError(f"out: must not exist, and {out} does")
     build = _workers(["describe"])["builds"][spec.kind]["sim_core"]
@@ -129,6 +130,8 @@ def _workers(arguments: list[str]) -> dict[str, Any]:
 
 
 def _write(out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], said: dict[str, Any], *, obj: bool) -> None:
+    import numpy as np
+
     (out / RESULT_NAME).write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
     if not arrays:
         return
