@@ -341,6 +341,15 @@ def test_health_and_metrics(client: httpx.Client, worker: PretendWorker) -> None
     assert 'stickslip_request_seconds_count{method="POST",route="/v1/jobs",status="202"} 1.0' in text
 
 
+def test_metrics_count_unknown_methods_as_one(client: httpx.Client) -> None:
+    """Otherwise each word that a stranger sends as a method would stay in memory."""
+    for word in ("BREW", "POUR"):
+        client.request(word, "/v1/jobs")
+    text = client.get("/metrics").text
+    assert 'stickslip_request_seconds_count{method="other",route="/v1/jobs",status="405"} 2.0' in text
+    assert not any(word in text for word in ("BREW", "POUR"))
+
+
 def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: httpx.Client) -> None:
     api = HttpApi(str(client.base_url), app.state.worker_key)
 

@@ -4,6 +4,7 @@ import re
 import secrets
 import time
 from collections.abc import Callable
+from http import HTTPMethod
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -12,6 +13,7 @@ from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_services.api.problems import problem_response
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_.:-]{1,128}")
+_METHODS = frozenset(HTTPMethod)
 
 
 class RequestIdMiddleware:
@@ -118,4 +120,5 @@ class TimingMiddleware:
             await self._app(scope, receive, watched_send)
         finally:
             route = getattr(scope.get("route"), "path", "unknown")
-            self._observe(scope["method"], route, status, time.perf_counter() - begin)
+            method = scope["method"] if scope["method"] in _METHODS else "other"
+            self._observe(method, route, status, time.perf_counter() - begin)
