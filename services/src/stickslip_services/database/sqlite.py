@@ -1,7 +1,7 @@
 """SQLite: a file in the data directory, for one coordinator."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,9 +15,10 @@ _PRAGMAS = (
     "journal_mode=WAL",  # readers and the writer do not wait for each other
     "busy_timeout=30000",  # another process may look at the database (a backup, a person)
     "foreign_keys=ON",
-    "cache_size=-65536",  # 64 MiB: the index of 200,000 task keys fits
     "journal_size_limit=67108864",  # the log of a big plan does not stay that big
 )
+_WRITER_CACHE = "cache_size=-65536"
+"""64 MiB: the index of 200,000 task keys fits. Readers drop their cache with each write, so theirs stays small."""
 
 
 class SqliteDatabase(Database):
@@ -27,26 +28,32 @@ class SqliteDatabase(Database):
         _close_to_others(path)
         # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync; leases and reports
         # come in batches, so there are only a few a second.
-        self._pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
+        pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
         url = URL.create("sqlite+pysqlite", database=str(path))
-        engine = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
-        event.listen(engine, "connect", self._prepare)
-        event.listen(engine, "begin", _begin)
-        super().__init__(engine, engine)
+        reader = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
+        writer = create_engine(url, connect_args={"timeout": 30}, pool_size=1, max_overflow=0)
+        event.listen(reader, "connect", partial(_prepare, pragmas))
+        event.listen(writer, "connect", partial(_prepare, (*pragmas, _WRITER_CACHE)))
+        event.listen(reader, "begin", partial(_begin, "BEGIN"))
+        event.listen(writer, "begin", partial(_begin, "BEGIN IMMEDIATE"))
+        super().__init__(reader, writer)
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Open a transaction that excludes other writers; it is durable after the block."""
-        with self._writing, self._writer.connect() as connection:
-            connection.execution_options(stickslip_write=True)
-            with connection.begin():
-                yield connection
+        with self._writing, self._writer.begin() as connection:
+            yield connection
 
-    def _prepare(self, connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # transactions are begun by _begin, not by the driver
-        connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
-        for pragma in self._pragmas:
-            connection.execute(f"PRAGMA {pragma}")
+
+def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:
+    connection.isolation_level = None  # transactions are begun by _begin, not by the driver
+    connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
+    for pragma in pragmas:
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _begin(statement: str, connection: Connection) -> None:
+    connection.exec_driver_sql(statement)
 
 
 def _close_to_others(path: Path) -> None:
@@ -60,8 +67,3 @@ def _close_to_others(path: Path) -> None:
             place.touch(mode=mode)
         if place.stat().st_uid == os.geteuid():
             place.chmod(mode)
-
-
-def _begin(connection: Connection) -> None:
-    immediate = connection.get_execution_options().get("stickslip_write", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
