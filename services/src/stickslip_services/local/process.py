@@ -12,8 +12,7 @@ from pathlib import Path
 
 from stickslip_services.errors import DatabaseRefusedError
 
-_M_ARENA_MAX = -8
-"""A name in glibc's malloc.h."""
+_M_ARENA_MAX = -8  # of glibc's malloc.h
 
 
 def limit_arenas() -> None:
