@@ -1,5 +1,6 @@
 """Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
 
+import re
 from pathlib import Path
 from typing import Any, Self
 
@@ -77,6 +78,13 @@ class Settings(BaseSettings):
         except ValidationError as error:
             rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
             raise SettingsError("; ".join(rules)) from None
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _are_names(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        if wrong := [host for host in hosts if re.fullmatch(r"[\w.-]+|\[[\da-fA-F:]+\]", host, re.ASCII) is None]:
+            raise ValueError(f"allowed_hosts must be names or addresses without a port; one is {wrong[0]!r}")
+        return hosts
 
     @field_validator("store")
     @classmethod

@@ -22,7 +22,7 @@ from stickslip_services.access.scopes import Scope, check_project
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys
-from stickslip_services.errors import NotFoundError, SettingsError
+from stickslip_services.errors import CommandError, NotFoundError, SettingsError
 from stickslip_services.settings import Settings
 
 LOCAL_WORKER = "local-worker"
@@ -47,7 +47,9 @@ class ApiKey:
 def create_key(
     connection: Connection, name: str, scopes: Collection[Scope], now: float, *, project: str = ""
 ) -> tuple[ApiKey, str]:
-    """Make a key; return it and its secret, which is not stored. Raise ValueError for a bad project."""
+    """Make a key; return it and its secret, which is not stored. Raise CommandError for a bad name or project."""
+    if not 1 <= len(name) <= 100:
+        raise CommandError(f"name must have 1 to 100 characters, and has {len(name)}")
     secret = f"sk_{secrets.token_urlsafe(32)}"
     key = _insert(connection, name, scopes, secret, now, project=check_project(project))
     told = [scope for scope in Scope if scope in scopes]

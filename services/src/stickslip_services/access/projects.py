@@ -31,7 +31,7 @@ class Project:
 
 
 def set_quota(connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float) -> None:
-    """Set the quota of a project from the next submission on; raise ValueError for a bad name."""
+    """Set the quota of a project from the next submission on; raise CommandError for a bad name."""
     connection.execute(delete(projects).where(projects.c.name == check_project(name)))
     connection.execute(insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs))
     note(connection, "project.quota", name, now, max_samples=max_samples, max_jobs=max_jobs)

@@ -3,6 +3,8 @@
 import re
 from enum import StrEnum
 
+from stickslip_services.errors import CommandError
+
 
 class Scope(StrEnum):
     """What a key permits. `submit` includes `read`; `admin` includes everything."""
@@ -30,7 +32,7 @@ def includes(granted: Scope, needed: Scope) -> bool:
 
 
 def check_project(name: str) -> str:
-    """Return the name of a project; raise ValueError where it is malformed."""
+    """Return the name of a project; raise CommandError where it is malformed."""
     if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
-        raise ValueError(f"project must be lower-case letters, digits and '-', at most 63 of them; got {name[:100]!r}")
+        raise CommandError(f"project must be lower-case letters, digits and '-', 63 at most; got {name[:100]!r}")
     return name

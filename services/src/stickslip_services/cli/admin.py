@@ -17,13 +17,9 @@ from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.scopes import Scope
 from stickslip_services.cli.common import print_table, say
 from stickslip_services.cli.errors import administers
-from stickslip_services.client.errors import ClientError
 from stickslip_services.settings import Settings
 
 webhook_argument = click.argument("webhook", help="id, as `stickslip webhooks list` shows it")
-
-
-# --- keys -----------------------------------------------------------------------------------------------------
 
 
 @click.group()
@@ -83,9 +79,6 @@ def revoke_key(key_id: str, data: Path, database: str | None) -> None:
     click.echo(f"{key_id} is revoked")
 
 
-# --- projects -------------------------------------------------------------------------------------------------
-
-
 @click.group()
 def projects() -> None:
     """List projects, and set their quotas."""
@@ -112,19 +105,13 @@ def list_projects(data: Path, database: str | None) -> None:
 def set_quota(name: str, samples: int | None, jobs: int | None, data: Path, database: str | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
     with audit.visited(data, database) as connection:
-        try:
-            stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
-        except ValueError as error:
-            raise ClientError(str(error)) from None
+        stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
     click.echo(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
 
 
 def _limit(value: int | None) -> str:
     return "any number" if value is None else f"{value:,}"
-
-
-# --- webhooks -------------------------------------------------------------------------------------------------
 
 
 @click.group()
@@ -177,9 +164,6 @@ def delete_webhook(webhook: str, data: Path, database: str | None) -> None:
     with audit.visited(data, database) as connection:
         stored_webhooks.delete_webhook(connection, webhook, time.time())
     click.echo(f"{webhook} is deleted")
-
-
-# --- audit log ------------------------------------------------------------------------------------------------
 
 
 @click.command()

@@ -18,7 +18,7 @@ PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
 
 
 @click.command()
-@click.option("--preset", required=True, help=f"the preset to certify: {', '.join(PRESETS)}")
+@click.option("--preset", type=click.Choice(PRESETS), required=True, help="the preset to certify")
 @click.option("--out", type=FILE, help="folder for the certificate (certificates/PRESET)")
 @click.option("--quick", is_flag=True, help="measure a few points only, in seconds; such a certificate does not count")
 @asks

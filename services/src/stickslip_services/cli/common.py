@@ -1,10 +1,12 @@
 """Options, tables and JSON output, shared by the commands."""
 
 import json
+import math
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,18 @@ database_option = click.option(
     "--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"
 )
 store_option = click.option("--store", help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
+
+
+def amount(unit: str, least: float) -> Callable[[str], float]:
+    """Return the type of an option that is a finite number of a unit."""
+
+    def read(text: str) -> float:
+        with suppress(ValueError):
+            if least <= float(text) < math.inf:
+                return float(text)
+        raise click.BadParameter(f"must be a number of {unit}, {least:g} or more, and is {text!r}")
+
+    return read
 
 
 def say(text: str) -> None:

@@ -94,7 +94,7 @@ class _Commands(click.Group):
 
 
 def _install_completion(ctx: click.Context, _: click.Parameter, shell: str | None) -> None:
-    if shell is None or ctx.resilient_parsing:
+    if shell is None:
         return
     place, line = _COMPLETIONS[shell]
     file = Path(place).expanduser()

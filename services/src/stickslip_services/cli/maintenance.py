@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.asker import asking, this_user
-from stickslip_services.cli.common import DEFAULT_DATA, FILE, data_option, database_option, say, store_option
-from stickslip_services.cli.errors import shows_errors
+from stickslip_services.cli.common import DEFAULT_DATA, FILE, amount, data_option, database_option, say, store_option
+from stickslip_services.cli.errors import P, R, shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
@@ -24,9 +24,14 @@ from stickslip_services.queue.reindex import reindex as reindexed
 from stickslip_services.queue.scrub import scrub as scrubbed
 from stickslip_services.settings import Settings
 
-stopped_data_option = click.option(
+_data_option = click.option(
     "--data", type=FILE, default=DEFAULT_DATA, help="data directory of a coordinator that is stopped"
 )
+
+
+def stopped(command: Callable[P, R]) -> Callable[P, R]:
+    """Give a command the options of a coordinator that is stopped, and show its errors."""
+    return _data_option(store_option(database_option(shows_errors(command))))
 
 
 def _settings(data: Path, store: str | None, database: str | None, role: Role, *, is_new: bool = False) -> Settings:
@@ -59,10 +64,7 @@ def _owned(
 
 @click.command()
 @click.argument("version", metavar="DATASET:vN", help="the version to remove")
-@stopped_data_option
-@store_option
-@database_option
-@shows_errors
+@stopped
 def rm(version: str, data: Path, store: str | None, database: str | None) -> None:
     """Remove a version of a dataset, with its jobs and the results that no other job needs.
 
@@ -78,14 +80,11 @@ def rm(version: str, data: Path, store: str | None, database: str | None) -> Non
 
 
 @click.command()
-@stopped_data_option
-@store_option
 @click.option(
-    "--older-than", type=click.FloatRange(0), metavar="HOURS", default=24.0, help="keep files that are younger"
+    "--older-than", type=amount("hours", 0), metavar="HOURS", default=24.0, help="keep files that are younger"
 )
 @click.option("--delete", is_flag=True, help="delete the files; default: only count them")
-@database_option
-@shows_errors
+@stopped
 def gc(data: Path, store: str | None, older_than: float, delete: bool, database: str | None) -> None:
     """Find the files of the store that nothing refers to, and delete them with --delete."""
     count = size = 0
@@ -100,10 +99,7 @@ def gc(data: Path, store: str | None, older_than: float, delete: bool, database:
 
 
 @click.command()
-@stopped_data_option
-@store_option
-@database_option
-@shows_errors
+@stopped
 def reindex(data: Path, store: str | None, database: str | None) -> None:
     """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
     counts = Counter[str]()
@@ -123,7 +119,7 @@ def reindex(data: Path, store: str | None, database: str | None) -> None:
 @data_option
 @store_option
 @database_option
-@click.option("--rate", type=click.FloatRange(0.1), metavar="MB/S", default=100.0, help="read so much a second at most")
+@click.option("--rate", type=amount("MB/s", 0.1), metavar="MB/S", default=100.0, help="read so much a second at most")
 @shows_errors
 def scrub(data: Path, store: str | None, database: str | None, rate: float) -> None:
     """Read all datasets, beside a running service or without one; exit with 1 if a file is damaged.

@@ -10,12 +10,13 @@ from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.scene.library import load_scene, scene_names
+from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
 from stickslip_services.cli.common import FILE, json_option, print_table, say
 from stickslip_services.cli.errors import shows_errors
 from stickslip_services.cli.specs import read_scene
+from stickslip_services.client.errors import ClientError
 from stickslip_services.local import certifying, simulating
 from stickslip_services.units import size
 
@@ -134,9 +135,12 @@ def _axis(scene: Scene, name: str) -> dict[str, Any]:
 
 def _scene(name: str) -> tuple[Scene, dict[str, bytes]]:
     """Return a built-in scene, or that of a file, and the files that it names by digest."""
-    if name in scene_names() and not Path(name).exists():
+    if Path(name).exists():
+        return read_scene(Path(name))
+    try:
         return load_scene(name), {}
-    return read_scene(Path(name))
+    except ValueError as error:
+        raise ClientError(f"scene {error}, in a file; it is {name!r}") from None
 
 
 def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:

@@ -28,10 +28,6 @@ if TYPE_CHECKING:
     from stickslip_services.settings import Settings
 
 
-def _url_option(url: str) -> str:
-    return "" if url == DEFAULT_URL else f" --url {url}"
-
-
 def _name(settings: "Settings") -> str:
     """Return a unique name for the dispatcher: a second one of the same name would take over its tasks."""
     return "local" if settings.database is None else re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
@@ -88,7 +84,8 @@ def up(
         supervisor.LocalService(settings, name or _name(settings), slots, workers),
         on_ready=lambda url: click.echo(
             f"stickslip is up. Dashboard: {click.style(url, bold=True)}\n"
-            f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{_url_option(url)}\n"
+            f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch"
+            f"{'' if url == DEFAULT_URL else f' --url {url}'}\n"
             f"Data are in {data}, logs in {data / 'logs'}. "
             "Ctrl-C stops the service; jobs go on when you start it again."
         ),

@@ -124,8 +124,6 @@ class Client:
     def close(self) -> None:
         self._http.close()
 
-    # --- jobs -----------------------------------------------------------------------------------------------------
-
     def validate(self, spec: Mapping[str, Any]) -> Validation:
         """Validate a spec and count its samples and tasks, without submitting it."""
         return self._call(Validation, "POST", "/v1/jobs:validate", json=spec)
@@ -220,8 +218,6 @@ class Client:
                     lines = (line.partition(": ") for line in message.split("\n"))
                     yield {name: value for name, _, value in lines}
 
-    # --- datasets and workers -------------------------------------------------------------------------------------
-
     def datasets(self) -> Iterator[Dataset]:
         """Yield all datasets, newest first."""
         return self._items(Page[Dataset], "/v1/datasets")
@@ -274,8 +270,6 @@ class Client:
     def workers(self) -> list[WorkerEntry]:
         return self._call(list[WorkerEntry], "GET", "/v1/workers")
 
-    # --- certificates ---------------------------------------------------------------------------------------------
-
     def certificates(self) -> Iterator[CertificateEntry]:
         """Yield all certificates, newest first."""
         return self._items(Page[CertificateEntry], "/v1/certificates")
@@ -288,8 +282,6 @@ class Client:
         headers = {"Content-Type": "application/json"}
         content = certificate.model_dump_json()
         return self._call(CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
-
-    # --- HTTP -----------------------------------------------------------------------------------------------------
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and repeat it while the connection fails or the coordinator is busy.
