@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Self
 
 from sqlalchemy import Connection, bindparam, select
+from sqlalchemy.exc import NoResultFound
 from stickslip_schemas.base.keys import Sha256, content_key
 from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
@@ -27,7 +28,7 @@ from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id, task_key
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
-UNSOUND = (DamagedRowsError, ConflictError, ValueError, KeyError, TypeError)
+UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError, TypeError)
 """Errors that damaged rows cause."""
 
 Publish = Callable[[bytes], Sha256]
