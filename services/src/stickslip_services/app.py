@@ -58,7 +58,7 @@ from stickslip_services.settings import Settings
 logger = logging.getLogger(__name__)
 
 PLAN_SECONDS = 0.2
-"""Polling interval for jobs to plan or to cancel [s]."""
+"""Polling interval for jobs to plan [s]."""
 
 GRACE_SECONDS = 3
 """Time that open requests (event streams) have to end after a signal [s]."""
@@ -90,7 +90,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
             (partial(check_made_datasets, context), every),
             (partial(scrub_when_idle, context), every),
             (Planner(context).run, PLAN_SECONDS),
-            (partial(give_up_waiting, context), PLAN_SECONDS),
+            (partial(give_up_waiting, context), every),
             (delivery.run, every),
         ]
         running = [asyncio.create_task(_repeat(*service)) for service in services]

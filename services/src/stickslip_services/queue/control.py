@@ -35,17 +35,19 @@ def cancel_job(context: Context, job_id: str) -> JobDetail:
     return _shown(context, job.seq)
 
 
+_TO_GIVE_UP = Prepared(select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1))
+
+
 def give_up_waiting(context: Context) -> None:
     """Give up the remaining waiting tasks of cancelled jobs, piece by piece, with pauses for other writers."""
-    left = select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1)
     while not context.is_closing:
         with context.database.read() as connection:
-            if connection.execute(left).one_or_none() is None:
+            if not _TO_GIVE_UP.tuples(connection):
                 return
         began = time.monotonic()
         with context.ledger() as book:
-            if (job := book.connection.execute(left).one_or_none()) is not None:
-                _give_up_more(book, job.seq, job.given_up)
+            for job, after in _TO_GIVE_UP.tuples(book.connection):
+                _give_up_more(book, job, after)
         time.sleep(time.monotonic() - began)
 
 
