@@ -20,7 +20,7 @@ from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.calls import StartError
 from stickslip_workers.cluster import Place
 from stickslip_workers.dispatcher import Dispatcher
-from stickslip_workers.lease_client import SupersededError
+from stickslip_workers.lease_client import CoordinatorError
 from stickslip_workers.settings import Settings
 
 pytestmark = [pytest.mark.real, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray leaves its log files open
@@ -321,7 +321,8 @@ def test_a_superseded_dispatcher_goes(start: Start, double: CoordinatorDouble) -
     double.until(lambda: len(double.registrations) == 1)
     double.superseded = True
     running.join()
-    assert isinstance(running.error, SupersededError)
+    assert isinstance(running.error, CoordinatorError)
+    assert "409" in str(running.error)
 
 
 def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:

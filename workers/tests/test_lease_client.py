@@ -5,7 +5,8 @@ import time
 from typing import Any, cast
 
 import pytest
-from stickslip_schemas.documents.tasks import SimulateTask
+from stickslip_schemas.base.states import Reason
+from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -15,7 +16,7 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_workers.lease_client import Backoff, LeaseBook, RefusedError, Session
+from stickslip_workers.lease_client import Backoff, CoordinatorError, LeaseBook, Session
 
 
 def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +28,8 @@ def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> 
         waits.append(backoff.next_try - 100.0)
     assert waits == pytest.approx([0.2, 0.4, 0.8, 1.0])
     backoff.succeeded()
-    assert (backoff.failures, backoff.next_try) == (0, 0.0)
+    assert backoff.next_try == 0.0
+    assert backoff.failed() == pytest.approx(0.2)
 
 
 class SlowCoordinator:
@@ -63,13 +65,13 @@ def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
 def test_what_the_coordinator_refuses_ends_the_session() -> None:
     class Refusing(SlowCoordinator):
         def register(self, _: WorkerRegistration) -> WorkerSession:
-            raise RefusedError("wrong key")
+            raise CoordinatorError("wrong key")
 
     registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
     session = Session(cast(Any, Refusing()), lambda: registration)
     session.start()
     session.join(timeout=10)
-    with pytest.raises(RefusedError, match="wrong key"):
+    with pytest.raises(CoordinatorError, match="wrong key"):
         _ = session.worker_id
 
 
@@ -101,4 +103,20 @@ def test_started_is_said_and_a_reported_lease_forgotten() -> None:
     assert [state.started for state in book.states()] == [True]
     book.remove([_lease(1)])
     book.note([_lease(1)], started=True)
+    assert book.states() == ()
+
+
+def test_a_result_goes_with_its_lease() -> None:
+    book, result = LeaseBook(), TaskResult(outcome="failed", reason=Reason.internal_error, message="")
+    book.add([_lease(1)])
+    book.settle(_lease(7), result)  # not held
+    assert book.reports() == ()
+    book.settle(_lease(1), result)
+    book.give_back(started=True)  # it has a result
+    assert [(report.token, report.result) for report in book.reports()] == [(1, result)]
+    book.add([_lease(2)])
+    assert book.reports() == ()
+    book.give_back(started=False)
+    assert [(report.token, report.result) for report in book.reports()] == [(2, None)]
+    book.remove(book.reports())
     assert book.states() == ()

@@ -136,10 +136,9 @@ class Pace:
             if isinstance(lease.task, RenderTask):
                 shared = shading_of(lease.task) or ""
                 self._renders_share = shared != ""
-                size = MOST_TOGETHER if shared else 1
+                size = MOST_TOGETHER if shared else self._short_renders
             groups.setdefault((stage, shared, size), []).append(lease)
         for (stage, shared, size), group in groups.items():
-            parts = [group[start : start + size] for start in range(0, len(group), size)]
-            together = self.tasks(stage) if stage is Stage.render and not shared else 1
-            for start in range(0, len(parts), together):
-                yield Call(stage, parts[start : start + together], is_short)
+            for start in range(0, len(group), size):
+                some = group[start : start + size]
+                yield Call(stage, [some] if shared else [[lease] for lease in some], is_short)

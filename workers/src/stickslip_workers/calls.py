@@ -12,14 +12,14 @@ from stickslip_workers import call
 from stickslip_workers.batches import Call
 from stickslip_workers.settings import CPU, RENDER_DEVICE, Settings
 
-LOOK_SECONDS = 4.0
+LOOK_SECONDS = 2.0
 """Time between two looks at the nodes of the cluster [s], which cost 3 ms each."""
 
 DEMAND = 1.5
 """Calls given to Ray for each CPU. An autoscaler adds nodes for those that wait."""
 
 WARM_UP_SECONDS = 10.0
-"""The first tasks wait so long for processes to start [s]."""
+"""The first tasks wait so long for processes to start [s], or they would start more."""
 
 CALLS_PER_PROCESS = 1000
 """Calls after which a process gives way to a fresh one: Blender's memory grows slowly."""
@@ -62,8 +62,7 @@ class Calls:
             True: ray.remote(**common, num_gpus=self._gpus, runtime_env=variables | python)(call.run),
         }
         list(self._look())
-        if self._calls:  # tasks that come while processes start would start more
-            ray.wait(list(self._calls), num_returns=len(self._calls), timeout=WARM_UP_SECONDS)
+        ray.wait(list(self._calls), num_returns=len(self._calls), timeout=WARM_UP_SECONDS)
 
     def __iter__(self) -> Iterator[Call]:
         return iter(list(self._calls.values()))

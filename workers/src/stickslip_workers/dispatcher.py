@@ -4,7 +4,6 @@ One thread does everything but heartbeats. It sleeps in `ray.wait` and never blo
 one request, so running work goes on while the coordinator is away, and its results wait.
 """
 
-import contextlib
 import json
 import logging
 import math
@@ -21,7 +20,7 @@ from stickslip_schemas.store import open_store
 from stickslip_workers.batches import LARGEST_BATCH, Call, Pace
 from stickslip_workers.calls import Calls, NotDoneError, StartError
 from stickslip_workers.cluster import Place
-from stickslip_workers.lease_client import Backoff, CoordinatorClient, CoordinatorError, Session, UnreachableError
+from stickslip_workers.lease_client import Backoff, CoordinatorClient, Session, UnreachableError
 from stickslip_workers.results import failed, process_failure
 from stickslip_workers.settings import Settings
 from stickslip_workers.stages.run import StageActor, with_damaged_inputs
@@ -29,7 +28,7 @@ from stickslip_workers.stages.run import StageActor, with_damaged_inputs
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT = 1.0
-"""The loop looks at time limits and dropped leases at least so often, and asks so often for short tasks [s]."""
+"""The loop looks at time limits and dropped leases at least so often; it asks so often for what could not start [s]."""
 
 
 class Dispatcher:
@@ -42,7 +41,7 @@ class Dispatcher:
         self._store = open_store(settings.store)
         self._coordinator = CoordinatorClient(settings.urls, settings.key, settings.tls_certificate)
         self._session = Session(self._coordinator, self._registration)
-        self._book, self._outbox = self._session.book, self._session.outbox
+        self._book = self._session.book
         self._backoff = Backoff()
         self._described: dict[bool, dict[str, Any]] = {}
         """What the stages and the renderer say about themselves, with their builds."""
@@ -73,14 +72,12 @@ class Dispatcher:
             self._session.tell()
             while not self.stopping:
                 self._turn(calls)
-            self._outbox.give_back(started=False)
+            self._book.give_back(started=False)
             deadline = time.monotonic() + self._settings.stop_seconds
             while any(one.parts for one in calls) and time.monotonic() < deadline:
                 self._turn(calls)
         except Exception as error:
             self._error = f"it has ended: {type(error).__name__}: {error}"
-            with contextlib.suppress(CoordinatorError):
-                self._session.beat()
             raise
         finally:
             self._session.close()  # Ray ends what runs when this process is gone
@@ -119,10 +116,9 @@ class Dispatcher:
         if worker_id is None or time.monotonic() < self._backoff.next_try:
             return
         try:
-            if time.monotonic() >= self._report_time(calls) and self._outbox.send(worker_id):
+            if time.monotonic() >= self._report_time(calls) and self._session.report(worker_id):
                 self._next_lease = 0.0  # what has ended may have made new tasks possible
-            if self._lease(calls, worker_id):
-                self._give_work(calls)
+            self._lease(calls, worker_id)
             self._backoff.succeeded()
         except UnreachableError as error:
             log.warning("the coordinator is away, or does not know this worker: %s", error)
@@ -138,7 +134,7 @@ class Dispatcher:
     def _report_time(self, calls: Calls) -> float:
         """Return when to report: at once where the coordinator's next tasks may hang on it."""
         is_busy = self._waiting or any(one.parts and not one.node for one in calls)
-        return self._outbox.due if is_busy or not self._outbox else 0.0
+        return self._book.due if is_busy or self._book.due == math.inf else 0.0
 
     def _collect(self, calls: Calls, timeout: float) -> None:
         """Take in what Ray says until nothing is left to take."""
@@ -169,7 +165,7 @@ class Dispatcher:
         for lease, result in zip(one.leases, results, strict=True):
             if result.outcome == "failed":
                 log.warning("task %s failed: %s: %s", lease.task_id, result.reason, result.message)
-            self._outbox.add(lease, result)
+            self._book.settle(lease, result)
 
     def _enforce_limits(self, calls: Calls) -> None:
         """End what has run too long, and what nobody wants any more."""
@@ -195,19 +191,19 @@ class Dispatcher:
     def _is_short(self, one: Call) -> bool:
         return one.is_short or self._pace.call(one.stage) < self._settings.clog_seconds
 
-    def _lease(self, calls: Calls, worker_id: str) -> bool:
-        """Ask for work if some is wanted and it is time; return whether there was any."""
+    def _lease(self, calls: Calls, worker_id: str) -> None:
+        """Ask for work if some is wanted and it is time."""
         wanted = self._wanted(calls)
         if not wanted or time.monotonic() < self._next_lease:
-            return False
+            return
         at_most = self._settings.clog_seconds if calls.is_clogged() else None
         batch = self._coordinator.lease(LeaseRequest(worker_id=worker_id, wanted=wanted, at_most_seconds=at_most))
-        wait = batch.retry_after_seconds if at_most is None else max(batch.retry_after_seconds, LONGEST_WAIT)
+        wait = batch.retry_after_seconds if calls.room() > 0 else LONGEST_WAIT
         self._next_lease = time.monotonic() + wait
         self._book.add(batch.leases)
         self._waiting += self._pace.calls(batch.leases, is_short=at_most is not None)
         self._waiting.sort(key=lambda one: -list(Stage).index(one.stage))
-        return bool(batch.leases)
+        self._give_work(calls)
 
     def _wanted(self, calls: Calls) -> dict[Stage, int]:
         """Return how many tasks to ask for: little more than what can run, so that a kill gives little back."""

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -52,7 +51,7 @@ LAST_BEAT_SECONDS = 5.0
 
 
 class CoordinatorError(Exception):
-    """A request to the coordinator failed."""
+    """The coordinator refuses this dispatcher: a newer one has its name, or a request would fail every time."""
 
 
 class UnreachableError(CoordinatorError):
@@ -61,14 +60,6 @@ class UnreachableError(CoordinatorError):
 
 class UnknownWorkerError(UnreachableError):
     """The coordinator does not know the session: the next heartbeat registers again."""
-
-
-class SupersededError(CoordinatorError):
-    """A newer dispatcher has registered under the same name; this one must end."""
-
-
-class RefusedError(CoordinatorError):
-    """A request that would fail every time."""
 
 
 def pinned(certificate: Path) -> ssl.SSLContext:
@@ -117,68 +108,54 @@ class CoordinatorClient:
                 timeout=timeout,
             )
         except httpx.TransportError as error:
-            self._turn_from(url)
+            if self._urls[0] == url:  # no other thread has turned from it
+                self._urls.rotate(-1)
             raise UnreachableError(f"{url}{path}: {type(error).__name__}: {error}") from error
         if response.status_code >= 500 or response.status_code == 429:
             raise UnreachableError(f"{path}: {response.status_code} {response.text[:500]}")
         if response.is_success:
             return answer.model_validate_json(response.content)
-        kind = _ERRORS.get(_problem_code(response), RefusedError)
+        is_unknown = response.status_code == 404 and ProblemCode.unknown_worker in response.text
+        kind = UnknownWorkerError if is_unknown else CoordinatorError
         raise kind(f"{path}: {response.status_code} {response.text[:500]}")
-
-    def _turn_from(self, url: str) -> None:
-        """Ask the next coordinator from now on, unless another thread has turned from this one already."""
-        if self._urls[0] == url:
-            self._urls.rotate(-1)
-
-
-_ERRORS: dict[str | None, type[CoordinatorError]] = {
-    ProblemCode.unknown_worker: UnknownWorkerError,
-    ProblemCode.conflict: SupersededError,
-}
-
-
-def _problem_code(response: httpx.Response) -> str | None:
-    try:
-        return str(response.json()["code"])
-    except (ValueError, KeyError, TypeError):
-        return None
 
 
 class Backoff:
     """Doubles the wait after each failure, with jitter so that many dispatchers do not return at once."""
 
     def __init__(self, *, first: float = 0.2, most: float = 5.0) -> None:
-        self._first = first
-        self._most = most
-        self.failures = 0
+        self._first, self._most, self._delay = first, most, first
         self.next_try = 0.0
         """Earliest time of the next attempt, on the monotonic clock [s]."""
 
     def failed(self) -> float:
         """Note a failure and double the wait; return it [s]."""
-        delay = min(self._most, self._first * 2.0 ** min(self.failures, 16)) * random.uniform(0.5, 1.0)
-        self.failures += 1
+        delay = self._delay * random.uniform(0.5, 1.0)
+        self._delay = min(2 * self._delay, self._most)
         self.next_try = time.monotonic() + delay
         return delay
 
     def succeeded(self) -> None:
         """Reset the wait."""
-        self.failures = 0
-        self.next_try = 0.0
+        self._delay, self.next_try = self._first, 0.0
 
 
 class LeaseBook:
-    """The leases that the dispatcher holds, shared between its loop and its session. Thread-safe."""
+    """The leases that the dispatcher holds, and the results that wait to be reported. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._states: dict[str, LeaseState] = {}
+        self._reports: dict[str, Report] = {}
+        self.due = math.inf
+        """When to report at the latest."""
 
     def add(self, leases: Iterable[Lease]) -> None:
+        """Add leases; they take the place of older ones of the same tasks."""
         with self._lock:
             for lease in leases:
                 self._states[lease.task_id] = LeaseState(task_id=lease.task_id, token=lease.token, started=False)
+                self._reports.pop(lease.task_id, None)
 
     def note(self, leases: Iterable[Lease], **changes: object) -> None:
         """Note that tasks have `started`, or their `frames`: (frames done, frames total)."""
@@ -187,66 +164,40 @@ class LeaseBook:
                 if self.holds(lease):
                     self._states[lease.task_id] = self._states[lease.task_id].model_copy(update=changes)
 
+    def settle(self, lease: Lease | LeaseState, result: TaskResult | None) -> None:
+        """Keep the result of a lease that is still held, or its return, until it is reported."""
+        with self._lock:
+            if self.holds(lease):
+                self.due = min(self.due, time.monotonic() + REPORT_SECONDS)
+                self._reports[lease.task_id] = Report(task_id=lease.task_id, token=lease.token, result=result)
+
+    def give_back(self, *, started: bool) -> None:
+        """Return the leases that have no result, those of started tasks only if `started`."""
+        for state in self.states():
+            if state.task_id not in self._reports and (started or not state.started):
+                self.settle(state, None)
+
     def remove(self, leases: Iterable[Lease | LeaseState | Report]) -> None:
         """Remove leases; newer ones of the same tasks stay."""
         with self._lock:
             for lease in leases:
                 if self.holds(lease):
                     del self._states[lease.task_id]
+                    self._reports.pop(lease.task_id, None)
 
     def holds(self, lease: Lease | LeaseState | Report) -> bool:
         """Return whether the lease is still held."""
         state = self._states.get(lease.task_id)
         return state is not None and state.token == lease.token
 
-    def clear(self) -> None:
-        """Remove all leases, at the end of a session."""
-        with self._lock:
-            self._states.clear()
-
     def states(self) -> tuple[LeaseState, ...]:
         with self._lock:
             return tuple(self._states.values())
 
-
-class Outbox:
-    """Results that wait to be reported."""
-
-    def __init__(self, coordinator: CoordinatorClient, book: LeaseBook) -> None:
-        self._coordinator = coordinator
-        self._book = book
-        self._reports: deque[Report] = deque()
-        self.due = math.inf
-        """When to report them at the latest."""
-
-    def __len__(self) -> int:
-        return len(self._reports)
-
-    def add(self, lease: Lease | LeaseState, result: TaskResult | None) -> None:
-        """Add a result, or the return of a lease."""
-        if not self._reports:
-            self.due = time.monotonic() + REPORT_SECONDS
-        self._reports.append(Report(task_id=lease.task_id, token=lease.token, result=result))
-
-    def give_back(self, *, started: bool) -> None:
-        """Return the leases that have no result, those of started tasks only if `started`."""
-        told = {report.task_id for report in self._reports}
-        for state in self._book.states():
-            if state.task_id not in told and (started or not state.started):
-                self.add(state, None)
-
-    def send(self, worker_id: str) -> bool:
-        """Send all of leases that are still held; return whether there were any."""
-        self._reports = deque(filter(self._book.holds, self._reports))
-        there_were = bool(self._reports)
-        while batch := tuple(islice(self._reports, REPORTS_A_REQUEST)):
-            for verdict in self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
-                if verdict.verdict == "stale":
-                    log.warning("the report of task %s came too late and was refused", verdict.task_id)
-            self._book.remove(batch)
-            self._reports = deque(islice(self._reports, len(batch), None))
-        self.due = math.inf
-        return there_were
+    def reports(self) -> tuple[Report, ...]:
+        """Return what waits to be reported."""
+        with self._lock:
+            return tuple(self._reports.values())
 
 
 class Session(threading.Thread):
@@ -261,7 +212,6 @@ class Session(threading.Thread):
         self._coordinator = coordinator
         self._registration = registration
         self.book = LeaseBook()
-        self.outbox = Outbox(coordinator, self.book)
         self._worker_id = ""
         self._interval = 0.0
         self._wanted, self._opened = 1, 0
@@ -292,16 +242,29 @@ class Session(threading.Thread):
             self.book.remove(state for state in states if state.task_id in drop)
         return self._interval if condition.state == "ready" else min(START_BEAT_SECONDS, self._interval)
 
+    def report(self, worker_id: str) -> bool:
+        """Send all results that wait; return whether there were any."""
+        reports = self.book.reports()
+        for first in range(0, len(reports), REPORTS_A_REQUEST):
+            batch = reports[first : first + REPORTS_A_REQUEST]
+            for verdict in self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
+                if verdict.verdict == "stale":
+                    log.warning("the report of task %s came too late and was refused", verdict.task_id)
+            self.book.remove(batch)
+        self.book.due = math.inf
+        return bool(reports)
+
     def tell(self) -> None:
         """Let the coordinator know at once how the dispatcher is."""
         self._wake.set()
 
     def close(self) -> None:
-        """Give all leases back, if the coordinator listens, and end the session."""
-        self.outbox.give_back(started=True)
+        """Give all leases back and say why it ends, if the coordinator listens, and end the session."""
+        self.book.give_back(started=True)
         with contextlib.suppress(CoordinatorError):
             if (worker_id := self.worker_id) is not None:
-                self.outbox.send(worker_id)
+                self.report(worker_id)
+                self.beat()
         self._ended = True
         self._wake.set()
         self.join(LAST_BEAT_SECONDS)  # a heartbeat in progress may end first
@@ -333,6 +296,6 @@ class Session(threading.Thread):
         """Register. What was leased in an earlier session is lost; the coordinator gives it out again."""
         wanted = self._wanted
         session = self._coordinator.register(self._registration())
-        self.book.clear()
+        self.book.remove(self.book.states())
         self._worker_id, self._interval, self._opened = session.worker_id, session.lease_seconds / 3, wanted
         log.info("registered as %s", session.worker_id)
