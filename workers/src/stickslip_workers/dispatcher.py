@@ -198,7 +198,7 @@ class Dispatcher:
             return
         at_most = self._settings.clog_seconds if calls.is_clogged() else None
         batch = self._coordinator.lease(LeaseRequest(worker_id=worker_id, wanted=wanted, at_most_seconds=at_most))
-        wait = batch.retry_after_seconds if calls.room() > 0 else LONGEST_WAIT
+        wait = batch.retry_after_seconds if at_most is None and calls.room() > 0 else LONGEST_WAIT
         self._next_lease = time.monotonic() + wait
         self._book.add(batch.leases)
         self._waiting += self._pace.calls(batch.leases, is_short=at_most is not None)
