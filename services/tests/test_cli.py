@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +103,24 @@ def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: 
         ("- 1", ["must hold a mapping"]),
         ("kind: rod_hang\naxes: 2020-01-01", ["axes must be a number"]),
         ("1: 2", ["the key 1 is no word"]),
+        ("kind: &a {axes: *a}", ["must not nest so deeply: does an alias name what it is in?"]),
+        (
+            "a: &a [1, 1]" + "".join(f"\n{to}: &{to} [*{of}, *{of}]" for of, to in pairwise("abcdefghijklm")),
+            ["must hold at most 5000 values, with aliases written out"],
+        ),
+        ("kind: cloth_scene\nscene: a.yaml", ["there is no file"]),
+        (
+            "kind: cloth_scene\nscene: {format: stickslip-scene/1, duration: 1, default_friction: 0, bodies: {egg: {"
+            "type: mesh, file: egg.obj}}, sheets: {a: {material: gray-interlock, mesh: {type: grid, size: [1, 1], "
+            "cells: [1, 1]}}}}",
+            ["bodies.egg.file: must be readable: No such file or directory, in egg.obj"],
+        ),
     ],
 )
-def test_a_bad_file_is_refused_in_words(cli: Any, tmp_path: Path, text: str, words: list[str]) -> None:
+def test_a_bad_file_is_refused_in_words(
+    cli: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, words: list[str]
+) -> None:
+    monkeypatch.setattr("stickslip_services.cli.specs.MAX_VALUES", 5000)
     (tmp_path / "spec.yaml").write_text(text)
     result = cli("submit", tmp_path / "spec.yaml")
     assert result.exit_code == 1

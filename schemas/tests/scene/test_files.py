@@ -63,6 +63,8 @@ def test_files_become_arrays() -> None:
         (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "line 4 must be .* a face of its vertices, and is 'f 1 2 4'"),
         (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2\n", "triangle 0 names one twice"),
         (BODY, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", "must be a manifold: .* 1 edges are not so"),
+        (BODY, b"v 0 0 0\nv 0.1 0.1 0\nv 0.3 0.3 0\nf 1 2 3\n", r"areas above 0 m\^2, and triangle 0 has none"),
+        (BODY, frames(), "triangle 0 has none"),
         (BODY, b"\xff\xfe\x00", "must be text in UTF-8.* 0xff in position 0"),
         (BODY, b"PK\x03\x04 no archive", "must be an NPZ file: File is not a zip file"),
         (

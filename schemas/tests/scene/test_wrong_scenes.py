@@ -166,6 +166,9 @@ WRONG: list[tuple[Any, ...]] = [
     ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]", "0.5"),
     ("parameters.speed.low", GONE, "", "low and high [rad/s] must be given", "null"),
     ("parameters.speed.sets", [f"{SPIN}.sped"], "parameters.speed.sets.0", "did you mean speed"),
+    ("parameters.speed.unit", "rpm", "", "must be rad/s, as of bodies.ball.motion.spin.speed"),
+    ("parameters.mu.unit", "N", "", "must be 1, as of friction.ball.lower"),
+    ("parameters.speed.unit", GONE, "", "must be rad/s", '"1"'),
     ("parameters.fabric.low", 1.0, "", "for numbers without a list of values"),
     ("parameters.fabric.values", ["silk"], "parameters.fabric.sets.0", "default within silk", '"gray-interlock"'),
     ("parameters.texture", {"sets": [f"{UPPER}.material"]}, "", "name of an axis of all scenes", '"texture"'),
@@ -175,7 +178,7 @@ WRONG: list[tuple[Any, ...]] = [
     ("parameters.two", {"low": 0, "high": 1, "sets": ["friction.lower.ball"]}, "parameters.two.sets.0", "where 'mu'"),
     (
         "parameters.both",
-        {"low": 0, "high": 1, "sets": ["bias.size", "bias.until"]},
+        {"unit": "m", "low": 0.01, "high": 1, "sets": [f"{BALL}.radius", "bodies.rod.length"]},
         "parameters.both.sets",
         "must find one value",
     ),

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 _RULES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_type", "finite_number")
@@ -21,9 +22,26 @@ def unit_of(item: ErrorDetails, of: Any) -> str:
     for place in reversed(names):
         for model in models_at(of, location[:place]):
             if (field := model.model_fields.get(str(location[place]))) is not None:
-                unit = re.search(r"\[([^\]]+)\]", field.description or "")
-                return f" [{unit[1]}]" if unit else ""
+                unit = _said(field)
+                return f" [{unit}]" if unit else ""
     return ""
+
+
+def unit_in(document: Any, location: Sequence[int | str]) -> str:
+    """Return the unit of the number at a place in a document; `1` of a pure number."""
+    unit = ""
+    for part in location:
+        if isinstance(document, BaseModel):
+            unit = _said(type(document).model_fields[str(part)])
+            document = getattr(document, str(part))
+        else:
+            document = document[part]
+    return unit or "1"
+
+
+def _said(field: FieldInfo) -> str:
+    unit = re.search(r"\[([^\]]+)\]", field.description or "")
+    return unit[1] if unit else ""
 
 
 def models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:

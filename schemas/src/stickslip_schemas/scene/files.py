@@ -54,12 +54,13 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
     for place, name in scene.files():
         if name.startswith(ARTIFACT):
             continue
-        data = read(name)
         try:
+            data = read(name)
             if (counts := _counts(place, {} if place[0] == "looks" else read_file(place, data))) is not None:
                 values[(*place[:-1], "counts")] = counts
-        except UnfitFileError as error:
-            raise UnfitFileError(f"{'.'.join(map(str, place))}: {error}, in {name}") from error
+        except (UnfitFileError, OSError) as error:
+            rule = str(error) if isinstance(error, UnfitFileError) else f"must be readable: {error.strerror}"
+            raise UnfitFileError(f"{'.'.join(map(str, place))}: {rule}, in {name}") from error
         digest = sha256(data)
         found[digest] = data
         values[place] = f"{ARTIFACT}{digest}"
@@ -189,6 +190,7 @@ def _body(data: bytes) -> Arrays:
     if not data.startswith(b"PK"):
         vertices, triangles, _ = read_obj(data)
         _check_edges(triangles, len(vertices))
+        _check_areas(vertices, triangles)
         return {"positions": vertices[None], "triangles": triangles, "times": np.zeros(1)}
     found = _arrays(data, _SKIN if "rest" in _names(data) else _FRAMES)
     triangles = found["triangles"].astype(np.int64)
@@ -197,6 +199,7 @@ def _body(data: bytes) -> Arrays:
     if (wrong := found["triangles"][(triangles != found["triangles"]) | (triangles < 0) | (triangles >= count)]).size:
         raise UnfitFileError(f"triangles must be vertices, 0 to {count - 1}, and has {wrong[0]}")
     _check_edges(triangles, count)
+    _check_areas(found["rest"] if "rest" in found else found["positions"][0], triangles)
     return {**found, "triangles": triangles}
 
 
@@ -288,6 +291,13 @@ def _check_edges(triangles: Triangles, vertices: int) -> None:
             "must be a manifold: at most two triangles share an edge, turned alike; "
             f"{int((counts > 1).sum())} edges are not so"
         )
+
+
+def _check_areas(vertices: Floats, triangles: Triangles) -> None:
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-300) ** 0.5
+    if len(flat := np.flatnonzero(height <= 1e-12)):
+        raise UnfitFileError(f"all triangles must have areas above 0 m^2, and triangle {flat[0]} has none")
 
 
 def _text(data: bytes) -> str:

@@ -8,7 +8,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base.document import Document, Float
 from stickslip_schemas.base.keys import placed
-from stickslip_schemas.base.units import unit_of
+from stickslip_schemas.base.units import unit_in, unit_of
 from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 Path = tuple[str | int, ...]
@@ -59,6 +59,8 @@ class Parameter(Document):
             if not ((is_number and not sized) or place[-1] == "material"):
                 rule = "must lead to a number or a material, and not to what decides on shapes of arrays or on files"
                 refuse(scene, place_here, rule, path)
+            if is_number and self.unit != (unit := unit_in(scene, place)):
+                refuse(scene, (*here, "unit"), f"must be {unit}, as of {path}", self.unit)
             if place in taken:
                 refuse(scene, place_here, f"must not lead where {taken[place]!r} does", path)
             taken[place] = name

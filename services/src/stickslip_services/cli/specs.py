@@ -3,6 +3,8 @@
 import json
 import math
 import re
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ from stickslip_services.errors import CommandError
 
 SCENE_SUFFIXES = (".yaml", ".yml", ".json")
 """Of a `scene` that is a file; other names are those of built-in scenes."""
+
+MAX_VALUES = 10_000_000
+"""Of a file."""
 
 
 class SpecFileError(CommandError):
@@ -39,7 +44,10 @@ def read_spec(path: Path) -> dict[str, Any]:
         raise SpecFileError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
     if not isinstance(document, dict):
         raise SpecFileError(f"{path} must hold a mapping (key: value), and it holds {document!r:.100}")
-    _check(document, "", path)
+    try:
+        _check(document, "", path, count())
+    except RecursionError as error:
+        raise SpecFileError(f"{path} must not nest so deeply: does an alias name what it is in?") from error
     return document
 
 
@@ -93,8 +101,6 @@ def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, byt
         return inlined(scene, read)
     except UnfitFileError as error:
         raise SpecFileError(f"{path} is not valid\n  {error}") from error
-    except OSError as error:
-        raise SpecFileError(f"{path} names a file that cannot be read: {error}") from error
 
 
 def _name(path: Path) -> str | None:
@@ -120,14 +126,16 @@ def field_line(field: FieldError) -> str:
     return f"  {place}: {field.rule}" + (f", and it is {field.value}" if field.value else "")
 
 
-def _check(value: Any, place: str, path: Path) -> None:
-    """Raise SpecFileError for values that JSON cannot hold."""
+def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
+    """Raise SpecFileError for values that JSON cannot hold, and for aliases that make too many of them."""
+    if next(values) > MAX_VALUES:
+        raise SpecFileError(f"{path} must hold at most {MAX_VALUES} values, with aliases written out")
     if isinstance(value, dict):
         for key, item in value.items():
-            _check(item, f"{place}.{key}" if place else str(key), path)
+            _check(item, f"{place}.{key}" if place else str(key), path, values)
     elif isinstance(value, list):
         for position, item in enumerate(value):
-            _check(item, f"{place}.{position}", path)
+            _check(item, f"{place}.{position}", path, values)
     elif isinstance(value, float) and not math.isfinite(value):
         raise SpecFileError(f"{path}: {place} must be a finite number, and it is {value}")
     elif value is not None and not isinstance(value, str | int | float | bool):
