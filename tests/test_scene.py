@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
-from harness import STICKSLIP, Service, read_arrays
+from harness import STICKSLIP, Service, read_arrays, wait_for
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
@@ -97,14 +97,32 @@ def upload(service: Service, height: float) -> str:
     return str(answer.json()["file"])
 
 
+def run_job(service: Service, given: dict[str, Any], busy: set[str]) -> dict[str, Any]:
+    """Run a job to its end and return it; put the names of the dispatchers that are seen at work into `busy`."""
+    job = service.submit(given)
+
+    def probe() -> dict[str, Any] | None:
+        busy.update(worker["name"] for worker in service.get("/v1/workers") if worker["running"])
+        answer: dict[str, Any] = service.get(f"/v1/jobs/{job}")
+        return answer if answer["finished_at"] is not None else None
+
+    over = wait_for(f"the end of {job}", probe, 500)
+    assert over["state"] == "succeeded", over
+    return over
+
+
+def ran(job: dict[str, Any]) -> dict[str, int]:
+    """Return how many tasks of each stage a job has run itself."""
+    stages = job["progress"]["stages"]
+    return {name: sum(stage["counts"].values()) - stage["cached"] for name, stage in stages.items()}
+
+
 @pytest.mark.slow
 def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path) -> None:
-    job = service.finished(service.submit(spec(upload(service, 0.02))), timeout=500)
-    assert job["state"] == "succeeded", job
-    assert job["sample_count"] == 8
-    nodes = {worker["name"] for worker in service.get("/v1/workers")}
-    assert "second" in nodes
-    assert len(nodes) == 2
+    busy: set[str] = set()
+    block = upload(service, 0.02)
+    job = run_job(service, spec(block), busy)
+    assert ran(job) == {"simulate": 8, "render": 8, "pack": 1, "publish": 1}
     pulled = tmp_path / "pulled"
     version = job["dataset"]["dataset"]
     subprocess.run([STICKSLIP, "pull", version, pulled, "--url", service.url], check=True, capture_output=True)
@@ -114,18 +132,24 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     assert arrays["cloth.positions"].shape == (8, 5, 63, 3)
     assert sorted(set(arrays["mu"])) == [0.2, 0.8]
     assert set(arrays["cloth.contact"][:, -1].ravel()) > {0}
-    block, bodies = arrays["body_pose"][:, -1, 0, 0, 3], arrays["pull"]
-    assert block == pytest.approx(bodies, abs=1e-6)
+    pose, pull = arrays["body_pose"][:, -1, 0, 0, 3], arrays["pull"]
+    assert pose == pytest.approx(pull, abs=1e-6)
     (batch,) = Samples(pulled, "train").loader(8)
     assert batch["video"].shape == (8, 2, 224, 224, 3)
     assert set(batch.names("fabric")) == {"gray-interlock", "camel-ponte-roma"}
 
-    # The same again: nothing is left to do. One more friction: only its simulations.
-    again = httpx.post(f"{service.url}/v1/jobs:validate", json=spec(upload(service, 0.02)), timeout=60).json()
-    assert again["cached_count"] == again["task_count"]
-    more = spec(upload(service, 0.02), mu=[0.2, 0.8, 1.0])
+    # The same file and the same spec again: nothing runs, and the same dataset answers.
+    assert upload(service, 0.02) == block
+    again = run_job(service, spec(block), busy)
+    assert set(ran(again).values()) == {0}
+    assert again["dataset"] == job["dataset"]
+    # One more friction: only its samples run.
+    more = spec(block, mu=[0.2, 0.8, 1.0])
     known = httpx.post(f"{service.url}/v1/jobs:validate", json=more, timeout=60).json()
     assert known["cached_count"] == 16  # simulations and renders of two frictions
-    # One vertex of the block elsewhere: all runs.
-    moved = httpx.post(f"{service.url}/v1/jobs:validate", json=spec(upload(service, 0.0199)), timeout=60).json()
-    assert moved["cached_count"] == 0
+    # One vertex of the block elsewhere: all runs, on both nodes together.
+    moved = run_job(service, spec(upload(service, 0.0199)), busy)
+    assert ran(moved) == ran(job)
+    assert moved["dataset"]["dataset"] != version
+    assert len(busy) == 2
+    assert "second" in busy
