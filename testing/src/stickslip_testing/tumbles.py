@@ -241,7 +241,9 @@ def pile(seed: int, preset: SolverSettings, sheets: int = 5) -> Tumble:
         flat = part.rest @ np.array([[c, s], [-s, c]])
         places.append(np.column_stack([flat, 0.01 + 0.012 * i + flat @ tilt]))
     cloth = Cloth(meshes.together(*parts), fabric("gray-interlock"), preset, self_contact=SelfContact(0.4))
-    cloth.set_state(np.concatenate(places))
+    start = np.concatenate(places)
+    start[:, 2] -= min(start[:, 2].min(), 0.0)  # none starts below the floor
+    cloth.set_state(start)
     return Tumble(cloth, [plane(0.4)], _free, 60)
 
 
