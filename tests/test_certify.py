@@ -100,18 +100,17 @@ def test_a_cloth_job_from_refusal_to_dataset(
     assert "this" in cli("certificates").stdout
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("certify", "--preset", "best", "--out", "{}/x"), "no certificate"),
-        (("register", "{}"), "there is no certificate.json"),
-    ],
-)
-def test_errors_are_words(cli: Callable[..., Result], tmp_path: Path, words: tuple[str, ...], said: str) -> None:
-    result = cli(*(word.format(tmp_path) for word in words))
+def test_a_folder_without_a_certificate_is_refused_in_words(cli: Callable[..., Result], tmp_path: Path) -> None:
+    result = cli("register", tmp_path)
     assert result.exit_code == 1
-    assert said in result.stderr
+    assert "there is no certificate.json" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_an_unknown_preset_is_refused_with_those_that_there_are(cli: Callable[..., Result], tmp_path: Path) -> None:
+    result = cli("certify", "--preset", "best", "--out", tmp_path / "x")
+    assert result.exit_code == 2
+    assert "'best' is not one of 'rods', 'certified'" in result.stderr
 
 
 def test_an_old_certificate_is_not_taken_for_a_new_one(
