@@ -107,12 +107,6 @@ def test_a_folder_without_a_certificate_is_refused_in_words(cli: Callable[..., R
     assert "Traceback" not in result.stderr
 
 
-def test_an_unknown_preset_is_refused_with_those_that_there_are(cli: Callable[..., Result], tmp_path: Path) -> None:
-    result = cli("certify", "--preset", "best", "--out", tmp_path / "x")
-    assert result.exit_code == 2
-    assert "'best' is not one of 'rods', 'certified'" in result.stderr
-
-
 def test_an_old_certificate_is_not_taken_for_a_new_one(
     cli: Callable[..., Result], quick: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,38 +66,44 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+def programs_of(wheels: Path, place: Path, *names: str) -> Path:
+    """Install packages into a bare environment, and return where its programs are.
+
+    Constraints pin what the index resolves; pip's own configuration says where it is.
+    """
+    venv.create(place, with_pip=False)
+    install = [*PIP, "--python", str(place / "bin" / "python"), "install", "--find-links", str(wheels)]
+    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), *names], check=True, cwd=place.parent)
+    return place / "bin"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
+@pytest.mark.xdist_group("wheels")  # which are built once
 def test_the_client_is_15_packages_of_60_megabytes(wheels: Path, tmp_path: Path) -> None:
     place = tmp_path / "venv"
-    venv.create(place, with_pip=False)
-    python = str(place / "bin" / "python")
-    install = [*PIP, "--python", python, "install", "--find-links", str(wheels)]
-    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), "stickslip"], check=True, cwd=tmp_path)
+    programs = programs_of(wheels, place, "stickslip")
     packages = list(place.glob("lib/python3*/site-packages/*.dist-info"))
     assert len(packages) <= 15, packages
     assert sum(file.stat().st_size for file in place.rglob("*") if file.is_file() and not file.is_symlink()) < 60e6
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    subprocess.run([str(place / "bin" / "stickslip"), "--help"], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([str(programs / "stickslip"), "--help"], check=True, stdout=subprocess.DEVNULL)
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 0.3
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
+@pytest.mark.xdist_group("wheels")  # which are built once
 def test_wheels_install_into_a_bare_environment(wheels: Path, tmp_path: Path) -> None:
-    """Constraints pin what the index resolves; pip's own configuration says where it is."""
     place = tmp_path / "venv"
-    venv.create(place, with_pip=True)
-    python = str(place / "bin" / "python")
-    names = ["stickslip[arrays,server,train]", "stickslip-sim-core"]
-    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--find-links", str(wheels)]
-    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), *names], check=True, cwd=tmp_path)
+    programs = programs_of(wheels, place, "stickslip[arrays,server,train]", "stickslip-sim-core")
     bare = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     for command in ("stickslip", "stickslip-train"):
-        done = subprocess.run([str(place / "bin" / command), "--help"], capture_output=True, text=True, env=bare)
+        done = subprocess.run([str(programs / command), "--help"], capture_output=True, text=True, env=bare)
         assert done.returncode == 0, done.stderr
-    version = subprocess.run([str(place / "bin" / "stickslip"), "--version"], capture_output=True, text=True, env=bare)
+    version = subprocess.run([str(programs / "stickslip"), "--version"], capture_output=True, text=True, env=bare)
     assert version.stdout.strip() == f"stickslip {VERSION}"
     code = "import stickslip_sim_core; from stickslip_sim_core import _sim_core; print(_sim_core.__file__)"
-    done = subprocess.run([python, "-c", code], capture_output=True, text=True, env=bare, cwd=tmp_path)
+    python = [str(programs / "python"), "-c", code]
+    done = subprocess.run(python, capture_output=True, text=True, env=bare, cwd=tmp_path)
     assert done.stdout.startswith(str(place)), done.stdout + done.stderr
