@@ -339,8 +339,7 @@ def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorD
 def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
     running = start(max_cpus=1, stop_seconds=20)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
-    _wait_for_pid(double, store, HANG)
-    double.until(lambda: "waiting" in double.leased)
+    double.until(lambda: "running" in double.started and "waiting" in double.leased)
     running.dispatcher.stop()
     double.until(lambda: "waiting" in double.released)
     (store.root / f"release-{HANG}").touch()
