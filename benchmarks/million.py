@@ -98,7 +98,7 @@ def plan(samples: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory, coordinator(Path(directory)) as (client, pid):
         key = (Path(directory) / "worker-key").read_text().strip()
         worker = Worker(client, key, client.get("/v1/workers").json()[0]["id"])
-        client.post("/v1/jobs", json=spec(1000, start=900.0), params={"priority": 5}).raise_for_status()
+        client.post("/v1/jobs", json=spec(500, start=900.0), params={"priority": 5}).raise_for_status()
         before: list[float] = []
         end = time.perf_counter() + BEFORE_SECONDS
         while time.perf_counter() < end:

@@ -59,8 +59,8 @@ class Settings(BaseSettings):
     """Delay before the second attempt [s]; it doubles with each further one."""
     sweep_seconds: float = Field(default=1.0, gt=0)
     """Polling interval for expired leases and due retries [s]."""
-    plan_samples: int = Field(default=10_000, ge=1)
-    """Largest job that is planned at once, and size of the pieces of larger ones [samples]."""
+    plan_samples: int = Field(default=500, ge=1)
+    """Largest job that is planned at once, and size of the pieces of larger ones [samples], 30 to 60 ms each."""
     lease_limit: int = Field(default=1000, ge=1)
     """Largest number of tasks of one stage that a request gets."""
     min_free_bytes: int = Field(default=256 * 2**20, ge=0)
