@@ -6,11 +6,13 @@ import subprocess
 import sys
 import tomllib
 import venv
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
@@ -53,6 +55,14 @@ def test_the_version_is_written_once() -> None:
     for name in DISTRIBUTIONS:
         text = (ROOT / name / "pyproject.toml").read_text()
         assert f'version = "{VERSION}"' not in text
+
+
+@pytest.mark.parametrize("environment", [".venv", ".venv-blender"])
+def test_everything_that_is_installed_admits_the_python_of_debian_12(environment: str) -> None:
+    packages = list(distributions(path=[str(ROOT / environment / "lib/python3.11/site-packages")]))
+    needs = {one.name: one.metadata["Requires-Python"] for one in packages if one.metadata["Requires-Python"]}
+    assert len(needs) > 20
+    assert {name: need for name, need in needs.items() if "3.11.2" not in SpecifierSet(need)} == {}
 
 
 PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]

@@ -8,10 +8,12 @@ trap 'rm -rf "$work"' EXIT
 
 # torch: one build for everybody; without a pin, a range takes the newest build with gigabytes of CUDA packages.
 # ray: the two environments must hold the very same version. numcodecs: the same, for byte-identical chunks.
+# soupsieve: 3.0 needs Python 3.11.5, and Debian 12 has 3.11.2.
 cat >"$work/pins.txt" <<PINS
 torch==2.13.0
 ray==2.60.0
 numcodecs==0.16.6
+soupsieve<3
 PINS
 
 freeze() { # environment, requirements file, constraints file
