@@ -2,9 +2,9 @@
 
 
 def duration(seconds: float) -> str:
-    """Return a time span in whole units: 9 s, 4 min, 2 h 10 min."""
+    """Return a time span in whole units: 9 s, 4 min, 2 h 10 min; below a second with one digit: 0.3 s."""
     if seconds < 90:
-        return f"{seconds:.0f} s"
+        return f"{seconds:.1g} s" if 0.01 < seconds < 1 else f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
