@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from stickslip_services.cli.errors import ARRAYS, shows_errors
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,12 +19,9 @@ SERVER_ONLY = (
     "starlette",
     "uvicorn",
 )
-ARRAYS_ONLY = ("google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "zarr")
 
-
-BLOCKED = (
-    f"import sys\nsys.modules.update(dict.fromkeys({SERVER_ONLY + ARRAYS_ONLY!r}))\n"  # importing what is None fails
-)
+# To import what is None fails.
+BLOCKED = f"import sys\nsys.modules.update(dict.fromkeys({(*SERVER_ONLY, *sorted(ARRAYS))!r}))\n"
 
 
 def run_without_extras(code: str) -> "subprocess.CompletedProcess[str]":
@@ -68,3 +66,12 @@ def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(example: s
 def test_a_dataset_is_not_opened_without_arrays() -> None:
     done = run_without_extras("from stickslip import Client\nClient().open('ds-0000000000000000')")
     assert "is not installed: pip install 'stickslip[arrays]'" in done.stderr
+
+
+def test_only_what_the_extra_installs_is_said_to_be_in_it() -> None:
+    @shows_errors
+    def broken() -> None:
+        raise ModuleNotFoundError("No module named 'click.gone'", name="click.gone")
+
+    with pytest.raises(ModuleNotFoundError):
+        broken()

@@ -15,6 +15,9 @@ from stickslip_services.errors import CommandError, StickslipError
 P = ParamSpec("P")
 R = TypeVar("R")
 
+ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "zarr"})
+"""Modules that the extra `arrays` installs; one that is missing is no fault of ours."""
+
 
 def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Print the errors that a command expects, and exit with status 1."""
@@ -39,7 +42,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         except OSError as error:
             _print(f"{error.filename or 'the file system'}: {error.strerror or error}")
         except ModuleNotFoundError as error:
-            if error.name is None or error.name.startswith("stickslip"):
+            if error.name is None or error.name.partition(".")[0] not in ARRAYS:
                 raise
             _print(str(MissingExtraError("arrays", f"this needs arrays, and {error.name}")))
         raise Exit(1)
