@@ -64,7 +64,7 @@ def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
     random = np.random.Generator(np.random.PCG64(4))
     overall = np.array([0.5, 0.51, 0.49, 0.9, 0.2, 0.5], dtype=np.float32)
     light = random.uniform(0.0, 0.6, (24, 60)).astype(np.float16)
-    shading = np.stack([0 * light, (0.5 * light).astype(np.float16), (0.9 * light).astype(np.float16)], axis=-1)
+    shading = np.stack([(a * light).astype(np.float16) for a in ALBEDOS], axis=-1)
     nothing, nowhere = np.empty((0, 0), dtype=np.float32), (0, 0, 0, 0)
     pictures = np.empty((2, 24, 60, 3), dtype=np.uint8)
     none = np.empty((0, 0, 6), dtype=np.float32)

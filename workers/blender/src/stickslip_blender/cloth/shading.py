@@ -32,8 +32,8 @@ from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.raster import GRID, Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
 
-ALBEDOS = (0.0, 0.5, 0.9)
-"""The cloth's base colour in a shading."""
+ALBEDOS = (0.0, 0.2, 0.6)
+"""The cloth's base colour in a shading. Prints have means of 0.05 to 0.6: between, light scattered thrice fits, too."""
 
 FINE = 2
 """Pixels of a shading across one of a picture, and down."""
