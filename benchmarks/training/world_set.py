@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.store import write_durably
-from stickslip_training.cloth.clips import INSTANTS, Clips, clips_of_file, render_clips
+from stickslip_training.cloth.clips import INSTANTS, Clips, clips_of_file, frames_at, render_clips
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import errors
 from stickslip_training.cloth.familiarity import glued, hanging, holders_at, reordered, sized
@@ -156,7 +156,9 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
 
 def without_answer(runs: Runs) -> dict[str, Clips]:
     """Return clips of sorts that hold no answer, each in worlds of their own."""
-    held = holders_at(runs.instants)
+    frames, instants = frames_at(runs.instants)
+    runs = replace(runs, positions=runs.positions[:, frames], instants=instants)
+    held = holders_at(instants)
 
     def shown(positions: Any, seed: int) -> Clips:
         return render_clips(replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True)

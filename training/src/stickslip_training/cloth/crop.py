@@ -23,6 +23,9 @@ SCALE = 290.0
 ANCHOR = (14.0, (WIDTH - 1) / 2)
 """Row and column of the middle of the holders."""
 
+PATCH = 0.095
+"""y of the middle of a held patch, and of the other its negative [m]; they are 1 cm wide."""
+
 
 @dataclass(frozen=True)
 class Cameras:

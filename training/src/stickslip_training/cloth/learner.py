@@ -243,20 +243,19 @@ class FrictionLearner(Learner):
     def elsewhere(
         self, clips: Clips, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return clips over dark floors as part of a batch: half of them mirrored, each in a world that is drawn about
-        its cloth."""
+        """Return clips of another renderer as part of a batch: half of them mirrored, each in a drawn world."""
         mirrored = torch.rand(len(clips), 1, 1, 1, generator=generator) < 0.5
-        dark, cover = (torch.where(mirrored, part.flip(3), part) for part in (clips.crops, clips.cover))
+        shown, cover = (torch.where(mirrored, part.flip(3), part) for part in (clips.crops, clips.cover))
         across = torch.tensor([1.0, -1.0, 1.0])
         direction = torch.where(mirrored[:, 0, 0], across * clips.direction, clips.direction)
         looks = draw_style(len(clips), len(self.frames), generator)
-        cloth, world = cloth_of_clip(dark, cover, looks, draw_world(len(clips), generator), generator)
+        cloth, world, cover = cloth_of_clip(shown, cover, looks, draw_world(len(clips), generator), generator)
         axes = torch.stack([torch.tensor(camera.rotation[2]) for camera in self.rig])
         near = torch.cdist(direction, axes).argmin(dim=1)
         cameras = Cameras.of([self.rig[place] for place in near.tolist()])
         crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
         mu = torch.from_numpy(clips.mu.astype(np.float32))
-        return crops, direction, torch.from_numpy(clips.material), mu, cloth.alpha
+        return crops, direction, torch.from_numpy(clips.material), mu, cover
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)

@@ -12,9 +12,9 @@ class PosteriorNet(nn.Module):
     """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
     M, K).
 
-    Every frame goes through the same four convolutions and keeps its places: friction shows in
-    where an edge lies, to a part of a pixel. Frames are at fixed phases of the path of the holders, so each has a place
-    of its own in the layer that joins them.
+    Every frame goes through the same four convolutions and keeps its places: friction shows in where an edge lies, to
+    a part of a pixel. The third also sees the silhouette, which has its size. Frames are at fixed phases of the path of
+    the holders, so each has a place of its own in the layer that joins them.
     """
 
     def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96) -> None:
@@ -25,7 +25,7 @@ class PosteriorNet(nn.Module):
         for before, after in pairwise(channels):
             kernel = 5 if before == 1 else 3
             layers += [
-                nn.Conv2d(before, after, kernel, stride=2, padding=kernel // 2),
+                nn.Conv2d(before + (before == 32), after, kernel, stride=2, padding=kernel // 2),
                 nn.GroupNorm(8, after),
                 nn.ReLU(),
             ]
@@ -48,7 +48,10 @@ class PosteriorNet(nn.Module):
         clips, frames = crops.shape[:2]
         deviation, mean = torch.std_mean(crops, dim=(1, 2, 3), keepdim=True)
         x = (crops - mean) / (deviation + 1e-3)
-        features = self.frame(self.encoder(x.reshape(clips * frames, 1, *crops.shape[2:])))
+        with torch.no_grad():
+            silhouettes = self.silhouettes(crops).sigmoid().flatten(0, 1)[:, None]
+        early = self.encoder[:6](x.reshape(clips * frames, 1, *crops.shape[2:]))
+        features = self.frame(self.encoder[6:](torch.cat([early, silhouettes], dim=1)))
         return torch.as_tensor(self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1)))
 
     def read(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

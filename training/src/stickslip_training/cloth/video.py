@@ -26,13 +26,10 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Array, Floats
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, Clips, frames_at
-from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops, holder_path
+from stickslip_training.cloth.crop import PATCH, Cameras, Crops, cut, holder_crops, holder_path
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-PATCH = 0.095
-"""y of the middle of the held patches [m]; they are 1 cm wide."""
 
 PATCH_BELOW = 0.005
 """Their depth below the held edge [m]."""

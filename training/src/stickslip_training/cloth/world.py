@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn import functional
 
-from stickslip_training.cloth.crop import ANCHOR, HEIGHT, SCALE, WIDTH, Cameras, Crops, holder_path
+from stickslip_training.cloth.crop import ANCHOR, HEIGHT, PATCH, SCALE, WIDTH, Cameras, Crops, holder_path
 
 if TYPE_CHECKING:
     from stickslip_training.cloth.render import Style
@@ -68,14 +68,8 @@ RANGES = {
 CHANCES = {"tame": 0.25, "matt": 0.15, "dim": 0.4, "cast": 0.6, "clamp": 0.5, "hands": 0.35, "stick": 0.6, "codec": 0.5}
 """Of a camera without errors, of the dark floor of `Style`, of an albedo from `dark`, and of the things themselves."""
 
-EXPOSED = 0.97
-"""Share of the pixels of a clip that are not saturated."""
-
 PATTERN = 96
 """Texels along a side of the pattern of a floor."""
-
-HOLD = 0.095
-"""y of the middles of both held patches, and its negative [m]."""
 
 _EDGE = 2 * SCALE  # how sharp edges of clamps and hands are [1/m]
 
@@ -159,20 +153,24 @@ class Cloth:
 
 def cloth_of_clip(
     crops: torch.Tensor, alpha: torch.Tensor, style: "Style", world: World, generator: torch.Generator
-) -> tuple[Cloth, World]:
-    """Return the cloth of clips over a dark floor, grey levels, with known coverage; and the world around it.
+) -> tuple[Cloth, World, torch.Tensor]:
+    """Return the cloth of clips, grey levels, with known coverage; the world around it; and its coverage.
 
-    The errors of the camera are made here, by a warp: the world that is returned has none left.
+    A floor with a mean light of 0.05 or more lights the cloth, and stays: all of the picture counts as cloth. A warp
+    makes the errors of the camera; the world that is returned has none left.
     """
     frames = crops.shape[1]
     both = _warped(torch.cat([crops, alpha], dim=1), world, generator)
     linear, cover = both[:, :frames].clamp(1e-4, 1.0) ** 2.2, both[:, frames:].clamp(0.0, 1.0)
     gain = torch.exp(0.25 * torch.randn(len(crops), 1, 1, 1, generator=generator))
-    light = linear * gain / cover.clamp(min=0.05) * (cover > 0.02) / style.exposure[:, None, None, None]
+    floor = cover < 0.02
+    dark = (linear * floor).sum(dim=(1, 2, 3), keepdim=True) < 0.05 * floor.sum(dim=(1, 2, 3), keepdim=True)
+    alpha = torch.where(dark, cover, torch.ones_like(cover))
+    light = linear * gain / alpha.clamp(min=0.05) * (alpha > 0.02) / style.exposure[:, None, None, None]
     down, along = torch.randint(-8, 9, (2,), generator=generator).tolist()
-    cloth = Cloth(cover, light.clamp(max=4.0), torch.roll(cover, (abs(down) // 2 + 1, along), (2, 3)))
+    cloth = Cloth(alpha, light.clamp(max=4.0), torch.roll(cover, (abs(down) // 2 + 1, along), (2, 3)))
     exact = {"zoom": torch.ones_like(world.drawn["zoom"]), "roll": torch.zeros_like(world.drawn["roll"])}
-    return cloth, replace(world, drawn=world.drawn | exact)
+    return cloth, replace(world, drawn=world.drawn | exact), cover
 
 
 def _warped(crops: torch.Tensor, world: World, generator: torch.Generator) -> torch.Tensor:
@@ -205,8 +203,8 @@ def light_of(
     beyond = u * torch.cos(heading) + v * torch.sin(heading) - world["cast_place"]
     light = light * (1 - world.is_there("cast") * world["cast"] * torch.sigmoid(beyond / world["cast_blur"]))
     light = _held(light, cameras, crops, instants, style, world)
-    # A camera exposes so that hardly any pixel is saturated.
-    brightest = light.flatten(1)[:, ::7].quantile(EXPOSED, dim=1)[:, None, None, None]
+    # A camera exposes so that hardly any pixel is saturated: 3 %.
+    brightest = light.flatten(1)[:, ::7].quantile(0.97, dim=1)[:, None, None, None]
     light = light / brightest.clamp(min=1.0)
     outside = (middle.abs() > cameras.center[:, None, None, None] + 0.5).any(dim=-1)
     return torch.where(outside, torch.zeros_like(light), light)
@@ -260,7 +258,7 @@ def _held(
 ) -> torch.Tensor:
     """Return pictures with what holds the cloth at its two held patches."""
     x, z = holder_path(instants)
-    ends = torch.stack([torch.stack([x, torch.full_like(x, y), z], dim=-1) for y in (-HOLD, HOLD)], dim=1)
+    ends = torch.stack([torch.stack([x, torch.full_like(x, y), z], dim=-1) for y in (-PATCH, PATCH)], dim=1)
     pixels, depth = cameras.project(ends.expand(len(light), -1, -1, -1))
     place = crops.off_by(style.shift, style.stretch).of_pixels(pixels)
     scale = crops.scale[..., None] * cameras.focal.mean(dim=1)[:, None, None] / depth  # [px/m]
