@@ -156,9 +156,9 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
 
 def without_answer(runs: Runs) -> dict[str, Clips]:
     """Return clips of sorts that hold no answer, each in worlds of their own."""
-    frames, instants = frames_at(runs.instants)
-    runs = replace(runs, positions=runs.positions[:, frames], instants=instants)
-    held = holders_at(instants)
+    frames, _ = frames_at(runs.instants)
+    runs = replace(runs, positions=runs.positions[:, frames], instants=INSTANTS)
+    held = holders_at(INSTANTS)
 
     def shown(positions: Any, seed: int) -> Clips:
         return render_clips(replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True)
