@@ -118,10 +118,9 @@ raster::Part part(const Colors& albedo, const WindowTuple& window, std::size_t c
   return {place, {albedo.data(), albedo.size()}};
 }
 
-void compose(const Halves& shading, std::tuple<float, float> albedos, const Input<float, nb::shape<-1>>& overall,
+void compose(const Halves& shading, std::tuple<float, float, float> albedos, const Input<float, nb::shape<-1>>& overall,
              const Plane& coverage, const Colors& mean, const WindowTuple& window, const Colors& reflected,
-             const WindowTuple& reflected_window, const Input<float, nb::shape<-1, -1, 3>>& floor, float reflectance,
-             Pictures pictures) {
+             const WindowTuple& reflected_window, const Input<float, nb::shape<-1, -1, 3>>& floor, Pictures pictures) {
   const std::size_t height = pictures.shape(1), width = pictures.shape(2), colors = overall.size();
   const std::size_t fine = height > 0 ? shading.shape(0) / height : 0;
   if (colors != 3 * pictures.shape(0) || shading.shape(0) != fine * height || shading.shape(1) != fine * width ||
@@ -133,12 +132,16 @@ void compose(const Halves& shading, std::tuple<float, float> albedos, const Inpu
   const raster::Part cloth = part(mean, window, colors), mirrored = part(reflected, reflected_window, colors);
   if (coverage.shape(0) != mean.shape(0) || coverage.shape(1) != mean.shape(1))
     throw std::invalid_argument("coverage: must be of the shape of its window");
-  const raster::Shading light{{shading.data(), shading.size()}, static_cast<int>(width), static_cast<int>(height),
-                              static_cast<int>(fine),           std::get<0>(albedos),    std::get<1>(albedos)};
+  const raster::Shading light{{shading.data(), shading.size()},
+                              static_cast<int>(width),
+                              static_cast<int>(height),
+                              static_cast<int>(fine),
+                              std::get<0>(albedos),
+                              std::get<1>(albedos),
+                              std::get<2>(albedos)};
   nb::gil_scoped_release release;
   raster::compose(light, {overall.data(), overall.size()}, cloth, {coverage.data(), coverage.size()}, mirrored,
-                  {floor.data(), floor.size()}, reflectance, pictures.data(),
-                  static_cast<std::size_t>(pictures.stride(0)));
+                  {floor.data(), floor.size()}, pictures.data(), static_cast<std::size_t>(pictures.stride(0)));
 }
 
 auto blurred(const Colors& values, const Plane& down, const Plane& across) {
@@ -180,7 +183,7 @@ NB_MODULE(_raster, module) {
       "(count, 3), and the area of the triangles, each seen alone [px].");
   module.def(
       "compose", &compose, "shading"_a, "albedos"_a, "overall"_a, "coverage"_a, "mean"_a, "window"_a, "reflected"_a,
-      "reflected_window"_a, "floor"_a, "reflectance"_a, "pictures"_a,
+      "reflected_window"_a, "floor"_a, "pictures"_a,
       "Write pictures (count, h, w, 3) of a shading (n h, n w, 3), half floats given as uint16; coverage and mean\n"
       "are in its pixels, too.");
   module.def("blurred", &blurred, "values"_a, "down"_a, "across"_a,

@@ -55,11 +55,12 @@ struct Light {
   float gloss, once, twice;
 };
 
-// The light from its values at the three albedos; sums of values have the sum of their lights.
-Light solved(const Shading& shading, const std::array<float, 3>& at) {
-  const float to_first = (at[1] - at[0]) / shading.first, to_second = (at[2] - at[0]) / shading.second;
-  const float twice = (to_second - to_first) / (shading.second - shading.first);
-  return {at[0], to_first - shading.first * twice, twice};
+// The light of a part of a pixel; sums of values have the sum of their lights. Off the cloth nothing is seen of its
+// albedo.
+Light solved(const Shading& shading, const std::array<float, 3>& at, bool is_cloth) {
+  const float slope = (at[1] - at[2]) / (shading.usual - shading.dark), dark = at[1] - shading.usual * slope;
+  if (!is_cloth) return {dark, slope, 0.0f};
+  return {at[0], (dark - at[0]) / shading.shown, slope / shading.shown};
 }
 
 // Add to `sums` (once + twice * other) * albedo + gloss, where `cover` of it is cloth, and the rest times the floor's
@@ -82,12 +83,11 @@ std::ptrdiff_t index_in(const Window& window, int column, int row) {
 }  // namespace
 
 void compose(const Shading& shading, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
-             const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
-             std::size_t stride) {
+             const Part& reflected, std::span<const float> floor, std::uint8_t* pictures, std::size_t stride) {
   const std::vector<std::uint16_t>& table = encoding();
   const int colors = static_cast<int>(overall.size()), fine = shading.fine;
   const float part = 1.0f / static_cast<float>(fine * fine);
-  std::vector<float> albedo(colors), factor(colors), sums(colors);
+  std::vector<float> factor(colors), sums(colors);
   std::vector<std::int32_t> codes(colors);
   for (int row = 0; row < shading.height; ++row) {
     for (int column = 0; column < shading.width; ++column) {
@@ -110,13 +110,11 @@ void compose(const Shading& shading, std::span<const float> overall, const Part&
             bare = true;
             continue;
           }
-          const float share = cover / (cover + (1.0f - cover) * reflectance);
           const float* const seen = cloth.albedo.data() + here * colors;
-          for (int k = 0; k < colors; ++k) albedo[k] = around[k] + share * (seen[k] - around[k]);
-          add_up(solved(shading, at), cover, albedo.data(), overall.data(), factor.data(), sums.data(), colors);
+          add_up(solved(shading, at, true), cover, seen, overall.data(), factor.data(), sums.data(), colors);
         }
       }
-      if (bare) add_up(solved(shading, mean), 0.0f, around, overall.data(), factor.data(), sums.data(), colors);
+      if (bare) add_up(solved(shading, mean, false), 0.0f, around, overall.data(), factor.data(), sums.data(), colors);
       for (int k = 0; k < colors; ++k) codes[k] = code(part * sums[k]);
       std::uint8_t* out = pictures + 3 * pixel;
       for (int k = 0; k < colors; k += 3, out += stride) {

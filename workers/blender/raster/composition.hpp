@@ -10,12 +10,13 @@
 
 namespace raster {
 
-// The light of a frame at three albedos of the cloth.
+// The light of a frame at three albedos of the cloth: as the camera sees it 0, `shown` and `shown`, for all other light
+// `usual`, `usual` and `dark`.
 struct Shading {
   std::span<const std::uint16_t> light;  // half floats, (fine height) x (fine width) x 3
   int width, height;                     // of a picture
   int fine;                              // pixels of the light across one of a picture, and down
-  float first, second;                   // the second and third albedo; the first is 0
+  float shown, usual, dark;
 };
 
 // Albedos in a part of the frame, height x width x colours; texture n has the colours 3 n to 3 n + 2.
@@ -30,11 +31,9 @@ struct Part {
 // that meet in a pixel have light of their own. A pixel is the mean of its parts.
 // `coverage` is the share of the pixels of the cloth's window that see cloth. `overall` is the albedo (colours) of
 // light that met the cloth elsewhere; `reflected` what the floor shows of the cloth in its window, instead of it.
-// `floor` (height x width x 3) is a factor of the floor's light, and `reflectance` how bright the floor is beside the
-// cloth, where both are in a pixel.
+// `floor` (height x width x 3) is a factor of the floor's light.
 void compose(const Shading& shading, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
-             const Part& reflected, std::span<const float> floor, float reflectance, std::uint8_t* pictures,
-             std::size_t stride);
+             const Part& reflected, std::span<const float> floor, std::uint8_t* pictures, std::size_t stride);
 
 // Largest difference of a pixel of a clip from its exact value [8-bit levels]. Red is rounded; green takes the level of
 // red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.cloth.shading import ALBEDOS, FINE, TOLERANCE
+from stickslip_blender.cloth.shading import ELSEWHERE, FINE, SHOWN, TOLERANCE
 from stickslip_blender.raster import Window, _raster
 
+ALBEDOS = SHOWN[1], ELSEWHERE[1], ELSEWHERE[2]
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
 
@@ -21,8 +22,14 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     height, width, count = 9, 12, 3
     window, around = Window(1, 1, 4, 4).times(FINE), Window(5, 3, 12, 9)
     gloss, once, twice = RANDOM.uniform(-0.02, 0.4, (3, FINE * height, FINE * width))
-    light = np.stack([gloss + once * a + twice * a * a for a in ALBEDOS], axis=-1).astype(np.float16)
-    coverage = RANDOM.uniform(0.0, 1.0, (6, 6)).astype(np.float32) * (RANDOM.random((6, 6)) < 0.7)
+    covered = np.zeros(gloss.shape, dtype=bool)
+    covered[window.slices] = chosen = RANDOM.random((6, 6)) < 0.7
+    here = np.where(covered, once, 0.0)  # off the cloth nothing is seen of its albedo
+    light = np.stack(
+        [gloss + here * a + twice * b * np.where(covered, a, 1.0) for a, b in zip(SHOWN, ELSEWHERE, strict=True)],
+        axis=-1,
+    ).astype(np.float16)
+    coverage = RANDOM.uniform(0.1, 1.0, (6, 6)).astype(np.float32) * chosen
     seen, reflected, overall = (
         RANDOM.uniform(0.0, 1.0, shape).astype(np.float32) for shape in [(6, 6, 9), (6, 7, 9), (9,)]
     )
@@ -30,7 +37,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     pictures = np.empty((count, 2, height, width, 3), dtype=np.uint8)[:, 1]
     _raster.compose(
         light.view(np.uint16),
-        ALBEDOS[1:],
+        ALBEDOS,
         overall,
         coverage,
         seen,
@@ -38,22 +45,18 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
         reflected,
         around.place,
         floor,
-        0.3,
         pictures,
     )
 
-    at = [light[..., k].astype(np.float64) for k in range(3)]
-    S, *rest = np.linalg.solve(np.vander(ALBEDOS, 3, increasing=True), np.stack([a.ravel() for a in at]))
-    D, I = (part.reshape(*gloss.shape, 1) for part in rest)  # noqa: E741
-    albedo = np.tile(overall.astype(np.float64), (*gloss.shape, 1))
-    albedo[around.times(FINE).slices] = reflected.repeat(FINE, 0).repeat(FINE, 1)
-    cover = np.zeros((*gloss.shape, 1))
-    cover[window.slices] = coverage[..., None]
-    share = cover / np.maximum(cover + (1.0 - cover) * 0.3, 1e-12)
-    over = np.zeros_like(albedo)
-    over[window.slices] = seen
-    albedo += share * (over - albedo)
-    expected = (S.reshape(*gloss.shape, 1) + (D + I * overall) * albedo).reshape(*gloss.shape, count, 3)
+    at = np.moveaxis(light.astype(np.float64), -1, 0)[..., None]
+    slope = (at[1] - at[2]) / (ALBEDOS[1] - ALBEDOS[2])
+    around_it = np.tile(overall.astype(np.float64), (*gloss.shape, 1))
+    around_it[around.times(FINE).slices] = reflected.repeat(FINE, 0).repeat(FINE, 1)
+    cover, over = np.zeros((*gloss.shape, 1)), np.zeros_like(around_it)
+    cover[window.slices], over[window.slices] = coverage[..., None], seen
+    of_cloth = at[0] + (at[1] - at[0] + slope * (overall - ALBEDOS[1])) * over / ALBEDOS[0]
+    expected = np.where(cover > 0.0, of_cloth, at[1] + slope * (around_it - ALBEDOS[1]))
+    expected = expected.reshape(*gloss.shape, count, 3)
     expected *= (1.0 + (1.0 - cover) * (floor.repeat(FINE, 0).repeat(FINE, 1) - 1.0))[:, :, None]
     expected = np.moveaxis(expected.reshape(height, FINE, width, FINE, count, 3).mean(axis=(1, 3)), 2, 0)
     np.testing.assert_allclose(pictures, _srgb(expected), atol=1.1)
@@ -64,14 +67,12 @@ def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
     random = np.random.Generator(np.random.PCG64(4))
     overall = np.array([0.5, 0.51, 0.49, 0.9, 0.2, 0.5], dtype=np.float32)
     light = random.uniform(0.0, 0.6, (24, 60)).astype(np.float16)
-    shading = np.stack([(a * light).astype(np.float16) for a in ALBEDOS], axis=-1)
+    shading = np.stack([(a * light).astype(np.float16) for a in ELSEWHERE], axis=-1)
     nothing, nowhere = np.empty((0, 0), dtype=np.float32), (0, 0, 0, 0)
     pictures = np.empty((2, 24, 60, 3), dtype=np.uint8)
     none = np.empty((0, 0, 6), dtype=np.float32)
     floor = np.ones((24, 60, 3), dtype=np.float32)
-    _raster.compose(
-        shading.view(np.uint16), ALBEDOS[1:], overall, nothing, none, nowhere, none, nowhere, floor, 0.3, pictures
-    )
+    _raster.compose(shading.view(np.uint16), ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, pictures)
     exact = _srgb(light[..., None].astype(np.float64) * overall)
     grey, colorful = pictures
     assert np.abs(grey - exact[..., :3]).max() <= TOLERANCE + 0.2

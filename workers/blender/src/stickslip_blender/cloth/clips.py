@@ -48,7 +48,7 @@ _KEPT_SHADINGS = 2
 
 Clip = npt.NDArray[np.uint8]
 Light = npt.NDArray[np.float16]
-"""Linear, at the albedos of `shading.ALBEDOS`."""
+"""Linear, at the albedos of `shading.SHOWN`."""
 
 
 class ClothRenderer:

@@ -14,7 +14,7 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.looks import Light, Look
-from stickslip_blender.cloth.shading import ALBEDOS, FINE, Composer
+from stickslip_blender.cloth.shading import ELSEWHERE, FINE, SHOWN, Composer
 from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.cycles.engine import ClothSampling, Sampling, new_scene, set_sampling
 from stickslip_blender.cycles.environment import set_curtains
@@ -98,11 +98,11 @@ class ClothScene:
             )
 
     def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
-        """Render one instant for all textures: linear light at ALBEDOS, shape (FINE height, FINE width, 3).
+        """Render one instant for all textures: linear light at three albedos, shape (FINE height, FINE width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not flicker.
         """
-        self._fabric.set_color(ALBEDOS)
+        self._fabric.set_color(SHOWN, ELSEWHERE)
         self._place(shot)
         paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
         set_sampling(self._scene, Sampling(paths, "plain", seed))

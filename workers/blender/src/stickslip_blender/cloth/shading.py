@@ -1,20 +1,18 @@
 """One shading for many textures.
 
-The cloth is rendered once with the base colour ALBEDOS. Lamp and floor are grey, so red, green and blue are three
-samples of the light that a pixel sends to the camera, as a function of the cloth's albedo a:
+The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and floor are grey, so red, green and blue
+are three samples of the light that a pixel sends to the camera, as a function of the cloth's albedo there, a, and
+elsewhere, m:
 
-    L(a) = S + D a + I a^2        S: gloss and what is not cloth; D: light that cloth scattered once; I: twice
+    L(a, m) = S + (D + I m) a        S: gloss, also of light from other cloth; D: light scattered once; I: twice
 
-A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is
+A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is L(A(p), m) with the mean albedo m of
+the cloth in sight, in linear light, for each of the texture's colours. The cloth is rendered with FINE x FINE pixels
+in each of a picture: where light and print change within one, the mean of their products is not that of their means.
 
-    L(p) = S + (D + I m) A(p)     m: mean albedo of the cloth in sight, for light comes from elsewhere on the cloth
-
-in linear light, for each of the texture's colours. The cloth is rendered with FINE x FINE pixels in each of a picture:
-where light and print change within one, the mean of their products is not the product of their means.
-
-Off the cloth D is light that the cloth threw there: A is m, or what a floor that mirrors shows of the cloth, blurred as
-much as its roughness does. Marks of the floor and colours of props lie on top, as factors of their light: whatever is
-not the cloth is grey in Cycles.
+Off the cloth L is linear in the albedo of light that the cloth threw there: m, or what a floor that mirrors shows of
+the cloth, blurred as much as its roughness does. Marks of the floor and colours of props lie on top, as factors of
+their light: whatever is not the cloth is grey in Cycles.
 
 Each level of a picture is within TOLERANCE of the exact value, and chosen so that the colours of grey are equal: clips
 are a tenth smaller for it.
@@ -32,8 +30,8 @@ from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.raster import GRID, Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
 
-ALBEDOS = (0.0, 0.2, 0.6)
-"""The cloth's base colour in a shading. Prints have means of 0.05 to 0.6: between, light scattered thrice fits, too."""
+SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
+"""The cloth's base colours in a shading, where the camera sees it and where other rays meet it."""
 
 FINE = 2
 """Pixels of a shading across one of a picture, and down."""
@@ -45,7 +43,6 @@ _MIRROR_GRID = 8
 _PROP_GRID = 3
 _LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
 _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
-_DIELECTRIC = 0.06  # what a floor that is no metal reflects, at the angles of our cameras
 
 Floats = npt.NDArray[np.float32]
 
@@ -90,7 +87,7 @@ class Composer:
             reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
         _raster.compose(
             np.ascontiguousarray(shading).view(np.uint16),
-            ALBEDOS[1:],
+            (SHOWN[1], ELSEWHERE[1], ELSEWHERE[2]),
             sight.overall.ravel(),
             sight.coverage,
             sight.mean.reshape(*sight.coverage.shape, colors),
@@ -98,7 +95,6 @@ class Composer:
             reflected,
             around.place,
             self._tinted(floor, points, camera),
-            _reflectance(substrate),
             pictures,
         )
         frame = parts.width * parts.height
@@ -184,10 +180,6 @@ def _finer(camera: Camera) -> Camera:
     numbers = {name: FINE * getattr(camera, name) for name in ("width", "height", "fx", "fy")}
     centre = {name: FINE * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
     return camera.model_copy(update=numbers | centre)
-
-
-def _reflectance(substrate: Substrate) -> float:
-    return substrate.albedo if substrate.metallic > 0.5 else _DIELECTRIC
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:

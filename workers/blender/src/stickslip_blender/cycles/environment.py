@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.objects import set_inputs, set_pixels
+from stickslip_blender.cycles.objects import mix_by_ray, set_inputs, set_pixels
 
 HEIGHT = 64  # rows of the panorama: its light is smooth
 
@@ -54,17 +54,14 @@ def set_environment(scene: Any, light: npt.NDArray[np.float32], ground: float) -
         "panorama", width=light.shape[1], height=light.shape[0], float_buffer=True, is_data=True
     )
     set_pixels(image, light[..., None])
-    tree, seen, surface = _emptied(scene)
+    tree, _, surface = _emptied(scene)
     sky = tree.nodes.new("ShaderNodeTexEnvironment")
     sky.image = image
-    color = tree.nodes.new("ShaderNodeMix")
-    color.data_type = "RGBA"
-    factor, a, b = (next(i for i in color.inputs if i.identifier == n) for n in _MIX_INPUTS)
-    b.default_value = (ground, ground, ground, 1.0)
+    even = tree.nodes.new("ShaderNodeRGB")
+    even.outputs["Color"].default_value = (ground, ground, ground, 1.0)
     background = tree.nodes.new("ShaderNodeBackground")
-    tree.links.new(seen, factor)
-    tree.links.new(sky.outputs["Color"], a)
-    tree.links.new(next(o for o in color.outputs if o.identifier == "Result_Color"), background.inputs["Color"])
+    color = mix_by_ray(tree, sky.outputs["Color"], even.outputs["Color"])
+    tree.links.new(color, background.inputs["Color"])
     tree.links.new(background.outputs["Background"], surface)
     scene.world.cycles.sampling_method = "MANUAL"
     scene.world.cycles.sample_map_resolution = 2 * HEIGHT
@@ -92,6 +89,3 @@ def _emptied(scene: Any) -> tuple[Any, Any, Any]:
     tree.nodes.clear()
     seen = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
     return tree, seen, tree.nodes.new("ShaderNodeOutputWorld").inputs["Surface"]
-
-
-_MIX_INPUTS = ("Factor_Float", "A_Color", "B_Color")  # the node's sockets share their names, one set per data type

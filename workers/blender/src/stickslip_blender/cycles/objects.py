@@ -18,6 +18,8 @@ SHARP = np.radians(40.0)
 
 SOFT = 0.6  # least roughness that other rays than a camera's meet: at 0.4, light of a steel floor was twice as noisy
 
+_MIX_INPUTS = ("Factor_Float", "A_Color", "B_Color")  # the node's sockets share their names, one set per data type
+
 Array = npt.NDArray[np.float64]
 
 
@@ -102,7 +104,8 @@ class Fabric:
         self._tree = tree = mesh.materials[0].node_tree
         self._picture = tree.nodes.new("ShaderNodeTexImage")
         self._picture.extension = "EXTEND"
-        self._even = tree.nodes.new("ShaderNodeRGB")
+        self._shown, self._other = (tree.nodes.new("ShaderNodeRGB").outputs["Color"] for _ in range(2))
+        self._even = mix_by_ray(tree, self._other, self._shown)
         self._color = tree.nodes.new("NodeReroute")
         through = tree.nodes.new("ShaderNodeBsdfTranslucent")
         self._both = tree.nodes.new("ShaderNodeMixShader")
@@ -119,9 +122,9 @@ class Fabric:
         set_inputs(self._shader, Specular_IOR_Level=specular, Sheen_Weight=sheen)
         set_inputs(self._both, Fac=translucency)
 
-    def set_color(self, color: tuple[float, float, float]) -> None:
-        """Give the cloth one linear colour."""
-        self._even.outputs["Color"].default_value = (*color, 1.0)
+    def set_color(self, color: Sequence[float], other: Sequence[float] | None = None) -> None:
+        """Give the cloth one linear colour, or another one for all rays that do not come from the camera."""
+        self._shown.default_value, self._other.default_value = (*color, 1.0), (*(other or color), 1.0)
         self._connect(self._even)
 
     def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
@@ -133,12 +136,23 @@ class Fabric:
         self._picture.image = image
         if old is not None:
             images.remove(old)
-        self._connect(self._picture)
+        self._connect(self._picture.outputs["Color"])
 
-    def _connect(self, node: Any) -> None:
-        if self._from is not node:
-            self._tree.links.new(node.outputs["Color"], self._color.inputs[0])
-            self._from = node
+    def _connect(self, color: Any) -> None:
+        if self._from != color:
+            self._tree.links.new(color, self._color.inputs[0])
+            self._from = color
+
+
+def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
+    """Return the socket of a colour that is `seen` for rays of the camera and `other` for the rest."""
+    mix = tree.nodes.new("ShaderNodeMix")
+    mix.data_type = "RGBA"
+    factor, a, b = (next(i for i in mix.inputs if i.identifier == n) for n in _MIX_INPUTS)
+    tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], factor)
+    tree.links.new(other, a)
+    tree.links.new(seen, b)
+    return next(o for o in mix.outputs if o.identifier == "Result_Color")
 
 
 def set_pixels(image: Any, color: npt.NDArray[np.floating[Any]]) -> None:

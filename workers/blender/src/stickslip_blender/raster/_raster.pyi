@@ -24,7 +24,7 @@ def albedo(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.float32], float]: ...
 def compose(
     trace: NDArray[np.uint16],
-    albedos: tuple[float, float],
+    albedos: tuple[float, float, float],
     overall: NDArray[np.float32],
     coverage: NDArray[np.float32],
     mean: NDArray[np.float32],
@@ -32,7 +32,6 @@ def compose(
     reflected: NDArray[np.float32],
     reflected_window: _Part,
     floor: NDArray[np.float32],
-    reflectance: float,
     pictures: NDArray[np.uint8],
 ) -> None: ...
 def blurred(
