@@ -104,7 +104,7 @@ def test_quick_rejections_do_not_shorten_the_time_left(context: Context, worker:
 
 
 def test_what_was_measured_long_ago_fades(context: Context, worker: PretendWorker) -> None:
-    submit(context, gamma=tuple(float(value) for value in range(1, 200)), phi1=(1.0, 2.0, 3.0), views=None)
+    submit(context, gamma=tuple(float(value) for value in range(1, 200)), phi1=(1.0, 2.0), views=None)
     for lease in worker.lease(simulate=KEPT_RUNS + 1):
         finish(worker, lease, 10.0)
     with context.database.read() as connection:
