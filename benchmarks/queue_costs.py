@@ -57,9 +57,14 @@ def database_seconds() -> float:
 
 
 def submit(server: ServerProcess, count: int, **spec: Any) -> str:
-    """Submit rods with `count` simulations; return the job."""
+    """Submit rods with `count` simulations; return the job when it is planned."""
     grid = rods(gamma=[1.0 + number for number in range(count)], phi1=[1.0], **spec)
-    return str(httpx.post(f"{server.url}/v1/jobs", json=grid, timeout=60, trust_env=False).json()["id"])
+    with httpx.Client(base_url=server.url, timeout=60, trust_env=False) as client:
+        job = client.post("/v1/jobs", json=grid).json()
+        while job["state"] == "planning":
+            time.sleep(0.1)
+            job = client.get(f"/v1/jobs/{job['id']}").json()
+    return str(job["id"])
 
 
 def report_lease_and_complete(server: ServerProcess, worker: PretendWorker, batch: int, count: int) -> None:
