@@ -7,6 +7,8 @@ from torch import nn
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH
 
+_SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames have its size there
+
 
 class PosteriorNet(nn.Module):
     """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
@@ -22,13 +24,10 @@ class PosteriorNet(nn.Module):
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
         channels = (1, 16, 32, 48, 64)
         layers: list[nn.Module] = []
-        for before, after in pairwise(channels):
-            kernel = 5 if before == 1 else 3
-            layers += [
-                nn.Conv2d(before + (before == 32), after, kernel, stride=2, padding=kernel // 2),
-                nn.GroupNorm(8, after),
-                nn.ReLU(),
-            ]
+        for number, (before, after) in enumerate(pairwise(channels)):
+            kernel = 5 if number == 0 else 3
+            seen = before + (number == _SILHOUETTE_AT)
+            layers += [nn.Conv2d(seen, after, kernel, stride=2, padding=kernel // 2), nn.GroupNorm(8, after), nn.ReLU()]
         self.encoder = nn.Sequential(*layers, nn.Flatten())
         places = channels[-1] * -(-HEIGHT // 16) * -(-WIDTH // 16)
         self.frame = nn.Sequential(nn.Linear(places, width), nn.LayerNorm(width), nn.ReLU())
@@ -50,8 +49,9 @@ class PosteriorNet(nn.Module):
         x = (crops - mean) / (deviation + 1e-3)
         with torch.no_grad():
             silhouettes = self.silhouettes(crops).sigmoid().flatten(0, 1)[:, None]
-        early = self.encoder[:6](x.reshape(clips * frames, 1, *crops.shape[2:]))
-        features = self.frame(self.encoder[6:](torch.cat([early, silhouettes], dim=1)))
+        early, late = self.encoder[: 3 * _SILHOUETTE_AT], self.encoder[3 * _SILHOUETTE_AT :]
+        seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), silhouettes], dim=1)
+        features = self.frame(late(seen))
         return torch.as_tensor(self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1)))
 
     def read(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

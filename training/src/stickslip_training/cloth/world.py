@@ -71,6 +71,7 @@ CHANCES = {"tame": 0.25, "matt": 0.15, "dim": 0.4, "cast": 0.6, "clamp": 0.5, "h
 PATTERN = 96
 """Texels along a side of the pattern of a floor."""
 
+_EXPOSED = 0.97  # share of the pixels of a clip that are not saturated
 _EDGE = 2 * SCALE  # how sharp edges of clamps and hands are [1/m]
 
 
@@ -203,8 +204,8 @@ def light_of(
     beyond = u * torch.cos(heading) + v * torch.sin(heading) - world["cast_place"]
     light = light * (1 - world.is_there("cast") * world["cast"] * torch.sigmoid(beyond / world["cast_blur"]))
     light = _held(light, cameras, crops, instants, style, world)
-    # A camera exposes so that hardly any pixel is saturated: 3 %.
-    brightest = light.flatten(1)[:, ::7].quantile(0.97, dim=1)[:, None, None, None]
+    # A camera exposes so that hardly any pixel is saturated.
+    brightest = light.flatten(1)[:, ::7].quantile(_EXPOSED, dim=1)[:, None, None, None]
     light = light / brightest.clamp(min=1.0)
     outside = (middle.abs() > cameras.center[:, None, None, None] + 0.5).any(dim=-1)
     return torch.where(outside, torch.zeros_like(light), light)

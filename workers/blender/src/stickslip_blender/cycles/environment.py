@@ -54,7 +54,7 @@ def set_environment(scene: Any, light: npt.NDArray[np.float32], ground: float) -
         "panorama", width=light.shape[1], height=light.shape[0], float_buffer=True, is_data=True
     )
     set_pixels(image, light[..., None])
-    tree, _, surface = _emptied(scene)
+    tree, surface = _emptied(scene)
     sky = tree.nodes.new("ShaderNodeTexEnvironment")
     sky.image = image
     even = tree.nodes.new("ShaderNodeRGB")
@@ -70,22 +70,21 @@ def set_environment(scene: Any, light: npt.NDArray[np.float32], ground: float) -
 def set_curtains(scene: Any, ambient: float) -> None:
     """Light the scene evenly from all around with a low radiance; cameras see black instead."""
     scene.world.color = (0.0, 0.0, 0.0)
-    tree, seen, surface = _emptied(scene)
+    tree, surface = _emptied(scene)
     dark = tree.nodes.new("ShaderNodeBackground")
     set_inputs(dark, Color=(0.0, 0.0, 0.0, 1.0))
     faint = tree.nodes.new("ShaderNodeBackground")
     set_inputs(faint, Color=(ambient, ambient, ambient, 1.0))
     mix = tree.nodes.new("ShaderNodeMixShader")
-    tree.links.new(seen, mix.inputs["Fac"])
+    tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], mix.inputs["Fac"])
     tree.links.new(faint.outputs["Background"], mix.inputs[1])
     tree.links.new(dark.outputs["Background"], mix.inputs[2])
     tree.links.new(mix.outputs["Shader"], surface)
     scene.world.cycles.sampling_method = "NONE"  # paths that leave find it: the lamp gets all shadow rays
 
 
-def _emptied(scene: Any) -> tuple[Any, Any, Any]:
-    """Empty the node tree of the world; return it, the socket of camera rays, and the socket of its surface."""
+def _emptied(scene: Any) -> tuple[Any, Any]:
+    """Empty the node tree of the world; return it and the socket of its surface."""
     tree = scene.world.node_tree
     tree.nodes.clear()
-    seen = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
-    return tree, seen, tree.nodes.new("ShaderNodeOutputWorld").inputs["Surface"]
+    return tree, tree.nodes.new("ShaderNodeOutputWorld").inputs["Surface"]
