@@ -25,7 +25,7 @@ class _Server(http.server.ThreadingHTTPServer):
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
-    """Serve a dataset version as the service does: the manifest beside `files/`, and ranges."""
+    """Serve the files of a dataset version as the service does, with ranges."""
 
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True  # header and body are two writes
@@ -39,9 +39,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if self.server.key and self.headers["Authorization"] != f"Bearer {self.server.key}":
             return self._answer(401)
         prefix = "/v1/datasets/ds-x/versions/1/"
-        if self.path == prefix + "manifest":
-            path = self.server.root / "manifest.json"
-        elif self.path.startswith(prefix + "files/"):
+        if self.path.startswith(prefix + "files/"):
             path = self.server.root / self.path.removeprefix(prefix + "files/")
         else:
             path = self.server.root / self.path.removeprefix("/static/")
@@ -117,7 +115,7 @@ def test_verify_reads_every_file(server, seen_rods):
     with DatasetReader(_url(server), verify=True):
         paths = {path.split("/files/")[1] for path, _ in server.requests if "/files/" in path}
         listed = {file.path for file in seen_rods.manifest.files}
-        assert paths == listed | {"zarr.json", "manifest.sha256"}
+        assert paths == listed | {"manifest.json", "zarr.json", "manifest.sha256"}
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
@@ -141,14 +139,14 @@ def test_a_busy_server_is_asked_again(server):
 def test_a_server_that_stays_away_is_an_error(server, monkeypatch):
     monkeypatch.setattr(HttpSource, "TRIES", 2)
     server.failures = 100
-    with pytest.raises(SourceError, match="manifest answered 503, and 200 was expected"):
+    with pytest.raises(SourceError, match=r"manifest.json answered 503, and 200 was expected"):
         DatasetReader(_url(server))
     with pytest.raises(SourceError, match="does not answer: ConnectError"):
         DatasetReader("http://127.0.0.1:9/v1/datasets/ds-x/versions/1")
 
 
 def test_a_version_that_is_not_there(server):
-    with pytest.raises(MissingFileError, match="answered 404: this is no committed dataset version"):
+    with pytest.raises(MissingFileError, match=r"manifest.json is not there: this is no committed dataset version"):
         DatasetReader(_url(server, "v1/datasets/ds-x/versions/2"))
 
 

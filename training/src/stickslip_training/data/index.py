@@ -154,13 +154,13 @@ class Index:
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
         key = array.name, shard
         if key not in self._shard_indexes:
-            if self._check_shards:
-                self._compare(file, self.source.digest(file))
             samples = self.manifest.spec.samples_per_shard
             size = shard_index_size(samples)
             if size > file.size:
                 raise CorruptDataError(f"array {array.name}: {self.at(file)} is too short for a shard index")
             data = self.source.read(file, file.size - size, size)
+            if self._check_shards:
+                self._compare(file, self.source.digest(file))
             with _naming(f"array {array.name}, {self.at(file)}"):
                 self._shard_indexes[key] = decode_shard_index(data, samples)
         return self._shard_indexes[key]

@@ -8,7 +8,6 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from stickslip_schemas.format.codecs import axes_order, packing
 from stickslip_schemas.spec.arrays import ArrayLayout
 
@@ -52,12 +51,13 @@ def check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
         "codecs": _codecs(array),
+        "fill_value": "NaN" if array.fill != array.fill else array.fill,
         "storage_transformers": [],
     }
     found = {
         **metadata,
-        "chunk_key_encoding": _with_default(metadata.get("chunk_key_encoding"), {"separator": "/"}),
-        "codecs": _normalised_codecs(metadata.get("codecs"), array),
+        "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding")),
+        "codecs": _all_normalised(metadata.get("codecs")),
         "storage_transformers": metadata.get("storage_transformers") or [],
     }
     for field, rule in expected.items():
@@ -65,10 +65,6 @@ def check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples
             raise InvalidDatasetError(
                 f"array {array.name}: {field} must be {json.dumps(rule)}, and is {json.dumps(found.get(field))}"
             )
-    if not _same_fill(metadata.get("fill_value"), array.fill):
-        raise InvalidDatasetError(
-            f"array {array.name}: fill_value must be {array.fill}, and is {json.dumps(metadata.get('fill_value'))}"
-        )
 
 
 _LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
@@ -91,36 +87,21 @@ def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
     return [{"name": "sharding_indexed", "configuration": configuration}]
 
 
-def _normalised_codecs(codecs: Any, array: ArrayLayout) -> Any:
-    """Give every codec a configuration, and drop what a reader need not know: the level of zstd, all of blosc's."""
-    if not isinstance(codecs, list):
-        return codecs
-    result = []
-    for codec in codecs:
-        codec = {"name": codec} if isinstance(codec, str) else codec
-        if not isinstance(codec, dict):
-            return codecs
-        configuration = dict(codec.get("configuration") or {})
-        if codec.get("name") in ("zstd", "blosc"):
-            configuration = {}
-        elif codec.get("name") == "bytes" and np.dtype(array.dtype).itemsize == 1:
-            configuration.setdefault("endian", "little")  # a byte has no order
-        elif codec.get("name") == "sharding_indexed":
-            configuration.setdefault("index_location", "end")
-            configuration["codecs"] = _normalised_codecs(configuration.get("codecs"), array)
-            configuration["index_codecs"] = _normalised_codecs(configuration.get("index_codecs"), array)
-        result.append({"name": codec.get("name"), "configuration": configuration})
-    return result
+_DEFAULTS = {"default": {"separator": "/"}, "bytes": {"endian": "little"}, "sharding_indexed": {"index_location": "end"}}
+"""Configurations that the metadata may leave out."""
 
 
-def _with_default(item: Any, configuration: dict[str, Any]) -> Any:
-    item = {"name": item} if isinstance(item, str) else item
-    if not isinstance(item, dict):
-        return item
-    return {"name": item.get("name"), "configuration": {**configuration, **(item.get("configuration") or {})}}
+def _normalised(named: Any) -> Any:
+    """Give a codec or an encoding its configuration, but for what a reader need not know: the level of zstd, all of
+    blosc's."""
+    named = {"name": named} if isinstance(named, str) else named
+    if not isinstance(named, dict):
+        return named
+    name = named.get("name")
+    configuration = _DEFAULTS.get(str(name), {}) | (named.get("configuration") or {})
+    inner = {key: _all_normalised(configuration[key]) for key in ("codecs", "index_codecs") if key in configuration}
+    return {"name": name, "configuration": {} if name in ("zstd", "blosc") else configuration | inner}
 
 
-def _same_fill(found: Any, fill: float | int | bool) -> bool:
-    if isinstance(fill, float) and np.isnan(fill):
-        return bool(found == "NaN")
-    return bool(found == fill)
+def _all_normalised(codecs: Any) -> Any:
+    return [_normalised(codec) for codec in codecs] if isinstance(codecs, list) else codecs

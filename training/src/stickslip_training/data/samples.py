@@ -169,10 +169,7 @@ class Samples(Dataset[Item]):
         return {name: tensor[:count] for name, tensor in self._ring[place].items()}
 
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
-        buffers = {}
-        for name in self._arrays:
-            buffers[name] = torch.from_numpy(self.reader.empty(name, count))
-        return buffers
+        return {name: torch.from_numpy(self.reader.empty(name, count)) for name in self._arrays}
 
 
 def _for_torch(values: Array) -> Array:

@@ -1,9 +1,4 @@
-"""The three files that vouch for all others of a version, and for one another.
-
-`manifest.json` has the SHA-256 of every file but these three. The attribute `manifest_sha256` of the group's metadata
-is that of the manifest. `manifest.sha256`, in the form of sha256sum, has those of both. So a bit that is flipped in any
-of the three shows.
-"""
+"""Reading the three files that vouch for all others of a version: see `stickslip_schemas.format.manifest`."""
 
 from typing import Any
 
@@ -19,16 +14,9 @@ from stickslip_training.data.sources import DirectorySource, Source
 def read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
     """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked against one another."""
     manifest = source.read_manifest()
+    group = source.fetch(GROUP_METADATA)[0]
     try:
-        seal = source.read_unlisted(SEAL_NAME)
-    except MissingFileError as error:
-        raise InvalidDatasetError(
-            f"{error}: the version was made before versions had this file, or it was lost. Make the dataset again: "
-            "submit its spec to a service of this release"
-        ) from None
-    group = source.read_unlisted(GROUP_METADATA)
-    try:
-        digest = check_seal(manifest, group, seal)
+        digest = check_seal(manifest, group, source.fetch(SEAL_NAME)[0])
     except BrokenSealError as error:
         raise CorruptDataError(f"{source}/{error}") from None
     return digest, parse_metadata(group, f"{source}/{GROUP_METADATA}"), manifest
@@ -39,7 +27,7 @@ def read_selection(source: Source, manifest: str) -> Selection:
     if not isinstance(source, DirectorySource):
         return Selection()  # servers have whole versions
     try:
-        data = source.read_unlisted(SELECTION_NAME)
+        data = source.fetch(SELECTION_NAME)[0]
     except MissingFileError:
         return Selection()
     try:

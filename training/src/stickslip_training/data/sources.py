@@ -1,7 +1,7 @@
 """Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range requests.
 
-A source keeps nothing open that two processes could fight over: a directory is read with one open and one pread per
-read, and an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
+A source keeps nothing open that two processes could fight over: a file is opened for each read, and an HTTP client
+belongs to the process that made it. So a source can be pickled and survives a fork.
 """
 
 import hashlib
@@ -27,21 +27,28 @@ class Source(ABC):
     """The files of one dataset version."""
 
     @abstractmethod
+    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
+        """Return the bytes of a file, or those of a part of it, and the size of the file if it is known.
+
+        Raises MissingFileError where there is no such file.
+        """
+
     def read_manifest(self) -> bytes:
         """Return the manifest's bytes."""
-
-    @abstractmethod
-    def read_unlisted(self, name: str) -> bytes:
-        """Return all bytes of a file that the manifest does not list."""
-
-    @abstractmethod
-    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
-        """Return `length` bytes from `offset` of a file whose size must be that of the manifest."""
+        try:
+            return self.fetch(MANIFEST_NAME)[0]
+        except MissingFileError as error:
+            raise MissingFileError(f"{error}: this is no committed dataset version") from None
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
         """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
         length = file.size - offset if length is None else length
-        data = self.read_range(file, offset, length)
+        try:
+            data, size = self.fetch(file.path, None if length == file.size else range(offset, offset + length))
+        except MissingFileError as error:
+            raise MissingFileError(f"{error}, and the manifest says it is") from None
+        if size not in (None, file.size):
+            raise CorruptDataError(f"{self}/{file.path} has {size} bytes, and the manifest says {file.size}")
         if len(data) != length:
             raise CorruptDataError(f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected")
         return data
@@ -73,46 +80,17 @@ class DirectorySource(Source):
     def __str__(self) -> str:
         return self._root
 
-    def read_manifest(self) -> bytes:
+    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
         try:
-            return self.read_unlisted(MANIFEST_NAME)
-        except MissingFileError:
-            path = f"{self}/{MANIFEST_NAME}"
-            raise MissingFileError(f"{path} is not there: this is no committed dataset version") from None
-
-    def read_unlisted(self, name: str) -> bytes:
-        path = Path(self._root, name)
-        try:
-            return path.read_bytes()
+            with Path(self._root, path).open("rb") as file:
+                file.seek(0 if part is None else part.start)
+                return file.read(-1 if part is None else len(part)), os.fstat(file.fileno()).st_size
         except (FileNotFoundError, NotADirectoryError):
-            raise MissingFileError(f"{path} does not exist") from None
+            raise MissingFileError(f"{self}/{path} is not there") from None
 
     def digest(self, file: FileEntry) -> str | None:
-        try:
-            with Path(self._root, file.path).open("rb", buffering=0) as opened:
-                return hashlib.file_digest(opened, "sha256").hexdigest()
-        except (FileNotFoundError, NotADirectoryError):
-            raise MissingFileError(f"{self._root}/{file.path} is not there, and the manifest says it is") from None
-
-    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
-        path = f"{self._root}/{file.path}"
-        try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except (FileNotFoundError, NotADirectoryError):
-            raise MissingFileError(f"{path} is not there, and the manifest says it is") from None
-        try:
-            size = os.fstat(descriptor).st_size
-            if size != file.size:
-                raise CorruptDataError(f"{path} has {size} bytes, and the manifest says {file.size}")
-            data = os.pread(descriptor, length, offset)
-            while len(data) < length:  # a signal, or more than 2 GiB
-                more = os.pread(descriptor, length - len(data), offset + len(data))
-                if not more:
-                    raise CorruptDataError(f"{path} ends before byte {offset + length}")
-                data += more
-        finally:
-            os.close(descriptor)
-        return data
+        with Path(self._root, file.path).open("rb", buffering=0) as opened:
+            return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 class BucketSource(Source):
@@ -139,19 +117,11 @@ class BucketSource(Source):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_objects": None, "_pid": 0}
 
-    def read_manifest(self) -> bytes:
-        return self.read_unlisted(MANIFEST_NAME)
-
-    def read_unlisted(self, name: str) -> bytes:
-        return self._asked(name, lambda obstore, objects: obstore.get(objects, name).bytes().to_bytes())
-
-    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
-        if offset == 0 and length == file.size:
-            return self.read_unlisted(file.path)
-        return self._asked(
-            file.path,
-            lambda obstore, objects: obstore.get_range(objects, file.path, start=offset, length=length).to_bytes(),
-        )
+    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
+        if part is None:
+            return self._asked(path, lambda obstore, objects: obstore.get(objects, path).bytes().to_bytes()), None
+        within = {"start": part.start, "end": part.stop}
+        return self._asked(path, lambda obstore, objects: obstore.get_range(objects, path, **within).to_bytes()), None
 
     def close(self) -> None:
         self._objects = None
@@ -174,7 +144,7 @@ class BucketSource(Source):
                 self._pid = os.getpid()
             return bytes(request(obstore, self._objects))
         except FileNotFoundError:
-            raise MissingFileError(f"{self}/{name} is not there: this is no committed dataset version") from None
+            raise MissingFileError(f"{self}/{name} is not there") from None
         except obstore.exceptions.BaseError as error:
             raise SourceError(f"{self}/{name} cannot be read: {str(error).splitlines()[0]}") from error
 
@@ -189,13 +159,11 @@ class HttpSource(Source):
     TRIES = 4
     _RETRIED_STATUSES = frozenset({429, 500, 502, 503, 504})
 
-    def __init__(self, url: str, *, api_key: str | None = None, timeout: float = 30.0) -> None:
+    def __init__(self, url: str, *, api_key: str | None = None) -> None:
         url = url.rstrip("/")
         version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
         self._files = f"{version[1]}/files" if version else url
-        self._manifests = ([f"{version[1]}/manifest"] if version else []) + [f"{self._files}/{MANIFEST_NAME}"]
         self._api_key = api_key
-        self._timeout = timeout
         self._client: Any = None
         self._client_pid = 0
 
@@ -205,41 +173,24 @@ class HttpSource(Source):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_client": None, "_client_pid": 0}
 
-    def read_manifest(self) -> bytes:
-        for url in self._manifests:
-            response = self._get(url, {})
-            if response.status_code == 200:
-                return bytes(response.content)
-            if response.status_code != 404:
-                raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
-        raise MissingFileError(f"{' and '.join(self._manifests)} answered 404: this is no committed dataset version")
-
-    def read_unlisted(self, name: str) -> bytes:
-        url = f"{self._files}/{name}"
-        response = self._get(url, {})
-        if response.status_code == 404:
-            raise MissingFileError(f"{url} does not exist")
-        if response.status_code != 200:
-            raise SourceError(f"{url} answered {response.status_code}, and 200 was expected")
-        return bytes(response.content)
-
-    def read_range(self, file: FileEntry, offset: int, length: int) -> bytes:
-        whole = offset == 0 and length == file.size
-        url = f"{self._files}/{file.path}"
-        response = self._get(url, {} if whole else {"Range": f"bytes={offset}-{offset + length - 1}"})
-        if response.status_code == 404:
-            raise MissingFileError(f"{url} is not there, and the manifest says it is")
-        if response.status_code == 416:
-            raise CorruptDataError(f"{url} ends before byte {offset + length}")
-        if response.status_code != (200 if whole else 206):
-            hint = ": it does not serve ranges" if response.status_code == 200 else ""
-            raise SourceError(f"{url} answered {response.status_code}, and {200 if whole else 206} was expected{hint}")
-        if not whole:
-            expected = f"bytes {offset}-{offset + length - 1}/{file.size}"
-            content_range = response.headers.get("Content-Range", "")
-            if content_range != expected:
-                raise CorruptDataError(f"{url} sent {content_range!r}, and {expected!r} was expected")
-        return bytes(response.content)
+    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
+        url, asked = f"{self}/{path}", "" if part is None else f"{part.start}-{part.stop - 1}"
+        response = self._get(url, {"Range": f"bytes={asked}"} if asked else {})
+        status, expected = response.status_code, 206 if asked else 200
+        if status == 404:
+            raise MissingFileError(f"{url} is not there")
+        if status == 416:
+            raise CorruptDataError(f"{url} ends before bytes {asked}")
+        if status != expected:
+            hint = ": it does not serve ranges" if status == 200 else ""
+            raise SourceError(f"{url} answered {status}, and {expected} was expected{hint}")
+        data = bytes(response.content)
+        if not asked:
+            return data, len(data)
+        sent = re.fullmatch(r"bytes (\d+-\d+)/(\d+)", response.headers.get("Content-Range", ""))
+        if sent is None or sent[1] != asked:
+            raise CorruptDataError(f"{url} sent {sent and sent[0]}, and bytes {asked} were expected")
+        return data, int(sent[2])
 
     def close(self) -> None:
         if self._client is not None and self._client_pid == os.getpid():
@@ -255,7 +206,7 @@ class HttpSource(Source):
             headers_of_all = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
             if self._api_key:
                 headers_of_all["Authorization"] = f"Bearer {self._api_key}"
-            self._client = httpx.Client(headers=headers_of_all, timeout=self._timeout, follow_redirects=True)
+            self._client = httpx.Client(headers=headers_of_all, timeout=30.0, follow_redirects=True)
             self._client_pid = os.getpid()
         for attempt in range(self.TRIES):
             try:

@@ -130,13 +130,13 @@ class Version:
     def label(self, name: str) -> Array:
         """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector; read-only."""
         array = self.array(name)
-        if array.per_sample or len(array.shape) > 1:
+        if not array.is_label:
             raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
         return self.index.label(name)
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        return tuple(array.name for array in self.arrays.values() if not array.per_sample and len(array.shape) < 2)
+        return tuple(array.name for array in self.arrays.values() if array.is_label)
 
     def categories(self, name: str) -> tuple[str, ...]:
         """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
@@ -211,10 +211,5 @@ def _parse_manifest(data: bytes) -> Manifest:
         raise InvalidDatasetError(
             f"sample_count of the manifest is {manifest.sample_count}, its spec asks for {manifest.spec.sample_count} "
             f"and it lists {len(manifest.sample_keys)} sample keys"
-        )
-    if not manifest.sections and manifest.valid_count != manifest.sample_count - len(manifest.rejections):
-        raise InvalidDatasetError(
-            f"valid_count of the manifest is {manifest.valid_count}, and {manifest.sample_count} samples less "
-            f"{len(manifest.rejections)} rejections is another number"
         )
     return manifest
