@@ -28,7 +28,7 @@ from stickslip_schemas.spec.cameras import load_rig  # noqa: E402
 from stickslip_sim_core import solve_general_rods, solve_rods  # noqa: E402
 from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.photographs import save_overlay  # noqa: E402
-from stickslip_training.reconstruction.silhouette import View, silhouette  # noqa: E402
+from stickslip_training.reconstruction.silhouette import View, silhouette, to_linear  # noqa: E402
 from stickslip_training.reconstruction.starts import moving_cylinder, visual_hull  # noqa: E402
 
 Floats = npt.NDArray[np.float64]
@@ -105,7 +105,7 @@ def judge(views: npt.NDArray[np.uint8], true: Floats) -> Judged:
 def thesis_error(pictures: npt.NDArray[np.uint8], true: Floats) -> float:
     """Return the mean error [L] of the centroid of a moving cylinder, the thesis's own way."""
     views = [
-        View.of(camera, silhouette(picture), length=1.0, clamp=(0, 0, 0))
+        View.of(camera, silhouette(to_linear(picture)), length=1.0, clamp=(0, 0, 0))
         for camera, picture in zip(load_rig(RIG), pictures, strict=True)
     ]
     line = moving_cylinder(visual_hull(views), RADIUS, DOWN)

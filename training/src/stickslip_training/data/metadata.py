@@ -87,7 +87,11 @@ def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
     return [{"name": "sharding_indexed", "configuration": configuration}]
 
 
-_DEFAULTS = {"default": {"separator": "/"}, "bytes": {"endian": "little"}, "sharding_indexed": {"index_location": "end"}}
+_DEFAULTS = {
+    "default": {"separator": "/"},
+    "bytes": {"endian": "little"},
+    "sharding_indexed": {"index_location": "end"},
+}
 """Configurations that the metadata may leave out."""
 
 

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +16,8 @@ from stickslip_schemas.spec.cameras import Camera, read_rigs
 
 from stickslip_training.reconstruction.pipeline import Reconstruction, ReconstructionError, reconstruct
 
-if TYPE_CHECKING:
-    from PIL import Image
-
-
-Color = tuple[int, int, int]
-
-FOUND: Color = (0, 255, 255)
-TRUE: Color = (255, 60, 255)
+FOUND, TRUE = (0, 255, 255), (255, 60, 255)
+"""Colours of centrelines."""
 LEAST_HEIGHT = 600  # [px]: smaller pictures are enlarged by a whole factor
 
 
@@ -36,15 +30,19 @@ def import_pillow() -> Any:
     return Image
 
 
-def overlay(
+def save_overlay(
+    path: Path,
     views: Sequence[npt.NDArray[np.uint8]],
     cameras: Sequence[Camera],
-    curves: Sequence[tuple[npt.NDArray[np.float64], Color]],
-) -> Image.Image:
-    """Return the views (y, x, rgb) side by side, with curves (n, 3) [camera unit] drawn over them, last on top."""
+    found: npt.NDArray[np.float64],
+    true: npt.NDArray[np.float64] | None = None,
+) -> None:
+    """Write a PNG of the views (y, x, rgb) side by side, with the reconstructed centreline (n, 3) [camera unit] and,
+    below it, the true one if it is known."""
     module = import_pillow()
     from PIL import ImageDraw
 
+    curves = [(found, FOUND)] if true is None else [(true, TRUE), (found, FOUND)]
     panels = []
     for pixels, camera in zip(views, cameras, strict=True):
         factor = max(1, round(LEAST_HEIGHT / camera.height))
@@ -60,19 +58,7 @@ def overlay(
     for panel in panels:
         sheet.paste(panel, (left, 0))
         left += panel.width
-    return sheet  # type: ignore[no-any-return]
-
-
-def save_overlay(
-    path: Path,
-    views: Sequence[npt.NDArray[np.uint8]],
-    cameras: Sequence[Camera],
-    found: npt.NDArray[np.float64],
-    true: npt.NDArray[np.float64] | None = None,
-) -> None:
-    """Write a PNG with the reconstructed centreline and, below it, the true one if it is known."""
-    curves = [(found, FOUND)] if true is None else [(true, TRUE), (found, FOUND)]
-    overlay(views, cameras, curves).save(path)
+    sheet.save(path)
 
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")

@@ -23,7 +23,7 @@ from stickslip_schemas.spec.cameras import Camera
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction import curve
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
-from stickslip_training.reconstruction.silhouette import NoRodError, View, shrink_image, silhouette_of_light, to_linear
+from stickslip_training.reconstruction.silhouette import NoRodError, View, shrink_image, silhouette, to_linear
 from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
 
 CONTROL_POINTS = 44
@@ -172,10 +172,10 @@ def _silhouettes(
 def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: Floats) -> View:
     factor = int(np.ceil(max(image.shape[:2]) / LARGEST_IMAGE))
     light = shrink_image(to_linear(image), factor)
-    coverage = silhouette_of_light(light)
+    coverage = silhouette(light)
     again = int(_half_width(coverage) / WIDEST_ROD * 2.0)
     if again > 1:
-        factor, coverage = factor * again, silhouette_of_light(shrink_image(light, again))
+        factor, coverage = factor * again, silhouette(shrink_image(light, again))
     return View.of(camera, coverage, length=length, clamp=clamp, factor=factor)
 
 

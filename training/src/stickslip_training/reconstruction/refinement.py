@@ -83,7 +83,7 @@ def draw(view: View, index: int, fit: Fit, s: Floats, extra_blur: float = 0.0) -
 def refine(
     views: Sequence[View],
     fit: Fit,
-    direction: Floats | None,
+    direction: Floats,
     *,
     extra_blur: float = 0.0,
     shading: bool = True,
@@ -143,7 +143,7 @@ class _Problem:
         self,
         views: Sequence[View],
         fit: Fit,
-        direction: Floats | None,
+        direction: Floats,
         extra_blur: float,
         shading: bool,
         fixed_radius: bool,
@@ -230,7 +230,7 @@ class _Problem:
             J[:, 3 * K + 2 + nodes :] += N * side.by_slope[:, None]
         return J
 
-    def _linear_priors(self, direction: Floats | None) -> tuple[Floats, Floats]:
+    def _linear_priors(self, direction: Floats) -> tuple[Floats, Floats]:
         """Return rows A and targets b of the priors |A x - b|^2 that are linear in x."""
         K, (views, nodes) = self._K, self._shape
         size = len(self._free)
@@ -246,8 +246,7 @@ class _Problem:
             return rows
 
         add(on_axes(basis(np.zeros(1), K)[0] / CLAMP))
-        if direction is not None:
-            add(on_axes(basis(np.zeros(1), K, 1)[0] / CLAMP_TANGENT), direction / CLAMP_TANGENT)
+        add(on_axes(basis(np.zeros(1), K, 1)[0] / CLAMP_TANGENT), direction / CLAMP_TANGENT)
         intervals = K - 3
         for row in basis((np.arange(intervals) + 0.5) / intervals, K, 3):
             add(on_axes(row / JERK))

@@ -28,18 +28,13 @@ class NoRodError(ValueError):
     """The picture shows no rod: nothing stands out from its ground."""
 
 
-def silhouette(image: npt.ArrayLike) -> Floats:
-    """Return the coverage (y, x): 0 on the ground, about 1 on the rod, in between on its edge.
+def silhouette(light: Floats) -> Floats:
+    """Return the coverage (y, x) in a picture of linear light (y, x, channel): 0 on the ground, about 1 on the rod, in
+    between on its edge.
 
-    `image` is (y, x, rgb) or (y, x): sRGB in 8 or 16 bit, or floating numbers in [0, 1]. The ground must be darker than
-    the rod but need not be evenly so; the colour of the rod is found. Coverage is relative to the brightness of the rod
-    around the pixel, and may exceed 1 where the rod shines.
+    The ground must be darker than the rod but need not be evenly so; the colour of the rod is found. Coverage is
+    relative to the brightness of the rod around the pixel, and may exceed 1 where the rod shines.
     """
-    return silhouette_of_light(to_linear(image))
-
-
-def silhouette_of_light(light: Floats) -> Floats:
-    """Return the coverage (y, x) in a picture of linear light (y, x, channel)."""
     light = light - _ground(light)
     signal = _along_color(light)
     noise = 1.4826 * float(np.median(np.abs(signal - np.median(signal))))
@@ -59,7 +54,7 @@ def silhouette_of_light(light: Floats) -> Floats:
 
 
 def to_linear(image: npt.ArrayLike) -> Floats:
-    """Decode sRGB [IEC 61966-2-1] to linear light (y, x, channel)."""
+    """Decode sRGB [IEC 61966-2-1], 8 or 16 bit or floating numbers in [0, 1], to linear light (y, x, channel)."""
     pixels = np.asarray(image)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
