@@ -23,12 +23,8 @@ class JobState(StrEnum):
     @property
     def is_open(self) -> bool:
         """True until the job has ended."""
-        return self not in (
-            JobState.cancelled,
-            JobState.succeeded,
-            JobState.succeeded_with_rejects,
-            JobState.failed,
-        )
+        ended = (JobState.cancelled, JobState.succeeded, JobState.succeeded_with_rejects, JobState.failed)
+        return self not in ended
 
 
 class TaskState(StrEnum):
@@ -107,24 +103,15 @@ class Reason(StrEnum):
     @property
     def is_deterministic(self) -> bool:
         """True where a second try gives the same answer, so that the sample is rejected and not retried."""
-        return self in _OF_SAMPLE
+        return self not in _INFRASTRUCTURE | _OF_JOBS
 
 
-_OF_SAMPLE = {
-    Reason.solver_diverged,
-    Reason.out_of_frame,
-    Reason.invalid_sample,
-    Reason.poor_pictures,
-    Reason.not_finite,
-    Reason.jumps,
-    Reason.unconverged,
-    Reason.budget,
-    Reason.missed,
-    Reason.crossings,
-    Reason.contact_gain,
-    Reason.stretch,
-    Reason.penetration,
-    Reason.passages,
-    Reason.sharpness,
-}
 _ENDING = {Reason.exec_timeout, Reason.worker_lost, Reason.oom_killed, Reason.renderer_crash, Reason.process_crash}
+_INFRASTRUCTURE = {*_ENDING, Reason.storage_error, Reason.store_unavailable, Reason.internal_error}
+_OF_JOBS = {
+    Reason.cancelled,
+    Reason.failed_tasks,
+    Reason.quarantined,
+    Reason.waiting_for_worker,
+    Reason.preset_not_certified,
+}

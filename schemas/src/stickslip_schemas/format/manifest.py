@@ -11,6 +11,7 @@ these files shows.
 import json
 import re
 from collections.abc import Callable, Iterator
+from functools import cached_property, lru_cache
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -187,22 +188,13 @@ class Contents:
         self.manifest = manifest
         self._read = read
         self._samples = section_samples(manifest.spec) if manifest.sections else manifest.sample_count
-        # Each of these is replaced as a whole, so threads may share the object.
-        self._kept: dict[int, ManifestSection] = {}
-        self._root_files: dict[str, FileEntry] | None = None
-        self._section_files: tuple[int, dict[str, FileEntry]] = (-1, {})
+        # Caches that threads may share.
+        self.section = lru_cache(self.KEPT)(self._section)
+        self._files_of = lru_cache(1)(lambda number: {file.path: file for file in self.section(number).files})
 
     def number_of(self, slot: int) -> int:
         """Return the number of the section of a sample; 0 where all is in the manifest itself."""
         return slot // self._samples
-
-    def section(self, number: int) -> ManifestSection:
-        """Return a section; a manifest without sections is like one with one section, but for the files."""
-        kept = self._kept
-        found = kept.get(number) or self._section(number)
-        others = [item for item in kept.items() if item[0] != number]
-        self._kept = dict([(number, found), *others][: self.KEPT])
-        return found
 
     def sections(self) -> Iterator[ManifestSection]:
         for number in range(max(1, len(self.manifest.sections))):
@@ -217,22 +209,16 @@ class Contents:
 
     def file(self, path: str) -> FileEntry | None:
         """Return the file at a path of the version; None if it lists none. At most one section is read."""
-        own = self._root_files
-        if own is None:
-            own = self._root_files = {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}
-        found = own.get(path)
+        found = self._own_files.get(path)
         shard = _SHARD.match(path)
         if found is not None or shard is None or not self.manifest.sections:
             return found
         slot = int(shard[1]) * self.manifest.spec.samples_per_shard
-        if slot >= self.manifest.sample_count:
-            return None
-        number, files = self._section_files
-        if number != self.number_of(slot):
-            number = self.number_of(slot)
-            files = {file.path: file for file in self.section(number).files}
-            self._section_files = number, files
-        return files.get(path)
+        return self._files_of(self.number_of(slot)).get(path) if slot < self.manifest.sample_count else None
+
+    @cached_property
+    def _own_files(self) -> dict[str, FileEntry]:
+        return {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}
 
     def rejections(self) -> Iterator[Rejection]:
         """Yield the rejected samples, by slot."""
@@ -245,6 +231,7 @@ class Contents:
             yield from section.sample_keys
 
     def _section(self, number: int) -> ManifestSection:
+        """Return a section; a manifest without sections is like one with one section, but for the files."""
         manifest = self.manifest
         if not manifest.sections:
             return ManifestSection.model_construct(

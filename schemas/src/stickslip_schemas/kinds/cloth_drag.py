@@ -80,11 +80,9 @@ class ClothDragSpec(DragSceneSpec):
         return f"{group}, self-contact" if stage is Stage.simulate and self.self_friction is not None else group
 
     def simulation_settings(self) -> dict[str, Any]:
-        """Return the fields of the simulation document that are the same for all samples."""
         return super().simulation_settings() | {"self_friction": self.self_friction}
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        """Return the arrays of a dataset of dragged cloth."""
         return (
             *clip_arrays(self),
             *physical_arrays(self),

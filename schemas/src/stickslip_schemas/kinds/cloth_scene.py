@@ -255,7 +255,6 @@ class ClothSceneSpec(ClipSpec):
         return self._places.get(axis) or super().fields_of(axis)
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
-        """Return what a value of an axis puts into these fields."""
         return (
             dict.fromkeys(self._places[axis], value) if axis in self._places else super().document_fields(axis, value)
         )
@@ -266,11 +265,9 @@ class ClothSceneSpec(ClipSpec):
         return tuple(axis for axis in self.named_axes if axis not in left_out)
 
     def simulation_settings(self) -> dict[str, Any]:
-        """Return the fields of the simulation document that are the same for all samples."""
         return {"scene": self.stage.physics()}
 
     def render_settings(self) -> dict[str, Any] | None:
-        """Return the fields of the render document that are the same for all samples."""
         looks = self.stage.looks
         of_rig = (
             {"rig": looks.cameras, "rig_digest": rig_digest(looks.cameras)} if isinstance(looks.cameras, str) else {}
@@ -324,7 +321,6 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def certified_preset(self) -> str:
-        """Name of the preset whose certificate vouches for the samples."""
         return self.stage.preset.value
 
     @property
@@ -353,6 +349,5 @@ class ClothSceneSpec(ClipSpec):
         return ", ".join((self._cost_of_scene, *shown))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        """Return the arrays of a dataset of the scene."""
         labels = (parameter_label(self.stage, name) for name in self.stage.parameters if name in self.named_axes)
         return (*clip_arrays(self), *labels, *scene_arrays(self, self.stage))

@@ -84,11 +84,9 @@ class RodHangSpec(JobSpec):
         return False
 
     def simulation_settings(self) -> dict[str, Any]:
-        """Return the fields of the simulation document that are the same for all samples."""
         return {"poisson": self.poisson}
 
     def render_settings(self) -> dict[str, Any] | None:
-        """Return the fields of the render document that are the same for all samples; None renders nothing."""
         if self.views is None:
             return None
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
@@ -104,7 +102,6 @@ class RodHangSpec(JobSpec):
         return () if self.views is None else load_rig(self.views)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        """Return the arrays of a dataset of rods."""
         views = len(self.cameras())
         return (*_curves(), *(_views(views) if views else ()), *_labels())
 

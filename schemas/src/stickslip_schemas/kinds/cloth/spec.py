@@ -183,7 +183,6 @@ class ClipSpec(NamingSpec):
         return not self.allow_uncertified
 
     def render_settings(self) -> dict[str, Any] | None:
-        """Return the fields of the render document that are the same for all samples."""
         return {
             "quality": self.quality,
             "instants": self.shown_instants,
@@ -255,15 +254,12 @@ class ClothSpec(ClipSpec):
 
     @property
     def certified_preset(self) -> str:
-        """Name of the preset whose certificate vouches for the samples."""
         return self.preset.value
 
     def simulation_settings(self) -> dict[str, Any]:
-        """Return the fields of the simulation document that are the same for all samples."""
         return {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
 
     def render_settings(self) -> dict[str, Any] | None:
-        """Return the fields of the render document that are the same for all samples."""
         return (super().render_settings() or {}) | {"rig": self.rig, "rig_digest": rig_digest(self.rig)}
 
     def cameras(self) -> tuple[Camera, ...]:
