@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 import pytest
 from harness import wait_for
-from stickslip_workers.kinds import kind_names
+from stickslip_schemas.kinds import KINDS
 
 ROOT = Path(__file__).parents[1]
 PLACE = Path(os.environ.get("STICKSLIP_BUILD_PLACE", "/var/tmp"))
@@ -179,7 +179,7 @@ def test_nobody_is_root_and_nothing_can_be_changed(images: Images, name: str, da
 
 def test_the_worker_says_what_it_is(images: Images, data: Path) -> None:
     said = json.loads(run(*images.command("worker", data, images.entry("worker", "describe"))))
-    assert set(said["builds"]) == set(kind_names())
+    assert set(said["builds"]) == set(KINDS)
     written = run(*images.command("worker", data, ["cat", "/usr/share/doc/stickslip/builds.json"]))
     assert json.loads(written) == said
     blender = ["/opt/stickslip/.venv-blender/bin/python", "-c", "import bpy; print(bpy.app.version_string)"]

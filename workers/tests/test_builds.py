@@ -46,8 +46,9 @@ from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_workers.stages.run import StageActor
 actor = StageActor(sys.argv[2])
 import stickslip_sim_core, stickslip_workers.stages.simulate  # what is run at import is no work
-from stickslip_workers.kinds import kind, kind_names
-for name in kind_names():
+from stickslip_schemas.kinds import KINDS
+from stickslip_workers.kinds import kind
+for name in KINDS:
     kind(name)
 sys.setprofile(note)
 results = json.loads(actor.run(sys.argv[1]))
@@ -60,8 +61,9 @@ import sys
 import stickslip_workers.stages.run, stickslip_workers.stages.pack, stickslip_workers.stages.publish
 import stickslip_workers.stages.simulate
 from stickslip_schemas.store import DirectoryStore
-from stickslip_workers.kinds import kind, kind_names
-for name in kind_names():
+from stickslip_schemas.kinds import KINDS
+from stickslip_workers.kinds import kind
+for name in KINDS:
     kind(name)
 import stickslip_sim_core
 print("\\n".join(m.__file__ for n, m in list(sys.modules.items()) if n.startswith("stickslip_") and m.__file__))

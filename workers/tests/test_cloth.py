@@ -15,7 +15,7 @@ from PIL import Image
 from publishing import publish_task
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
-from stickslip_schemas.format.codecs import encode_clip, encode_trajectory
+from stickslip_schemas.format.codecs import encode_clip, encode_sample
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
@@ -24,6 +24,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpe
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS
+from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
@@ -324,11 +325,11 @@ def test_a_trajectory_is_encoded_once_for_all_its_renders(
 ) -> None:
     encoded = []
 
-    def count(data: np.ndarray[Any, Any]) -> bytes:
+    def count(array: ArrayLayout, data: np.ndarray[Any, Any]) -> bytes:
         encoded.append(data)
-        return encode_trajectory(data)
+        return encode_sample(array, data)
 
-    monkeypatch.setattr(pack_module, "encode_trajectory", count)
+    monkeypatch.setattr(pack_module, "encode_sample", count)
     for task in make_clips(per_shard=6).pack_tasks:
         pack(task, store)
     assert len(encoded) == 3

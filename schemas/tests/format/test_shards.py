@@ -6,13 +6,16 @@ from stickslip_schemas.format.codecs import (
     MISSING,
     CorruptChunkError,
     decode_chunk,
+    decode_sample,
     decode_shard_index,
-    decode_trajectory,
     encode_chunk,
+    encode_sample,
     encode_shard,
-    encode_trajectory,
     shard_index_size,
 )
+from stickslip_schemas.spec.arrays import ArrayLayout
+
+TRAJECTORY = ArrayLayout("positions", "float32", (100, 500, 3), ("t", "vertex", "xyz"), "", is_trajectory=True)
 
 
 def test_chunk_round_trip() -> None:
@@ -50,22 +53,22 @@ def smooth_trajectory() -> np.ndarray:
 
 def test_trajectory_round_trip() -> None:
     data = smooth_trajectory()
-    chunk = encode_trajectory(data)
-    assert chunk == encode_trajectory(np.asfortranarray(data))
+    chunk = encode_sample(TRAJECTORY, data)
+    assert chunk == encode_sample(TRAJECTORY, np.asfortranarray(data))
     assert len(chunk) < 0.8 * len(encode_chunk(data))
     out = np.empty_like(data)
-    decode_trajectory(chunk, out)
+    decode_sample(TRAJECTORY, chunk, out)
     assert np.array_equal(out, data)
 
 
 def test_a_broken_trajectory_is_refused() -> None:
     data = smooth_trajectory()
-    chunk = bytearray(encode_trajectory(data))
+    chunk = bytearray(encode_sample(TRAJECTORY, data))
     with pytest.raises(CorruptChunkError, match="decodes to 600000 bytes, and 594000 are expected"):
-        decode_trajectory(bytes(chunk), np.empty((99, 500, 3), dtype=np.float32))
+        decode_sample(TRAJECTORY, bytes(chunk), np.empty((99, 500, 3), dtype=np.float32))
     chunk[1000] ^= 1
     with pytest.raises(CorruptChunkError, match="crc32c of the chunk"):
-        decode_trajectory(bytes(chunk), np.empty_like(data))
+        decode_sample(TRAJECTORY, bytes(chunk), np.empty_like(data))
 
 
 def test_shard_index_points_at_the_chunks() -> None:

@@ -221,7 +221,7 @@ def _show_frames(over: threading.Event) -> None:
     from stickslip_workers import progress
 
     while not over.wait(FRAMES_SECONDS):
-        if (frames := progress.current()) is not None:
+        if (frames := progress.frames) is not None:
             sys.stderr.write(f"{frames[0]} of {frames[1]} frames\n")
 
 

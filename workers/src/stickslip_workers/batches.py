@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, Task, TaskResult
+from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, TaskResult, results_adapter, tasks_adapter
 from stickslip_schemas.documents.worker_api import Lease
+from stickslip_schemas.kinds import KINDS
 
-from stickslip_workers.kinds import kind, kind_names
+from stickslip_workers.kinds import kind
 from stickslip_workers.results import failure, merged, shading_of, split
-from stickslip_workers.stages.run import AnyTask
 
 STAGE_BYTES = {Stage.simulate: 2**28, Stage.render: 2**30, Stage.pack: 2**29, Stage.publish: 2**29}
 """Memory of a process without a mesh [bytes]. Measured: 152 MiB after 512 rods."""
@@ -29,11 +29,8 @@ ENOUGH_SECONDS = 2.0
 """Renders that share no shading are one call if they take so long together, and calls that wait here for each CPU are
 enough for twice as long [s]. A call costs 10 ms, a request for tasks too; but another dispatcher may have nothing."""
 
-LARGEST_BATCH = max(kind(name).batch for name in kind_names())
+LARGEST_BATCH = max(kind(name).batch for name in KINDS)
 """How many tasks to ask for at once at most: one call takes as many simulations."""
-
-_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
-_results = TypeAdapter(list[TaskResult])
 
 
 @dataclass(eq=False)
@@ -75,7 +72,7 @@ class Call:
         """Return what the process is given for each part: the renderer takes dicts, the stages JSON."""
         if self.stage is Stage.render:
             return [merged(_renders(part)).model_dump(mode="json") for part in self.parts]
-        return [_tasks.dump_json([lease.task for lease in part]).decode() for part in self.parts]
+        return [tasks_adapter.dump_json([lease.task for lease in part]).decode() for part in self.parts]
 
     def results(self, answers: list[Any]) -> Iterator[TaskResult]:
         """Yield the result of each task from the answers."""
@@ -84,7 +81,7 @@ class Call:
                 if self.stage is Stage.render:
                     yield from split(_renders(part), TaskResult.model_validate(answer))
                 else:
-                    yield from _results.validate_json(answer)
+                    yield from results_adapter.validate_json(answer)
             except ValidationError as error:
                 yield from [failure(error)] * len(part)
 

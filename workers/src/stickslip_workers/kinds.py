@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from stickslip_schemas.kinds import KINDS, kind_named
+from stickslip_schemas.kinds import kind_named
 
 if TYPE_CHECKING:
     from stickslip_sim_core.scenes.kind import Kind
@@ -27,7 +27,3 @@ def kind(name: str) -> "Kind":
     """
     found: Kind = import_module(scene_module(name)).KIND
     return found
-
-
-def kind_names() -> tuple[str, ...]:
-    return tuple(KINDS)

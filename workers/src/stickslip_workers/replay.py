@@ -5,12 +5,12 @@ import tempfile
 from pathlib import Path
 
 from stickslip_schemas.base.states import Reason
-from stickslip_schemas.documents.tasks import RenderTask, TaskResult
+from stickslip_schemas.documents.tasks import AnyTask, RenderTask, TaskResult
 from stickslip_schemas.store import open_store
 
 from stickslip_workers.results import failed
 from stickslip_workers.settings import RENDER_ACTOR
-from stickslip_workers.stages.run import AnyTask, run_tasks
+from stickslip_workers.stages.run import run_tasks
 
 # Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what it likes.
 _RENDER = """

@@ -143,7 +143,8 @@ class PublishOutput(Document):
     bytes: Int = Field(ge=0, description="size of all files of the version")
 
 
-Task = Annotated[SimulateTask | RenderTask | PackTask | PublishTask, Field(discriminator="stage")]
+AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
+Task = Annotated[AnyTask, Field(discriminator="stage")]
 Output = Annotated[SimulateOutput | RenderOutput | PackOutput | PublishOutput, Field(discriminator="stage")]
 
 
@@ -178,13 +179,13 @@ class TaskResult(Document):
         return self
 
 
-task_adapter: TypeAdapter[SimulateTask | RenderTask | PackTask | PublishTask] = TypeAdapter(Task)
+task_adapter: TypeAdapter[AnyTask] = TypeAdapter(Task)
 """Validates and dumps a task of any stage."""
+tasks_adapter: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
+results_adapter = TypeAdapter(list[TaskResult])
 
 
-def input_digests(
-    task: SimulateTask | RenderTask | PackTask | PublishTask, read: Callable[[Sha256], bytes]
-) -> tuple[Sha256, ...]:
+def input_digests(task: AnyTask, read: Callable[[Sha256], bytes]) -> tuple[Sha256, ...]:
     """Return the artifacts that a task needs; `read` reads artifacts that list others, which may be damaged or lost."""
     if isinstance(task, RenderTask):
         pictures = map(referred, task.textures or (task.render.variant,))

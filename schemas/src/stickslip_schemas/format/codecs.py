@@ -68,20 +68,6 @@ def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndar
     return Zstd().decode(frame, out)  # type: ignore[no-any-return]  # untyped library
 
 
-def encode_trajectory(data: np.ndarray) -> bytes:
-    """Return the encoded chunk of one sample's `data`, (frames, ..., k).
-
-    The axes are reversed, so that the values of one coordinate over time are neighbours, and bytes of one significance
-    are put together: the float32 positions of a dragged cloth then take half the space of a plain chunk.
-    """
-    return _packed(data.T, TRAJECTORY)
-
-
-def decode_trajectory(chunk: bytes, out: np.ndarray) -> None:
-    """Decode a chunk that `encode_trajectory` has made into all of `out`; raise CorruptChunkError."""
-    _unpack(chunk, out.T)
-
-
 def encode_clip(clip: np.ndarray) -> bytes:
     """Return the encoded chunk of a clip (frames, height, width, 3) of uint8."""
     return _packed(clip.transpose(_CLIP_ORDER), CLIP)
@@ -97,23 +83,30 @@ def decode_clip(chunk: bytes, out: np.ndarray) -> None:
 
 def encode_sample(array: ArrayLayout, values: np.ndarray) -> bytes:
     """Return the encoded chunk of one sample's values of an array."""
-    if array.is_clip:
-        return encode_clip(values)
-    return encode_trajectory(values) if array.is_trajectory else encode_chunk(values)
+    settings = packing(array)
+    return encode_chunk(values) if settings is None else _packed(_turned(array, values), settings)
 
 
 def decode_sample(array: ArrayLayout, chunk: bytes, out: np.ndarray) -> None:
     """Decode the chunk of one sample of an array into all of `out`; raise CorruptChunkError."""
-    if array.is_clip:
-        decode_clip(chunk, out)
-    elif array.is_trajectory:
-        decode_trajectory(chunk, out)
-    else:
+    if packing(array) is None:
         decode_chunk(chunk, out)
+    else:
+        _unpack(chunk, _turned(array, out))
+
+
+def _turned(array: ArrayLayout, values: np.ndarray) -> np.ndarray:
+    """Return a view of one sample's values with the axes in the order of its chunk."""
+    turned: np.ndarray = values[None].transpose(axes_order(array))[0]
+    return turned
 
 
 def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
-    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None: not at all."""
+    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None: not at all.
+
+    Those of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate over time are neighbours,
+    and bytes of one significance are put together: float32 positions then take half the space of a plain chunk.
+    """
     if array.is_clip:
         return (0, *(1 + axis for axis in _CLIP_ORDER))
     return (0, *range(len(array.shape), 0, -1)) if array.is_trajectory else None

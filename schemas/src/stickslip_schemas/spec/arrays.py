@@ -45,9 +45,9 @@ class ArrayLayout:
     categories: tuple[str, ...] = ()
     """Names of the codes 0, 1, ... of a categorical label."""
     is_trajectory: bool = False
-    """True where the first dimension of a sample is time and the values change slowly: coded by `encode_trajectory`."""
+    """True where the first dimension of a sample is time and the values change slowly: coded as a trajectory."""
     is_clip: bool = False
-    """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded by `encode_clip`."""
+    """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded as a clip."""
     attributes: dict[str, Any] = field(default_factory=dict, hash=False)
     """What else the Zarr array says of itself."""
 

@@ -3,23 +3,16 @@
 Labels are no files yet: the task that publishes writes those of many shard groups into one file.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.documents.tasks import PackOutput, PackSlot, PackTask, RecordRef, TaskResult
-from stickslip_schemas.format.codecs import check_chunk, encode_chunk, encode_shard, encode_trajectory
+from stickslip_schemas.documents.tasks import PackOutput, PackSlot, PackTask, RecordRef
+from stickslip_schemas.format.codecs import check_chunk, encode_chunk, encode_sample, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 
 from stickslip_workers.stages.records import Array, Records
-
-
-def run(tasks: Sequence[PackTask], store: Store) -> list[TaskResult]:
-    """Run pack tasks, one after the other."""
-    return [TaskResult(outcome="succeeded", output=pack(task, store)) for task in tasks]
 
 
 def pack(task: PackTask, store: Store) -> PackOutput:
@@ -109,7 +102,7 @@ class _Shard:
         """Return the encoded chunk of a trajectory; the renders of one simulation share it."""
         key = array.name, record
         if key not in self._trajectories:
-            self._trajectories[key] = encode_trajectory(self._recorded(array, record))
+            self._trajectories[key] = encode_sample(array, self._recorded(array, record))
         return self._trajectories[key]
 
     def _recorded(self, array: ArrayLayout, record: RecordRef) -> Array:

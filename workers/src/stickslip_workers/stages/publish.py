@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.keys import canonical_json
-from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask, TaskResult
+from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
 from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.format.manifest import (
@@ -35,11 +35,6 @@ from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, PREVIEW_NAME, card, pictured, preview
 from stickslip_workers.stages.metadata import metadata_files
-
-
-def run(tasks: Sequence[PublishTask], store: Store) -> list[TaskResult]:
-    """Run publish tasks, one after the other."""
-    return [TaskResult(outcome="succeeded", output=publish(task, store)) for task in tasks]
 
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:

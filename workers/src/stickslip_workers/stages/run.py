@@ -5,27 +5,13 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from pydantic import TypeAdapter
 from stickslip_schemas.base.states import Reason
-from stickslip_schemas.documents.tasks import (
-    PackTask,
-    PublishTask,
-    RenderTask,
-    SimulateTask,
-    Task,
-    TaskResult,
-    input_digests,
-)
+from stickslip_schemas.documents.tasks import AnyTask, TaskResult, input_digests, results_adapter, tasks_adapter
+from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.store import Store, in_parallel, open_store
 
 from stickslip_workers import builds, progress
-from stickslip_workers.kinds import kind_names
 from stickslip_workers.results import failure
-
-AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
-
-_tasks: TypeAdapter[list[AnyTask]] = TypeAdapter(list[Task])
-_results = TypeAdapter(list[TaskResult])
 
 
 class StageActor:
@@ -37,21 +23,20 @@ class StageActor:
     def describe(self) -> dict[str, Any]:
         """Return the builds of each kind, and versions of libraries."""
         return {
-            "builds": {name: builds.kind_builds(name) for name in kind_names()},
+            "builds": {name: builds.kind_builds(name) for name in KINDS},
             "versions": builds.versions(),
         }
 
     def run(self, tasks: str) -> str:
         """Run tasks, see `run_tasks`."""
-        progress.clear()
         try:
-            return _results.dump_json(run_tasks(_tasks.validate_json(tasks), self._store)).decode()
+            return results_adapter.dump_json(run_tasks(tasks_adapter.validate_json(tasks), self._store)).decode()
         finally:
-            progress.clear()
+            progress.frames = None
 
     def frames(self) -> tuple[int, int] | None:
         """Return the progress of the running simulation, (frames done, frames total); another thread may call it."""
-        return progress.current()
+        return progress.frames
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
@@ -63,7 +48,7 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     try:
         results = _run(tasks, store)
     except Exception as error:
-        results = [_failure(error, task, store) for task in tasks]
+        results = [with_damaged_inputs(failure(error), task, store) for task in tasks]
     share = {
         "cpu_seconds": (time.process_time() - cpu) / len(tasks),
         "wall_seconds": (time.perf_counter() - wall) / len(tasks),
@@ -71,29 +56,24 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     return [result.model_copy(update=share) for result in results]
 
 
-def damaged_inputs(task: AnyTask, store: Store) -> tuple[str, ...]:
-    """Return the artifacts that `task` reads and that are damaged or not in the store. Reads all of them."""
-    digests = input_digests(task, store.read)
-    return tuple(digest for digest, whole in zip(digests, in_parallel(store.holds, digests), strict=True) if not whole)
-
-
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
     """Return the result of a failed task with the digests of its damaged inputs, so that they are recomputed at once.
 
-    While the store is unavailable, inputs cannot be checked.
+    All inputs are read. While the store is unavailable, they cannot be checked.
     """
     if result.reason is Reason.store_unavailable:
         return result
-    return result.model_copy(update={"damaged_inputs": damaged_inputs(task, store)})
-
-
-def _failure(error: Exception, task: AnyTask, store: Store) -> TaskResult:
-    """Return the result of a task that raised."""
-    return with_damaged_inputs(failure(error), task, store)
+    digests = input_digests(task, store.read)
+    are_whole = in_parallel(store.holds, digests)
+    damaged = tuple(digest for digest, is_whole in zip(digests, are_whole, strict=True) if not is_whole)
+    return result.model_copy(update={"damaged_inputs": damaged})
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     """Call the module of the stage, imported here: packing needs no simulator."""
     (stage,) = {task.stage for task in tasks}
-    results: list[TaskResult] = import_module(f"stickslip_workers.stages.{stage}").run(tasks, store)
-    return results
+    work = getattr(import_module(f"stickslip_workers.stages.{stage}"), stage)
+    if stage == "simulate":
+        results: list[TaskResult] = work(tasks, store)
+        return results
+    return [TaskResult(outcome="succeeded", output=work(task, store)) for task in tasks]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stickslip_sim_core.scenes.kind import Outcome
 
 
-def run(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
+def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     """Simulate tasks of one kind together; return one result for each.
 
     Raises:
