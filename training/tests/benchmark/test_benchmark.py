@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
     """A folder of sets of its own."""
     path = tmp_path / "sets"
     path.mkdir()
-    monkeypatch.setattr(sets, "_folder", lambda: path)
+    monkeypatch.setattr(sets, "SETS", path)
     return path
 
 

@@ -2,8 +2,6 @@
 
 import re
 from functools import cache
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,9 @@ import yaml
 
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.fabrics import did_you_mean
+
+SCENES = Path(__file__).parents[1] / "scenes"
+"""Folder of the built-in scenes."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -40,26 +41,22 @@ def parse_yaml(text: str) -> Any:
     return yaml.load(text, _Loader)
 
 
-def _folder() -> Traversable:
-    return files("stickslip_schemas").joinpath("scenes")
-
-
 @cache
 def scene_names() -> tuple[str, ...]:
     """Name the built-in scenes."""
-    return tuple(sorted(Path(file.name).stem for file in _folder().iterdir() if file.name.endswith(".yaml")))
+    return tuple(sorted(file.stem for file in SCENES.glob("*.yaml")))
 
 
 @cache
 def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
     """Return a built-in scene, and its files by digest."""
-    text = _folder().joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+    text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
     scene = Scene.model_validate({"name": name, **parse_yaml(text)})
     if not any(scene.files()):
         return scene, {}
     from stickslip_schemas.scene.files import inlined  # needs the extra `arrays`
 
-    return inlined(scene, lambda file: _folder().joinpath(file).read_bytes())
+    return inlined(scene, lambda file: (SCENES / file).read_bytes())
 
 
 def load_scene(name: str) -> Scene:

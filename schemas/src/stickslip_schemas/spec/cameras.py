@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from operator import mul
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +29,9 @@ if TYPE_CHECKING:
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
+
+RIGS = Path(__file__).parents[1] / "rigs"
+"""Folder of the rigs that this package ships."""
 
 ROTATION_TOLERANCE = 1e-6  # of R R^T - 1: calibration files print six digits or more
 
@@ -162,23 +163,19 @@ class _Rig(Document):
         return cameras
 
 
-_RIGS: TypeAdapter[dict[str, _Rig]] = TypeAdapter(dict[str, _Rig])
-
-
-def _parse_rigs(text: str) -> dict[str, tuple[Camera, ...]]:
-    data: dict[str, Any] = tomllib.loads(text)
-    return {name: rig.cameras for name, rig in _RIGS.validate_python(data).items()}
+_RIG_FILE: TypeAdapter[dict[str, _Rig]] = TypeAdapter(dict[str, _Rig])
 
 
 def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
     """Read the rigs of a calibration file, laid out as those in this package's folder `rigs`."""
-    return _parse_rigs(Path(path).read_text(encoding="utf-8"))
+    data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    return {name: rig.cameras for name, rig in _RIG_FILE.validate_python(data).items()}
 
 
 @cache
 def rig_names() -> tuple[str, ...]:
     """Name the rigs that this package ships."""
-    return tuple(sorted(Path(file.name).stem for file in _rig_folder().iterdir() if file.name.endswith(".toml")))
+    return tuple(sorted(file.stem for file in RIGS.glob("*.toml")))
 
 
 @cache
@@ -186,11 +183,7 @@ def load_rig(name: str) -> tuple[Camera, ...]:
     """Return the cameras of one of the shipped rigs, in the order in which their views are stored."""
     if name not in rig_names():
         raise ValueError(f"rig must be one of {', '.join(rig_names())}; got {name!r}")
-    return _parse_rigs((_rig_folder() / f"{name}.toml").read_text(encoding="utf-8"))[name]
-
-
-def _rig_folder() -> Traversable:
-    return files("stickslip_schemas").joinpath("rigs")
+    return read_rigs(RIGS / f"{name}.toml")[name]
 
 
 @cache

@@ -12,8 +12,8 @@ from those on a set that was remade.
 
 import json
 from dataclasses import dataclass
-from importlib.resources import files
 from io import BytesIO
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -27,6 +27,8 @@ from stickslip_training.benchmark.rods import RodTask
 from stickslip_training.benchmark.task import Task
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
+
+SETS = Path(__file__).parent / "sets"
 
 TASKS: dict[str, Task] = {"cloth_drag": ClothTask(), "rod_hang": RodTask()}
 """By kind of dataset."""
@@ -86,15 +88,15 @@ class NamedSet:
 
 
 def set_names() -> tuple[str, ...]:
-    return tuple(sorted(file.name.removesuffix(".json") for file in _folder().iterdir() if file.name.endswith(".json")))
+    return tuple(sorted(file.stem for file in SETS.glob("*.json")))
 
 
 def load_set(name: str) -> NamedSet:
     """Return a set; raise ValueError if the name is unknown."""
     if name not in set_names():
         raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name!r}")
-    document = json.loads((_folder() / f"{name}.json").read_text(encoding="utf-8"))
-    with np.load(BytesIO((_folder() / f"{name}.npz").read_bytes())) as file:
+    document = json.loads((SETS / f"{name}.json").read_text(encoding="utf-8"))
+    with np.load(SETS / f"{name}.npz") as file:
         seen = {each: file[each] for each in file.files}
     return NamedSet(
         name=name,
@@ -125,7 +127,3 @@ def frozen(
 def labels_digest(task: Task, reader: DatasetReader, slots: Integers) -> str:
     """Return the SHA-256 of the labels of slots."""
     return sha256(canonical_json(task.labels(reader, slots)).encode())
-
-
-def _folder() -> Any:
-    return files("stickslip_training.benchmark") / "sets"

@@ -31,7 +31,7 @@ class FitSettings:
     """Settings of a run."""
 
     steps: int
-    epoch: int
+    epoch: int = 1
     """Steps after which the network is validated and a report made."""
     seed: int = 0
     averaging: float = 0.0

@@ -1,7 +1,7 @@
 """Train the curvature network of the thesis on a dataset of rods, and measure it against what needs no learning."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +28,17 @@ _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apar
 
 
 @dataclass(frozen=True, kw_only=True)
-class CurvatureTraining:
-    """Settings of a run."""
+class CurvatureTraining(FitSettings):
+    """Settings of a run; an epoch is a pass over the training rods."""
 
     dataset: str
     """Directory or URL of a dataset of rods."""
     out: Path
     """Directory for the model, the checkpoint and the report."""
     steps: int = 1000
-    """Of training, with a batch each; every pass over the training rods ends with a validation."""
+    """Of training, with a batch each."""
     noise: float = 0.005
     """Standard deviation of the white noise on every coordinate of the centreline [L], in training and evaluation."""
-    seed: int = 0
     batch_size: int = 16
     """After six passes over 1,985 rods, 16 had a test loss of 0.50 rad, and 64 of 1.75."""
     learning_rate: float = 1.0
@@ -51,30 +50,16 @@ class CurvatureTraining:
     Not in the thesis. Steps of Adadelta at this rate do not get smaller, and leave the network a constant off, now this
     way, now that: the average had half the error and less of the last weights (README).
     """
-    threads: int = 2
-    device: str = "cpu"
-    """Of torch."""
     evaluation_rods: int = 1000
     """The most test rods that are evaluated; the first of the split are taken."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_positive(self, "batch_size", "learning_rate", "evaluation_rods")
         if not 0 <= self.noise < 1:
             raise ValueError(f"noise must be a share of L, from 0 to less than 1, and is {self.noise}")
         if not 0 < self.decay < 1:
             raise ValueError(f"decay must be between 0 and 1, and is {self.decay}")
-        self.fit_settings(1)  # checks the others
-
-    def fit_settings(self, steps_per_epoch: int) -> FitSettings:
-        """Return the settings of the training loop."""
-        return FitSettings(
-            steps=self.steps,
-            epoch=steps_per_epoch,
-            seed=self.seed,
-            averaging=self.averaging,
-            threads=self.threads,
-            device=self.device,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,8 +104,8 @@ def train_curvature(
     learner = _CurvatureLearner(config, rods["train"], rods["validation"])
     names = ("noise", "batch_size", "learning_rate", "decay")
     identity = {"manifest": digest, **{name: getattr(config, name) for name in names}}
-    settings = config.fit_settings(learner.steps_per_epoch)
-    fitted = fit(learner, settings, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
+    config = replace(config, epoch=learner.steps_per_epoch)
+    fitted = fit(learner, config, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
     with torch_threads(config.threads):
         noisy = noisy_test_centerline(rods["test"], config.noise, config.seed)
         methods, test_loss = evaluate(fitted.net, rods["test"], noisy)
