@@ -4,6 +4,8 @@ Its digest is over everything but `environment` and the densely drawn curves: th
 give the same certificate.
 """
 
+import math
+from collections.abc import Iterable
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -77,16 +79,12 @@ class ProtocolReport(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        errors = [error for curve in self.curves for error in curve.errors]
-        finite = [abs(error) for error in errors if error is not None]
-        largest = max(finite) if errors and len(finite) == len(errors) else None
+        largest = _largest(error for curve in self.curves for error in curve.errors)
         if self.error != largest:
             raise ValueError(f"error must be the largest of the curves' errors, {largest}, and it is {self.error}")
         within = self.error is not None and self.error <= self.tolerance
         if self.limit_tolerance is not None:
-            of_limits = [error for curve in self.curves for error in curve.limit_errors]
-            known = [abs(error) for error in of_limits if error is not None]
-            largest = max(known) if of_limits and len(known) == len(of_limits) else None
+            largest = _largest(error for curve in self.curves for error in curve.limit_errors)
             if self.limit_error != largest:
                 raise ValueError(f"limit_error must be the largest of the limits' errors, {largest}")
             within = within and self.limit_error is not None and self.limit_error <= self.limit_tolerance
@@ -95,6 +93,12 @@ class ProtocolReport(Document):
         if self.passed != (within and not self.message):
             raise ValueError("passed must say whether the errors are within their tolerances")
         return self
+
+
+def _largest(errors: Iterable[float | None]) -> float | None:
+    """Return the largest |error|; None where one is infinite, or there is none."""
+    largest = max((math.inf if error is None else abs(error) for error in errors), default=math.inf)
+    return None if largest == math.inf else largest
 
 
 class Certificate(Document):

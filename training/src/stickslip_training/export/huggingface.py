@@ -7,7 +7,6 @@ categorical label with its names.
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.arrays import Array
@@ -63,23 +62,12 @@ def _column(values: Array, kind: Any) -> Any:
     """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the further axes."""
     import pyarrow
 
-    storage = kind.storage_type if isinstance(kind, pyarrow.ExtensionType) else kind
-    column = _nested(values, storage)
-    return pyarrow.ExtensionArray.from_storage(kind, column) if storage is not kind else column
-
-
-def _nested(values: Array, kind: Any) -> Any:
-    import pyarrow
-    import pyarrow.types
-
-    if values.ndim == 1:
-        return pyarrow.array(values).cast(kind)
-    inner = _nested(values.reshape(-1, *values.shape[2:]), kind.value_type)
-    if pyarrow.types.is_fixed_size_list(kind):
-        return pyarrow.FixedSizeListArray.from_arrays(inner, type=kind)
-    ends = np.arange(len(values) + 1, dtype=np.int64) * values.shape[1]
-    offsets = pyarrow.array(ends, type=pyarrow.int64() if pyarrow.types.is_large_list(kind) else pyarrow.int32())
-    return type(pyarrow.array([], kind)).from_arrays(offsets, inner, type=kind)
+    column = pyarrow.array(values.reshape(-1))
+    for size in values.shape[:0:-1]:
+        column = pyarrow.FixedSizeListArray.from_arrays(column, size)
+    if not isinstance(kind, pyarrow.ExtensionType):
+        return column.cast(kind)
+    return pyarrow.ExtensionArray.from_storage(kind, column.cast(kind.storage_type))
 
 
 def _card(content: Content, splits: list[str]) -> str:

@@ -101,17 +101,18 @@ def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
         codes("material", spec.names("material")),
         array("mu", "friction coefficient"),
         *(factor for factor in factors if factor.name in spec.named_axes),
-        array("areal_density", "mass per area [kg/m^2]"),
-        array(
-            "bending_rigidity",
-            "plate rigidities along the warp, along the weft, and of twist [N m]",
-            of={"direction": 3},
-        ),
-        array(
-            "stretching_stiffness",
-            "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
-            of={"coefficient": 4},
-        ),
+        *fabric_arrays(),
+    )
+
+
+def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
+    """Return the labels of the numbers of a fabric, whose names begin with a prefix."""
+    rigidity = "plate rigidities along the warp, along the weft, and of twist [N m]"
+    stiffness = "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]"
+    return (
+        array(f"{prefix}areal_density", "mass per area [kg/m^2]"),
+        array(f"{prefix}bending_rigidity", rigidity, of={"direction": 3}),
+        array(f"{prefix}stretching_stiffness", stiffness, of={"coefficient": 4}),
     )
 
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from stickslip_schemas.kinds.cloth.arrays import codes, over_time, solver_arrays
+from stickslip_schemas.kinds.cloth.arrays import codes, fabric_arrays, over_time, solver_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.arrays import ArrayLayout, array
@@ -38,20 +38,7 @@ def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
 
 def _sheet_labels(scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
     hung = array(f"{sheet}.tilt", "lean of gravity along the normal as it came to hang, over gravity")
-    return (
-        array(f"{sheet}.areal_density", "mass per area [kg/m^2]"),
-        array(
-            f"{sheet}.bending_rigidity",
-            "plate rigidities along the warp, along the weft, and of twist [N m]",
-            of={"direction": 3},
-        ),
-        array(
-            f"{sheet}.stretching_stiffness",
-            "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]",
-            of={"coefficient": 4},
-        ),
-        *((hung,) if scene.sheets[sheet].start.type == "hung" else ()),
-    )
+    return (*fabric_arrays(f"{sheet}."), *((hung,) if scene.sheets[sheet].start.type == "hung" else ()))
 
 
 def _tracks(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
