@@ -30,7 +30,6 @@ from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
-from stickslip_schemas.scene.looks import View
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate
 from stickslip_schemas.spec.arrays import ArrayLayout
@@ -284,32 +283,32 @@ class ClothSceneSpec(ClipSpec):
             **floor,
         }
 
+    @cached_property
+    def _own(self) -> Mapping[str, Mapping[str, Any]]:
+        """What the scene defines names to be, by axis."""
+        looks = self.stage.looks
+        return {
+            "viewpoint": looks.cameras if isinstance(looks.cameras, dict) else {},
+            "lighting": {OF_SCENE: looks.light} if isinstance(looks.light, LampNumbers) else {},
+            "substrate": {OF_SCENE: looks.floor} if isinstance(looks.floor, FloorNumbers) else {},
+        }
+
     def built_in(self, axis: str) -> tuple[str, ...]:
         """Return the names that an axis may use without a definition in the spec: those of the scene, too."""
-        looks = self.stage.looks
-        if axis == "viewpoint":
-            rig = [camera.name for camera in load_rig(looks.cameras)] if isinstance(looks.cameras, str) else FRAMING
-            return tuple(looks.cameras if isinstance(looks.cameras, dict) else rig)
-        is_own = {"lighting": isinstance(looks.light, LampNumbers), "substrate": isinstance(looks.floor, FloorNumbers)}
-        return (*super().built_in(axis), *((OF_SCENE,) if is_own.get(axis) else ()))
+        cameras = self.stage.looks.cameras
+        if axis == "viewpoint" and not isinstance(cameras, dict):
+            return tuple(FRAMING if cameras is None else (camera.name for camera in load_rig(cameras)))
+        return (*super().built_in(axis), *self._own.get(axis, {}))
 
     def meaning(self, axis: str, name: str) -> Any:
         """Return what the spec or the scene has defined a name of an axis to be."""
-        looks = self.stage.looks
-        views: dict[str, View] = looks.cameras if isinstance(looks.cameras, dict) else {}
-        own: dict[str, Mapping[str, Any]] = {
-            "viewpoint": views,
-            "lighting": {OF_SCENE: looks.light},
-            "substrate": {OF_SCENE: looks.floor},
-        }
-        return super().meaning(axis, name) or own.get(axis, {}).get(name)
+        return super().meaning(axis, name) or self._own.get(axis, {}).get(name)
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras by name, but for those that frame what moves: each sample has its own of them."""
         given = self.stage.looks.cameras
         rig = load_rig(given) if isinstance(given, str) else ()
-        views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
-        return (*rig, *views, *(camera.camera(name) for name, camera in self.viewpoints.items()))
+        return (*rig, *(view.camera(name) for name, view in {**self._own["viewpoint"], **self.viewpoints}.items()))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:

@@ -39,20 +39,17 @@ class Record:
         write_durably(path, (json.dumps(_rounded(asdict(self)), indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_answers(path: Path) -> tuple[list[Any], str]:
-    """Return the answers of a file, and its SHA-256; raise ValueError where it holds no list."""
-    data = path.read_bytes()
-    answers = json.loads(data)
-    if not isinstance(answers, list):
-        raise ValueError(f"{path} must hold a list of answers, and holds a {type(answers).__name__}")
-    return answers, sha256(data)
-
-
 def enter(
     name: str, answers: Path, dataset: str, *, method: str, by: str, trained_on: str, link: str | None = None
 ) -> Record:
-    """Score a file of answers to the test set `name`; raise ValueError where the dataset is not that set."""
-    answered, digest = read_answers(answers)
+    """Score a file of answers to the test set `name`.
+
+    Raises ValueError where the file holds no list, or the dataset is not that set.
+    """
+    data = answers.read_bytes()
+    answered = json.loads(data)
+    if not isinstance(answered, list):
+        raise ValueError(f"{answers} must hold a list of answers, and holds a {type(answered).__name__}")
     chosen = load_set(name)
     with DatasetReader(dataset) as reader:
         slots, making = chosen.check(reader)
@@ -66,7 +63,7 @@ def enter(
         link=link,
         making=making,
         manifest=manifest,
-        predictions=digest,
+        predictions=sha256(data),
         scores=_rounded(scores),
     )
 

@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -11,6 +11,7 @@ from rich.table import Table
 
 from stickslip_training.cli.errors import readable_errors
 from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.version import Split
 
 NO_ANSWER = 3
 """Exit status of `predict` where no clip has an answer."""
@@ -128,7 +129,7 @@ def predict(
                 if value is not None:
                     raise ValueError(f"{name} must come with --camera: clips of a dataset have times; it is {value}")
             with DatasetReader(source) as reader:
-                clips, found = read_clips(reader, None if split is None else _split(split), friction.materials)
+                clips, found = read_clips(reader, cast("Split | None", split), friction.materials)
                 names = reader.categories("material")
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
@@ -156,11 +157,3 @@ def _answers(answers: list[dict[str, Any]], true: list[str]) -> Table:
             cells = [f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
         table.add_row(str(answer["slot"]), *cells, *true[place : place + 1], f"{answer['familiarity']:.2f}")
     return table
-
-
-def _split(name: str) -> Any:
-    from stickslip_schemas.spec.arrays import SPLITS
-
-    if name not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {name!r}")
-    return name
