@@ -2,7 +2,7 @@
 
     python benchmarks/training/gaussian_process.py TRAIN.npz CLIPS.npz ... [--seed 0]
 
-TRAIN.npz is a packed file of `cloth_runs.py`; CLIPS.npz are of `blender_clips.py`, of simulations of its test split.
+TRAIN.npz is a packed file of `cloth_runs.py`; CLIPS.npz are of `blender_clips.py`, of other simulations.
 Training clips are rendered in torch in drawn worlds. The mask network of the package finds the cloth in all clips. The
 process sees 40 principal components of the six silhouettes at 4 x 4 pixels, and the direction of view.
 
@@ -24,11 +24,11 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
 from stickslip_training.arrays import Array, Floats
-from stickslip_training.cloth.clips import SHARES, Clips, clips_of_file, render_clips
+from stickslip_training.cloth.clips import Clips, clips_of_file, render_clips
 from stickslip_training.cloth.evaluation import errors
 from stickslip_training.cloth.model import FrictionModel, load_friction, silhouettes
 from stickslip_training.cloth.posterior import MU_BINS, SHARE, Estimates
-from stickslip_training.cloth.runs import load_runs, split_of_runs, split_runs
+from stickslip_training.cloth.runs import load_runs
 
 COMPONENTS = 40
 RENDERS = 6
@@ -105,23 +105,19 @@ def main() -> None:
     """Print the errors on the test split of the packed file, and on each file of clips."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("runs", type=Path)
-    parser.add_argument("clips", type=Path, nargs="*")
+    parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     torch.set_num_threads(1)
     started, model = time.process_time(), load_friction()
-    train, _, test = split_runs(load_runs(args.runs).named(model.materials), SHARES, args.seed)
+    train = load_runs(args.runs).named(model.materials)
     reader = Reader.of(model, render_clips(train, RENDERS, args.seed, drawn_world=True))
     fitted = reader.process
     print(f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise {fitted.noise:.3g}")
-    shown = {"unseen runs, torch": render_clips(test, RENDERS, args.seed + 99, drawn_world=True)}
-    shown |= {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
-    split = split_of_runs(load_runs(args.runs), SHARES, args.seed)
-    for path in args.clips:
-        if (split[shown[path.stem].run] != 2).any():
-            raise ValueError(f"{path} must show simulations of the test split alone")
-    if args.clips:
-        shown["all files"] = Clips.joined([shown[path.stem] for path in args.clips])
+    shown = {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
+    shown["all files"] = Clips.joined(list(shown.values()))
+    if set(shown["all files"].mu.tolist()) & set(train.mu.tolist()):
+        raise ValueError(f"{', '.join(map(str, args.clips))} must show no simulation of {args.runs}")
     for name, clips in shown.items():
         told = errors(reader.read(clips), clips.mu, clips.run)
         parts = {key: round(getattr(told, key).value, 3) for key in ("mae", "within_01", "within_02", "coverage")}

@@ -44,11 +44,16 @@ def clips(make_clips):
 
 @pytest.mark.physics
 def test_train_and_resume(packed, tmp_path):
-    with np.load(packed) as file:  # every fourth simulation: most of the time goes into pictures for validation
+    with np.load(packed) as file:
         arrays = dict(file)
-    arrays["differences"], arrays["about"] = arrays["differences"][:, ::4], arrays["about"][::4]
-    np.savez(tmp_path / "some.npz", **arrays)
-    run = ["cloth", "train", str(tmp_path / "some.npz"), "--out", str(tmp_path / "run"), "--threads", "1"]
+    for name, some in (("train", slice(0, None, 4)), ("validation", slice(1, None, 16))):
+        part = {"differences": arrays["differences"][:, some], "about": arrays["about"][some]}
+        np.savez(tmp_path / f"{name}.npz", **arrays | part)
+    alone = ["cloth", "train", str(tmp_path / "train.npz"), "--out", str(tmp_path / "run"), "--threads", "1"]
+    refused = runner.invoke(app, alone)
+    assert refused.exit_code == 1
+    assert "validation must be a packed file of simulations" in " ".join(refused.stderr.split())
+    run = [*alone, "--validation", str(tmp_path / "validation.npz")]
     trained = runner.invoke(app, [*run, "--steps", "2"])
     assert trained.exit_code == 0, trained.output
     assert "step 2 of 2: loss" in trained.output

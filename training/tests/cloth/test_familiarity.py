@@ -5,7 +5,6 @@ import pytest
 from stickslip_training.cloth.clips import INSTANTS, render_clips
 from stickslip_training.cloth.familiarity import ALARMS, UNKNOWN, Familiarity, hanging, holders_at, pooled, reordered
 from stickslip_training.cloth.model import load_friction
-from stickslip_training.cloth.runs import split_runs
 
 pytestmark = pytest.mark.physics  # pictures are rendered
 
@@ -23,8 +22,8 @@ def silhouettes(clips):
     return pooled(clips.cover).numpy()
 
 
-def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few):
-    train, judged, _ = split_runs(few, (0.3, 0.0), 0)
+def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split_runs):
+    train, judged, _ = split_runs(few, 0.3, 0.0)
     good = silhouettes(render_clips(judged, 8, 1, drawn_world=True))
     known = Familiarity.of(train, INSTANTS, 2, good)
     share, reasons = known.judge(good)

@@ -4,21 +4,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stickslip_training.cli import app
 from stickslip_training.cloth.calibration import covering_temperature, likeliest_temperatures
-from stickslip_training.cloth.clips import INSTANTS, SHARES, Clips, RenderedClips, clips_of_file, jittered, render_clips
+from stickslip_training.cloth.clips import (
+    INSTANTS,
+    Clips,
+    RenderedClips,
+    clips_of_file,
+    jittered,
+    render_clips,
+    training_clips,
+)
 from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
 from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
 from stickslip_training.cloth.posterior import MU_BINS
-from stickslip_training.cloth.runs import split_of_runs, split_runs
-from typer.testing import CliRunner
 
 SMALL = ClothTraining(steps=6, batch_size=2, width=16)
 
 
 @pytest.fixture(scope="module")
-def few(runs):
-    train, validation, test = split_runs(runs, (0.12, 0.25), 0)
+def few(runs, split_runs):
+    train, validation, test = split_runs(runs, 0.12, 0.25)
     return train[np.arange(9)], validation[np.arange(2)], test[np.arange(2)]
 
 
@@ -117,6 +122,8 @@ def test_intervals_of_a_network_that_is_twice_too_sure_become_twice_as_wide():
     ("changes", "message"),
     [
         ({"steps": 0}, "steps must be more than 0 and finite, and is 0"),
+        ({"repeats": 0}, "repeats must be more than 0 and finite, and is 0"),
+        ({"dropout": 1.0}, "dropout must be from 0 to less than 1, and is 1.0"),
         ({"turn": -1.0}, "turn must be 0 or more and finite, and is -1"),
         ({"device": "toaster"}, "device must be one that torch can use here"),
     ],
@@ -154,22 +161,43 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_p
 
 
 @pytest.mark.physics
-def test_half_of_each_batch_is_of_the_clips_and_some_of_them_are_mirrored(few):
+def test_half_of_each_batch_is_of_the_clips(few):
     clips = some_clips(few)
     known = replace(clips.train, mu=np.full(18, 9.0))
     learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16), RenderedClips(known, clips.validation))
-    crops, direction, material, mu, cover = learner.batch(0)
+    crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 16
     assert (mu == 9.0).tolist() == [False] * 8 + [True] * 8
 
-    def likest(flipped):
-        """Return how far each cover is from the nearest of the clips."""
-        parts = known.cover.flip(3) if flipped else known.cover
-        return torch.cdist(cover[8:].flatten(1), parts.flatten(1)).min(dim=1).values
 
-    mirrored = likest(True) < likest(False)
-    assert 0 < mirrored.sum() < 8
-    assert (direction[8:][mirrored, None] * torch.tensor([1.0, -1.0, 1.0]) == known.direction).all(2).any(1).all()
+@pytest.mark.physics
+def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrored(few):
+    first = train_friction(*few[:2], SMALL, epoch=6)
+    learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16, repeats=2), start=first)
+    drawn = [learner.batch(number) for number in range(3)]
+    for step, count in ((0, 1), (1, 1), (2, 2), (5, 3)):
+        known = [torch.cat(column) for column in zip(*drawn[:count], strict=True)]
+        plain = mirrored = 0
+        for crops, direction, material, mu, seen in zip(*learner.chosen(step), strict=True):
+            place = (known[3] == mu).nonzero().flatten().tolist()
+            same = [k for k in place if torch.equal(known[0][k], crops)]
+            other = [k for k in place if torch.equal(known[0][k].flip(2), crops)]
+            assert len(same) + len(other) == 1
+            k = (same + other)[0]
+            plain, mirrored = plain + len(same), mirrored + len(other)
+            assert torch.equal(known[4][k] if same else known[4][k].flip(2), seen)
+            assert material == known[2][k]
+            assert torch.equal(direction, known[1][k] * torch.tensor([1.0, 1.0 if same else -1.0, 1.0]))
+        assert min(plain, mirrored) >= 2
+
+
+@pytest.mark.physics
+def test_the_silhouettes_of_a_start_stay_and_its_reader_learns(few):
+    first = train_friction(*few[:2], SMALL, epoch=6)
+    model = train_friction(*few[:2], replace(SMALL, seed=3), start=first, epoch=6)
+    for name, tensor in weights(first).items():
+        if name.startswith("silhouette.") or name in ("mu.weight", "encoder.0.weight"):
+            assert torch.equal(tensor, weights(model)[name]) == name.startswith("silhouette.")
 
 
 @pytest.mark.physics
@@ -201,12 +229,12 @@ def test_a_model_of_another_size_is_no_start(few):
         train_friction(*few[:2], replace(SMALL, width=24), start=model)
 
 
-def file_of_clips(path, run, size=224):
-    video = np.random.default_rng(0).integers(0, 255, (len(run), 6, size, size, 3), dtype=np.uint8)
+def file_of_clips(path, shown):
+    video = np.random.default_rng(0).integers(0, 255, (len(shown), 6, 224, 224, 3), dtype=np.uint8)
     classes = np.random.default_rng(1).integers(0, 4, video.shape[:-1], dtype=np.uint8)
     about = [
-        {"run": number, "material": "gray-interlock", "mu": 0.5, "landed_side": 1, "viewpoint": "calibrated"}
-        for number in run
+        {"run": 5, "material": shown.materials[code], "mu": mu, "landed_side": 1, "viewpoint": "calibrated"}
+        for code, mu in zip(shown.material.tolist(), shown.mu.tolist(), strict=True)
     ]
     np.savez(
         path,
@@ -217,19 +245,20 @@ def file_of_clips(path, run, size=224):
     )
 
 
-def test_a_file_of_clips_is_read_and_its_test_simulations_are_refused(runs, packed, tmp_path):
-    split = split_of_runs(runs, SHARES, 0)
-    kept, tested = np.flatnonzero(split == 0)[:2].tolist(), int(np.flatnonzero(split == 2)[0])
-    file_of_clips(tmp_path / "clips.npz", kept)
-    clips, about = clips_of_file(tmp_path / "clips.npz", runs.materials)
-    assert clips.crops.shape == (2, 6, 72, 88)
-    assert clips.run.tolist() == kept == [clip["run"] for clip in about]
-    twice = Clips.joined([clips, clips[np.array([1])]])
-    assert twice.run.tolist() == [*kept, kept[1]]
-    assert torch.equal(twice.crops[2], clips.crops[1])
-    file_of_clips(tmp_path / "tested.npz", [*kept, tested])
-    done = CliRunner().invoke(
-        app, ["cloth", "train", str(packed), "--out", str(tmp_path / "out"), "--clips", str(tmp_path / "tested.npz")]
-    )
-    assert done.exit_code == 1
-    assert "must not show simulations to test with" in " ".join(done.output.split())
+def test_clips_of_files_are_parted_by_simulation_and_those_of_others_are_refused(few, tmp_path):
+    train, validation, test = few
+    file_of_clips(tmp_path / "a.npz", train[np.array([3, 0])])
+    file_of_clips(tmp_path / "b.npz", validation[np.array([1])])
+    alone, about = clips_of_file(tmp_path / "a.npz", train.materials)
+    assert alone.crops.shape == (2, 6, 72, 88)
+    assert alone.run.tolist() == [clip["run"] for clip in about] == [5, 5]
+    digests, clips = training_clips([str(tmp_path / name) for name in ("a.npz", "b.npz")], train, validation)
+    assert len(set(digests)) == 2
+    assert clips.train.run.tolist() == [3, 0]
+    assert clips.train.mu.tolist() == train.mu[[3, 0]].tolist()
+    assert torch.equal(clips.train.crops, alone.crops)
+    assert clips.validation.run.tolist() == [len(train) + 1]
+    file_of_clips(tmp_path / "c.npz", test)
+    with pytest.raises(ValueError, match="clips must show simulations to train on or to validate: 2 of 2 do not"):
+        training_clips([str(tmp_path / "c.npz")], train, validation)
+    assert len(Clips.joined([alone, alone[np.array([1])]])) == 3

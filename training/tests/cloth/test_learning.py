@@ -4,15 +4,14 @@ import pytest
 from stickslip_training.cloth.clips import render_clips
 from stickslip_training.cloth.evaluation import score
 from stickslip_training.cloth.learner import ClothTraining, train_friction
-from stickslip_training.cloth.runs import split_runs
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # three minutes of CPU time, on machines that may have a lot else to do
-def test_friction_of_unseen_simulations_is_learned_from_clips(runs):
-    train, validation, test = split_runs(runs, (0.1, 0.22), 0)
+def test_friction_of_unseen_simulations_is_learned_from_clips(runs, split_runs):
+    train, validation, test = split_runs(runs, 0.1, 0.22)
     assert 65 <= len(train) <= 70
-    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False), epoch=150)
+    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False, repeats=1, dropout=0.1), epoch=150)
     clips = render_clips(test, 6, 99)
     scores = score(model.estimate(clips), clips)
     assert scores.blind.simulations >= 20

@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from stickslip_training.cloth.runs import between, grid_order, load_runs, split_runs
+from stickslip_training.cloth.runs import between, grid_order, load_runs
 
 
 def test_the_packed_file_is_small_and_says_what_it_holds(packed, runs):
@@ -28,22 +28,6 @@ def test_positions_are_a_grid_of_cloth_to_ten_micrometres(runs):
     assert runs.positions[..., 2].min() > -1e-3
     steps = runs.positions / 1e-5
     assert np.abs(steps - steps.round()).max() < 0.1
-
-
-def test_splits_part_the_simulations_of_every_fabric_and_keep_the_ends(runs):
-    parts = split_runs(runs, (0.12, 0.25), 0)
-    assert sum(map(len, parts)) == len(runs)
-    keys = [set(zip(part.material.tolist(), part.mu.tolist(), strict=True)) for part in parts]
-    assert not keys[0] & keys[1]
-    assert not (keys[0] | keys[1]) & keys[2]
-    for code in range(len(runs.materials)):
-        known = parts[0].mu[parts[0].material == code]
-        everything = runs.mu[runs.material == code]
-        assert (known.min(), known.max()) == (everything.min(), everything.max())
-        assert all((part.material == code).sum() >= 2 for part in parts)
-    again = split_runs(runs, (0.12, 0.25), 0)[2]
-    assert np.array_equal(again.mu, parts[2].mu)
-    assert not np.array_equal(split_runs(runs, (0.12, 0.25), 1)[2].mu, parts[2].mu)
 
 
 def test_meshes_are_taken_between_neighbours_of_one_fabric_and_side(runs):

@@ -27,9 +27,11 @@ RunsArgument = Annotated[
 def train(
     runs: RunsArgument,
     out: Annotated[Path, typer.Option(help="directory for the model, the checkpoint and the report")],
+    validation: Annotated[
+        str | None, typer.Option(help="a packed file of simulations to validate; a dataset has a split for it")
+    ] = None,
     steps: Annotated[int, typer.Option(help="of training, with 16 clips each")] = 1500,
     seed: Annotated[int, typer.Option(help="of the weights and of all that is drawn")] = 0,
-    split_seed: Annotated[int, typer.Option(help="of the splits of a packed file")] = 0,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
     clips: Annotated[
@@ -60,13 +62,12 @@ def train(
         if first is not None:
             # The network knows the order of mu: its targets are as narrow as at the end.
             settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
-        source, parts = training_runs(runs, split_seed)
-        source["split_seed"] = split_seed
+        source, learned, judged = training_runs(runs, validation)
         source["start"] = None if start is None else sha256(start.read_bytes())
-        source["clips"], rendered = training_clips(clips, runs, parts["train"], split_seed) if clips else (None, None)
+        source["clips"], rendered = training_clips(clips, learned, judged) if clips else (None, None)
         model = train_friction(
-            parts["train"],
-            parts["validation"],
+            learned,
+            judged,
             settings,
             clips=rendered,
             start=first,

@@ -22,7 +22,7 @@ from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
-from stickslip_training.cloth.runs import Runs, landed_side, load_runs, runs_of_dataset, split_of_runs, split_runs
+from stickslip_training.cloth.runs import Runs, landed_side, load_runs, runs_of_dataset
 from stickslip_training.cloth.world import draw_world
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
@@ -50,13 +50,10 @@ a blend of the frames before and after is no better."""
 CHUNK = 32
 """Clips that are rendered or estimated at once outside of training."""
 
-TRAINING, VALIDATION = 0, 1
+TRAINING, VALIDATION, CHOICE = 0, 1, 2
 """Streams of random numbers."""
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-
-SHARES = (0.12, 0.25)
-"""Of the simulations of a packed file, for validation and test."""
 
 _READ_CHUNK = 8  # clips of full pictures in memory at once
 
@@ -268,26 +265,30 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     return clips, about
 
 
-def training_runs(source: str, seed: int) -> tuple[dict[str, Any], dict[Split, Runs]]:
-    """Return what identifies the simulations of a packed file (.npz) or of a dataset, and those of each split.
+def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], Runs, Runs]:
+    """Return what identifies simulations to train on and to validate, and both.
 
-    `seed` parts those of a packed file; a dataset has its own splits.
+    They are two packed files (.npz), or splits of one dataset.
     """
     if source.endswith(".npz"):
-        parts = split_runs(load_runs(source), SHARES, seed)
-        return {"runs": sha256(Path(source).read_bytes())}, dict(zip(SPLITS, parts, strict=True))
+        if validation is None:
+            raise ValueError("validation must be a packed file of simulations, as runs is one: it is not given")
+        train, judged = load_runs(source), load_runs(validation)
+        named = {name: sha256(Path(of).read_bytes()) for name, of in (("runs", source), ("validation", validation))}
+        return named, train, judged.named(train.materials)
+    if validation is not None:
+        raise ValueError(f"validation must not be given with a dataset, which has a split for it: it is {validation}")
     with DatasetReader(source) as reader:
-        named = {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}
-        splits = [split for split in SPLITS if len(reader.slots(split))]
-        if missing := [split for split in SPLITS[:2] if split not in splits]:
+        if missing := [split for split in SPLITS[:2] if not len(reader.slots(split))]:
             raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
-        return named, {split: runs_of_dataset(reader, split, INSTANTS)[0] for split in splits}
+        train, judged = (runs_of_dataset(reader, split, INSTANTS)[0] for split in SPLITS[:2])
+        return {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}, train, judged
 
 
-def training_clips(sources: list[str], runs: str, train: Runs, seed: int) -> tuple[list[str], RenderedClips]:
-    """Return what identifies clips of the simulations `runs`, and the clips of the splits train and validation.
+def training_clips(sources: list[str], train: Runs, validation: Runs) -> tuple[list[str], RenderedClips]:
+    """Return what identifies clips of simulations to train on and to validate, and the clips of both.
 
-    `sources` are one dataset, or files of the simulations of a packed file, which `seed` parts.
+    `sources` are one dataset, or files of clips: material and mu tell of which simulation each is.
     """
     if not all(source.endswith(".npz") for source in sources):
         if len(sources) > 1:
@@ -296,18 +297,15 @@ def training_clips(sources: list[str], runs: str, train: Runs, seed: int) -> tup
             learned, judged = (read_clips(reader, split, train.materials)[0] for split in SPLITS[:2])
             # Simulations have numbers by split.
             return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
-    if not runs.endswith(".npz"):
-        raise ValueError(f"runs must be the packed file that the clips are of, and are {runs}")
-    split = split_of_runs(load_runs(runs), SHARES, seed)
-    files = []
-    for source in sources:
-        shown, _ = clips_of_file(Path(source), train.materials)
-        if shown.run.max() >= len(split) or (split[shown.run] == 2).any():
-            raise ValueError(f"{source} must not show simulations to test with: it has some of the test split")
-        files.append(shown)
-    known = Clips.joined(files)
-    learned, judged = (known[np.flatnonzero(split[known.run] == part)] for part in (0, 1))
-    return [sha256(Path(source).read_bytes()) for source in sources], RenderedClips(learned, judged)
+    runs = zip([*train.material, *validation.material], [*train.mu, *validation.mu], strict=True)
+    numbers = {run: number for number, run in enumerate(runs)}
+    shown = Clips.joined([clips_of_file(Path(source), train.materials)[0] for source in sources])
+    places = [numbers.get(clip, -1) for clip in zip(shown.material, shown.mu, strict=True)]
+    if others := places.count(-1):
+        raise ValueError(f"clips must show simulations to train on or to validate: {others} of {len(shown)} do not")
+    known = replace(shown, run=np.array(places))
+    named = [sha256(Path(source).read_bytes()) for source in sources]
+    return named, RenderedClips(known[known.run < len(train)], known[known.run >= len(train)])
 
 
 def check_kind(reader: DatasetReader) -> None:

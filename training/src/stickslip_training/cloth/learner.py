@@ -16,6 +16,7 @@ from stickslip_training.cloth.calibration import (
     likeliest_temperatures,
 )
 from stickslip_training.cloth.clips import (
+    CHOICE,
     INSTANTS,
     TRAINING,
     VALIDATION,
@@ -51,6 +52,9 @@ from stickslip_training.engine.fit import (
 SILHOUETTES = 8
 """Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
 
+KEPT = 20
+"""Batches of clips that a step chooses from, the last ones."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClothTraining:
@@ -60,6 +64,10 @@ class ClothTraining:
     batch_size: int = 16
     learning_rate: float = 2e-3
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
+    repeats: int = 3
+    """Steps for each batch of clips that is drawn: drawing one costs three times as much as learning from it."""
+    dropout: float = 0.2
+    """Share of the joined features that a step leaves out [1]; with 0.1 a network learns few simulations by heart."""
     averaging: float = 0.99
     """Decay of the running average over steps that is the model's weights."""
     smoothing: tuple[float, float] = (0.2, 0.02)
@@ -79,7 +87,9 @@ class ClothTraining:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check_positive(self, "steps", "batch_size", "learning_rate", "width", "threads")
+        check_positive(self, "steps", "batch_size", "learning_rate", "repeats", "width", "threads")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be from 0 to less than 1, and is {self.dropout}")
         if not all(0 < deviation < math.inf for deviation in self.smoothing):
             raise ValueError(f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}")
         for name in ("gap", "turn"):
@@ -108,7 +118,7 @@ def train_friction(
         validation: Simulations that choose the weights and the temperatures.
         settings: Settings of the training.
         clips: Clips of another renderer to train on, too.
-        start: A model whose weights are the first.
+        start: A model whose weights are the first. What cloth is, it knows: its silhouettes stay.
         out: Directory of the checkpoint; None writes none.
         identity: Names the runs and the clips; a run that is resumed must have the same.
         resume: Continue from the checkpoint in `out`.
@@ -140,7 +150,8 @@ def train_friction(
 
 
 class FrictionLearner(Learner):
-    """Every step draws runs, or meshes between two neighbours in mu, mirrors half of them, and renders them anew."""
+    """Batches are runs, or meshes between two neighbours in mu, that are rendered anew; a step learns from clips of the
+    last batches, half of them mirrored."""
 
     def __init__(
         self,
@@ -162,26 +173,16 @@ class FrictionLearner(Learner):
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
         self.rig = training_cameras()
         self.clips = clips
+        drawn: dict[str, Any] = {"wanted": settings.instants, "drawn_world": settings.worlds}
         self.validation = (
-            render_clips(
-                validation,
-                6,
-                settings.seed,
-                spread=settings.turn,
-                wanted=settings.instants,
-                drawn_world=self.settings.worlds,
-            )
+            render_clips(validation, 6, settings.seed, spread=settings.turn, **drawn)
             if clips is None
             else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
         with seeded(settings.seed):
-            self.net = PosteriorNet(
-                materials=len(train.materials),
-                bins=MU_BINS.count,
-                frames=len(self.frames),
-                width=settings.width,
-            )
+            sizes = {"materials": len(train.materials), "bins": MU_BINS.count, "frames": len(self.frames)}
+            self.net = PosteriorNet(**sizes, width=settings.width, dropout=settings.dropout)
         if start is not None:
             if start.materials != train.materials or start.net.sizes != self.net.sizes:
                 raise ValueError(
@@ -190,6 +191,9 @@ class FrictionLearner(Learner):
                 )
             first = self.net.state_dict()  # heads that the start lacks begin anew
             self.net.load_state_dict(first | {n: t for n, t in start.net.state_dict().items() if n in first})
+        self.settled, self.seen = start is not None, self.net.seen_silhouettes
+        self.net.silhouette.requires_grad_(not self.settled)
+        self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -199,23 +203,39 @@ class FrictionLearner(Learner):
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         assert isinstance(net, PosteriorNet)
-        crops, direction, material, mu, cover = self.batch(step)
+        crops, direction, material, mu, silhouettes = self.chosen(step)
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
         target = _blurred(self.centers, mu, deviation)
         device = self.settings.device
-        seen = net.features(crops.to(device), direction.to(device))
+        silhouettes = silhouettes.to(device)
+        seen = net.features(crops.to(device), direction.to(device), silhouettes if self.settled else None)
         log_material, log_mu = net.read(seen)
         rows = torch.arange(len(mu), device=device)
         given = log_mu[rows, material.to(device)]
         loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
-        some = slice(None, None, SILHOUETTES)
-        shares = pooled(cover[some]).to(device)
-        return loss + functional.binary_cross_entropy_with_logits(net.silhouettes(crops[some].to(device)), shares)
+        if not self.settled:
+            found = net.silhouettes(crops[::SILHOUETTES].to(device))
+            loss = loss + functional.binary_cross_entropy_with_logits(found, silhouettes[::SILHOUETTES])
+        return torch.as_tensor(loss)
 
-    def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the crops, directions of view, materials, mu and coverage of a step."""
-        seeds = (self.settings.seed, TRAINING, step)
+    def chosen(self, step: int) -> tuple[torch.Tensor, ...]:
+        """Return what a step learns from: clips of the last batches, and what is true of them; half are mirrored."""
+        newest = step // self.settings.repeats
+        last = range(max(0, newest - KEPT + 1), newest + 1)
+        self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
+        random, count = np.random.default_rng((self.settings.seed, CHOICE, step)), self.settings.batch_size
+        places = zip(random.choice(last, count).tolist(), random.integers(count, size=count).tolist(), strict=True)
+        parts = [[column[place] for column in self.drawn[number]] for number, place in places]
+        crops, direction, material, mu, silhouettes = (torch.stack(column) for column in zip(*parts, strict=True))
+        turned = torch.from_numpy(random.random(count) < 0.5)[:, None]
+        direction = torch.where(turned, direction * torch.tensor([1.0, -1.0, 1.0]), direction)
+        crops, silhouettes = (torch.where(turned[:, None, None], part.flip(3), part) for part in (crops, silhouettes))
+        return crops, direction, material, mu, silhouettes
+
+    def batch(self, number: int) -> tuple[torch.Tensor, ...]:
+        """Return the crops, directions of view, materials, mu and silhouettes, as seen by a start or as they are."""
+        seeds = (self.settings.seed, TRAINING, number)
         random = np.random.default_rng(seeds)
         generator = torch.Generator().manual_seed(seed_of_step(*seeds))
         some = 0 if self.clips is None else self.settings.batch_size // 2
@@ -224,8 +244,6 @@ class FrictionLearner(Learner):
         share = random.random(count, dtype=np.float32)
         near = torch.from_numpy(share)[:, None, None, None, None]
         meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
-        mirrored = torch.from_numpy(random.random(count) < 0.5)
-        meshes[mirrored] = meshes[mirrored].flip(3) * torch.tensor([1.0, -1.0, 1.0])
         views = [self.rig[place] for place in random.integers(len(self.rig), size=count)]
         cameras = randomly_turned(Cameras.of(views), self.settings.turn, generator)
         looks = draw_style(count, len(self.frames), generator)
@@ -233,29 +251,24 @@ class FrictionLearner(Learner):
         crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
         first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
         mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
-        rendered = crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, cover
-        if self.clips is None:
-            return rendered
-        given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
-        a, b, c, d, e = (torch.cat(both) for both in zip(rendered, given, strict=True))
-        return a, b, c, d, e
+        parts = [crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, cover]
+        if self.clips is not None:
+            given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
+            parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
+        *parts, cover = parts
+        return *parts, self.seen(parts[0].to(self.settings.device)).cpu() if self.settled else pooled(cover)
 
-    def elsewhere(
-        self, clips: Clips, generator: torch.Generator
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return clips of another renderer as part of a batch: half of them mirrored, each in a drawn world."""
-        mirrored = torch.rand(len(clips), 1, 1, 1, generator=generator) < 0.5
-        shown, cover = (torch.where(mirrored, part.flip(3), part) for part in (clips.crops, clips.cover))
-        across = torch.tensor([1.0, -1.0, 1.0])
-        direction = torch.where(mirrored[:, 0, 0], across * clips.direction, clips.direction)
+    def elsewhere(self, clips: Clips, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
+        """Return clips of another renderer as part of a batch, each in a drawn world."""
         looks = draw_style(len(clips), len(self.frames), generator)
-        cloth, world, cover = cloth_of_clip(shown, cover, looks, draw_world(len(clips), generator), generator)
+        world = draw_world(len(clips), generator)
+        cloth, world, cover = cloth_of_clip(clips.crops, clips.cover, looks, world, generator)
         axes = torch.stack([torch.tensor(camera.rotation[2]) for camera in self.rig])
-        near = torch.cdist(direction, axes).argmin(dim=1)
+        near = torch.cdist(clips.direction, axes).argmin(dim=1)
         cameras = Cameras.of([self.rig[place] for place in near.tolist()])
         crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
         mu = torch.from_numpy(clips.mu.astype(np.float32))
-        return crops, direction, torch.from_numpy(clips.material), mu, cover
+        return crops, clips.direction, torch.from_numpy(clips.material), mu, cover
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)

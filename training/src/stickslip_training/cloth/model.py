@@ -64,7 +64,7 @@ def silhouettes(net: PosteriorNet, clips: Clips) -> SingleFloats:
     with torch.inference_mode():
         device = next(net.parameters()).device
         chunks = [clips.crops[first : first + CHUNK] for first in range(0, len(clips), CHUNK)]
-        parts = [net.silhouettes(crops.to(device)).sigmoid().cpu() for crops in chunks]
+        parts = [net.seen_silhouettes(crops.to(device)).cpu() for crops in chunks]
     return np.asarray(torch.cat(parts).numpy())
 
 

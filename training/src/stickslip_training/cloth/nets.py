@@ -19,7 +19,7 @@ class PosteriorNet(nn.Module):
     the holders, so each has a place of its own in the layer that joins them.
     """
 
-    def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96) -> None:
+    def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96, dropout: float = 0.0) -> None:
         super().__init__()
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
         channels = (1, 16, 32, 48, 64)
@@ -34,7 +34,7 @@ class PosteriorNet(nn.Module):
         self.joined = nn.Sequential(
             nn.Linear(frames * width + 3, 2 * width),
             nn.ReLU(),
-            nn.Dropout(0.1),
+            nn.Dropout(dropout),
             nn.Linear(2 * width, 2 * width),
             nn.ReLU(),
         )
@@ -42,15 +42,16 @@ class PosteriorNet(nn.Module):
         self.mu = nn.Linear(2 * width, materials * bins)
         self.silhouette = _silhouette_net()
 
-    def features(self, crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        """Return what material and mu are read off, (B, 2 width)."""
+    def features(
+        self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Return what material and mu are read off, (B, 2 width); `silhouettes` are found if they are not given."""
         clips, frames = crops.shape[:2]
         deviation, mean = torch.std_mean(crops, dim=(1, 2, 3), keepdim=True)
         x = (crops - mean) / (deviation + 1e-3)
-        with torch.no_grad():
-            silhouettes = self.silhouettes(crops).sigmoid().flatten(0, 1)[:, None]
+        masks = (self.seen_silhouettes(crops) if silhouettes is None else silhouettes).flatten(0, 1)[:, None]
         early, late = self.encoder[: 3 * _SILHOUETTE_AT], self.encoder[3 * _SILHOUETTE_AT :]
-        seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), silhouettes], dim=1)
+        seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), masks], dim=1)
         features = self.frame(late(seen))
         return torch.as_tensor(self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1)))
 
@@ -58,6 +59,11 @@ class PosteriorNet(nn.Module):
         """Return log p(m) and log p(mu | m) of features."""
         mu = self.mu(features).reshape(len(features), self.sizes["materials"], self.sizes["bins"])
         return torch.log_softmax(self.material(features), dim=1), torch.log_softmax(mu, dim=2)
+
+    @torch.no_grad()
+    def seen_silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
+        """Return the silhouettes that the network sees, 0 to 1, (B, F, 18, 22): the reader does not teach them."""
+        return self.silhouettes(crops).sigmoid()
 
     def silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
         """Return logits of the share that cloth covers of each 4 x 4 pixels of crops (B, F, 72, 88): (B, F, 18, 22).

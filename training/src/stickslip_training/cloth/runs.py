@@ -111,29 +111,6 @@ def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequen
     return _runs(np.stack(meshes), rest, tuple(instants), materials, material, mu), chosen
 
 
-def split_runs(runs: Runs, shares: tuple[float, float], seed: int) -> tuple[Runs, Runs, Runs]:
-    """Part runs into train, validation and test: see `split_of_runs`."""
-    split = split_of_runs(runs, shares, seed)
-    train, validation, test = (runs[np.flatnonzero(split == part)] for part in range(3))
-    return train, validation, test
-
-
-def split_of_runs(runs: Runs, shares: tuple[float, float], seed: int) -> Integers:
-    """Return 0, 1 or 2 for each run, train, validation or test; `shares` are of the last two, in every fabric.
-
-    The runs with the least and the largest mu of a fabric are always trained on: nothing can be learned beyond them.
-    """
-    split = np.zeros(len(runs), dtype=np.int64)
-    for code in np.unique(runs.material):
-        order = np.flatnonzero(runs.material == code)
-        order = order[np.argsort(runs.mu[order], kind="stable")]
-        inner = np.random.default_rng((seed, int(code))).permutation(order[1:-1])
-        counts = [round(share * len(order)) for share in shares]
-        split[inner[: counts[0]]] = 1
-        split[inner[counts[0] : sum(counts)]] = 2
-    return split
-
-
 def _runs(
     positions: SingleFloats,
     rest: SingleFloats,
