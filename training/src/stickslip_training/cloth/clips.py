@@ -288,7 +288,7 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
 def training_clips(sources: list[str], train: Runs, validation: Runs) -> tuple[list[str], RenderedClips]:
     """Return what identifies clips of simulations to train on and to validate, and the clips of both.
 
-    `sources` are one dataset, or files of clips: material and mu tell of which simulation each is.
+    `sources` are one dataset, or files of clips, whose material and mu name their simulations.
     """
     if not all(source.endswith(".npz") for source in sources):
         if len(sources) > 1:
