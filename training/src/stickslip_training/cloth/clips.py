@@ -53,7 +53,7 @@ CHUNK = 32
 TRAINING, VALIDATION, CHOICE = 0, 1, 2
 """Streams of random numbers."""
 
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+SPLITS: tuple[Split, ...] = ("train", "validation")
 
 _READ_CHUNK = 8  # clips of full pictures in memory at once
 
@@ -279,9 +279,9 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
     if validation is not None:
         raise ValueError(f"validation must not be given with a dataset, which has a split for it: it is {validation}")
     with DatasetReader(source) as reader:
-        if missing := [split for split in SPLITS[:2] if not len(reader.slots(split))]:
+        if missing := [split for split in SPLITS if not len(reader.slots(split))]:
             raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
-        train, judged = (runs_of_dataset(reader, split, INSTANTS)[0] for split in SPLITS[:2])
+        train, judged = (runs_of_dataset(reader, split, INSTANTS)[0] for split in SPLITS)
         return {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}, train, judged
 
 
@@ -294,7 +294,7 @@ def training_clips(sources: list[str], train: Runs, validation: Runs) -> tuple[l
         if len(sources) > 1:
             raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
         with DatasetReader(sources[0]) as reader:
-            learned, judged = (read_clips(reader, split, train.materials)[0] for split in SPLITS[:2])
+            learned, judged = (read_clips(reader, split, train.materials)[0] for split in SPLITS)
             # Simulations have numbers by split.
             return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
     runs = zip([*train.material, *validation.material], [*train.mu, *validation.mu], strict=True)
