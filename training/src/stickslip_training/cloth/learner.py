@@ -65,7 +65,7 @@ class ClothTraining:
     learning_rate: float = 2e-3
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
     repeats: int = 3
-    """Steps for each batch of clips: drawing it and finding silhouettes costs five times as much as learning from it."""
+    """Steps for each batch of clips: drawing it, with silhouettes, costs five times as much as learning from it."""
     dropout: float = 0.2
     """Share of the joined features that a step leaves out [1]; with 0.1 a network learns few simulations by heart."""
     averaging: float = 0.99
