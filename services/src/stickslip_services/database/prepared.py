@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Dialect, text
+from sqlalchemy import Connection, Dialect, Table, text
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.sql.base import Executable
 from sqlalchemy.sql.compiler import SQLCompiler
@@ -65,7 +65,9 @@ class Prepared:
             _driver(connection).execute(sql, parameters)
 
     def run_all(self, connection: Connection, values: Sequence[Values]) -> None:
-        """Execute it with each of the values; it must not have expanding parameters."""
+        """Execute it with each of the values, if there are any; it must not have expanding parameters."""
+        if not values:
+            return
         compiled = self._compile(connection.dialect)
         names, defaults = compiled.names, compiled.defaults
         rows = [[row[name] if name in row else defaults[name] for name in names] for row in values]
@@ -112,6 +114,22 @@ class Prepared:
             compiled = _Compiled(sql, names, defaults, lists, mark)
             self._compiled[dialect.name] = compiled
         return compiled
+
+
+class Counters(Prepared):
+    """Adds to the counters of a table, whose last column is the counter and whose others are its key."""
+
+    def __init__(self, table: Table) -> None:
+        self._names = table.columns.keys()
+        *keys, counter = (f'"{name}"' for name in self._names)
+        super().__init__(
+            f"INSERT INTO {table.name} ({', '.join([*keys, counter])}) VALUES (:{', :'.join(self._names)}) "
+            f"ON CONFLICT ({', '.join(keys)}) DO UPDATE SET {counter} = {table.name}.{counter} + excluded.{counter}"
+        )
+
+    def add(self, connection: Connection, changes: Mapping[tuple[Any, ...], int]) -> None:
+        """Add changes by key; a row that is missing is made."""
+        self.run_all(connection, [dict(zip(self._names, (*key, n), strict=True)) for key, n in changes.items()])
 
 
 def _list_mark(name: str) -> str:

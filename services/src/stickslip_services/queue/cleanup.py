@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 
-from sqlalchemy import ColumnElement, Connection, delete, select, update
+from sqlalchemy import Connection, delete, select
 from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text
@@ -30,11 +30,11 @@ from stickslip_services.database.tables import (
     jobs,
     previews,
     samples,
-    task_counts,
     task_dependencies,
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
+from stickslip_services.queue.ledger import TASK_COUNTS
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
@@ -87,9 +87,7 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
         connection.execute(delete(task_dependencies).where(task_dependencies.c.task.in_(batch)))
         connection.execute(delete(previews).where(previews.c.task.in_(batch)))
         connection.execute(delete(tasks).where(of_batch))
-    for (stage, state), count in counts.items():
-        place: tuple[ColumnElement[bool], ...] = (task_counts.c.stage == stage, task_counts.c.state == state)
-        connection.execute(update(task_counts).where(*place).values(count=task_counts.c.count - count))
+    TASK_COUNTS.add(connection, {key: -count for key, count in counts.items()})
     return len(own), len(lost)
 
 

@@ -18,9 +18,11 @@ from stickslip_services.queue.eta import Run, add_costs
 from stickslip_services.queue.events import append_event, set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
-    ADD_TO_JOB_COUNTS,
+    JOB_COUNTS,
+    JOB_GROUPS,
     OVER,
     RUNNABLE,
+    TASK_COUNTS,
     Ending,
     Holder,
     Ledger,
@@ -44,14 +46,6 @@ _READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
 
 
 _PLANNED = frozenset(RUNNABLE) - {JobState.planning}
-_ADD_TO_TASK_COUNTS = Prepared(
-    "INSERT INTO task_counts (stage, state, count) VALUES (:stage, :state, :change) "
-    "ON CONFLICT (stage, state) DO UPDATE SET count = task_counts.count + excluded.count"
-)
-_ADD_TO_JOB_GROUPS = Prepared(
-    'UPDATE job_groups SET "left" = "left" + :b_change '
-    "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
-)
 _ADD_TO_JOB_STAGES = Prepared(
     "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + :b_count, "
     "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_squares WHERE job = :b_job AND stage = :b_stage"
@@ -90,7 +84,7 @@ def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
     moves, book.moves = book.moves, []
     runs, book.runs = book.runs, []
     inserted, book.inserted = book.inserted, Counter()
-    _add_to_task_counts(book.connection, inserted)
+    TASK_COUNTS.add(book.connection, inserted)
     if moves or runs:
         holders = book.holders([*(move.task for move in moves), *(run.task for run in runs)])
         _count(book.connection, moves, holders)
@@ -155,37 +149,16 @@ def _end_job(book: Ledger, job: int, ending: Ending) -> None:
 def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
     overall: Counter[tuple[Stage, TaskState]] = Counter()
     by_job: Counter[tuple[int, Stage, TaskState]] = Counter()
-    for move in moves:
-        overall[move.stage, move.old] -= 1
-        overall[move.stage, move.new] += 1
-        for holder in holders.get(move.task, ()):
-            by_job[holder.job, move.stage, move.old] -= 1
-            by_job[holder.job, move.stage, move.new] += 1
-    _add_to_task_counts(connection, overall)
-    _count_left(connection, moves, holders)
-    changes = [
-        {"b_job": job, "b_stage": stage, "b_state": state, "b_change": change}
-        for (job, stage, state), change in by_job.items()
-        if change
-    ]
-    if changes:
-        ADD_TO_JOB_COUNTS.run_all(connection, changes)
-
-
-def _count_left(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
     left: Counter[tuple[int, Stage, str]] = Counter()
     for move in moves:
-        change = (move.new not in OVER) - (move.old not in OVER)
-        if change:
+        for state, change in ((move.old, -1), (move.new, 1)):
+            overall[move.stage, state] += change
             for holder in holders.get(move.task, ()):
-                left[holder.job, move.stage, holder.cost_group] += change
-    rows = [
-        {"b_job": job, "b_stage": stage, "b_group": group, "b_change": change}
-        for (job, stage, group), change in left.items()
-        if change
-    ]
-    if rows:
-        _ADD_TO_JOB_GROUPS.run_all(connection, rows)
+                by_job[holder.job, move.stage, state] += change
+                left[holder.job, move.stage, holder.cost_group] += change * (state not in OVER)
+    TASK_COUNTS.add(connection, overall)
+    JOB_COUNTS.add(connection, by_job)
+    JOB_GROUPS.add(connection, {group: change for group, change in left.items() if change})
 
 
 def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[Holder]]) -> None:
@@ -205,8 +178,7 @@ def _add_costs(connection: Connection, runs: list[Run], holders: dict[int, list[
         }
         for (job, stage), group in by_job.items()
     ]
-    if rows:
-        _ADD_TO_JOB_STAGES.run_all(connection, rows)
+    _ADD_TO_JOB_STAGES.run_all(connection, rows)
     add_costs(connection, runs)
 
 
@@ -220,13 +192,6 @@ def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
             set_job_state(book.connection, job, JobState.running, book.now)
         else:  # it runs when it has been planned
             book.connection.execute(update(jobs).where(jobs.c.seq == job).values(started_at=book.now))
-
-
-def _add_to_task_counts(connection: Connection, changes: Counter[tuple[Stage, TaskState]]) -> None:
-    """Change the number of tasks by stage and state."""
-    rows = [{"stage": stage, "state": state, "change": change} for (stage, state), change in changes.items() if change]
-    if rows:
-        _ADD_TO_TASK_COUNTS.run_all(connection, rows)
 
 
 def _finish_cancelling(connection: Connection, now: float) -> None:

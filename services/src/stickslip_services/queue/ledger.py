@@ -15,8 +15,8 @@ from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
 from stickslip_services.catalog.versions import CommittedVersion
 from stickslip_services.database.database import batches
-from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.database.prepared import Counters, Prepared
+from stickslip_services.database.tables import job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import Run
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
@@ -105,9 +105,7 @@ _HOLDERS = Prepared(
         jobs.c.state.in_([state for state in JobState if state.is_open]),
     )
 )
-ADD_TO_JOB_COUNTS = Prepared(
-    "UPDATE job_counts SET count = count + :b_change WHERE job = :b_job AND stage = :b_stage AND state = :b_state"
-)
+TASK_COUNTS, JOB_COUNTS, JOB_GROUPS = Counters(task_counts), Counters(job_counts), Counters(job_groups)
 
 
 class Ledger:

@@ -14,7 +14,6 @@ from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import batches, insert_rows
-from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import (
     job_counts,
     job_stages,
@@ -26,15 +25,10 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
-from stickslip_services.queue.ledger import ADD_TO_JOB_COUNTS, OVER, Ledger, charge_tasks, reset_tasks
+from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, Ledger, charge_tasks, reset_tasks
 from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
-
-_ADD_GROUPS = Prepared(
-    'INSERT INTO job_groups (job, stage, cost_group, "left") VALUES (:job, :stage, :cost_group, :n) '
-    'ON CONFLICT (job, stage, cost_group) DO UPDATE SET "left" = job_groups."left" + excluded."left"'
-)
 
 
 def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "") -> int:
@@ -137,22 +131,14 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
             for row in [(job, slot, key, seqs[simulate], None if render is None else seqs[render], split, labels)]
         ),
     )
-    new = Counter(Stage(task.stage) for key, task in plan.tasks.items() if key not in known)
-    counts = Counter({(stage, TaskState.pending): count for stage, count in new.items()})
-    if rejected:
-        counts[Stage.render, TaskState.rejected] += len(rejected)
-        counts[Stage.render, TaskState.pending] -= len(rejected)
-    book.inserted.update(counts)
-    counts.update((task.stage, task.state) for task in shared)
-    _add_counts(connection, job, counts)
-    left = Counter((task.stage, task.cost_group) for task in shared if task.state not in OVER)
-    for key, task in plan.tasks.items():
-        if key not in known:
-            left[Stage(task.stage), task.cost_group] += seqs[key] not in rejected
-    groups = {*left, *((task.stage, task.cost_group) for task in shared)}
-    if groups:
-        rows = [{"job": job, "stage": stage, "cost_group": group, "n": left[stage, group]} for stage, group in groups]
-        _ADD_GROUPS.run_all(connection, rows)
+    new = Counter(
+        (Stage(task.stage), task.cost_group, TaskState.rejected if seqs[key] in rejected else TaskState.pending)
+        for key, task in plan.tasks.items()
+        if key not in known
+    )
+    for (stage, _, state), count in new.items():
+        book.inserted[stage, state] += count
+    _add_counts(connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared))
     lost = [(task.seq, task.stage, task.state) for task in shared if task.state in _LOST]
     reset_tasks(book, lost, dict.fromkeys((seq for seq, _, _ in lost), job))  # its moves change the counts
     for key, old in known.items():
@@ -230,16 +216,15 @@ def _payload(task: PlannedTask, job: int) -> str:
     return task.payload
 
 
-def _add_counts(connection: Connection, job: int, counts: Mapping[tuple[Stage, TaskState], int]) -> None:
-    changes = [
-        {"b_job": job, "b_stage": stage, "b_state": state, "b_change": count}
-        for (stage, state), count in counts.items()
-        if count
-    ]
-    if changes:
-        ADD_TO_JOB_COUNTS.run_all(connection, changes)
-    settled = (TaskState.succeeded, TaskState.rejected)
-    for stage in Stage:
-        if cached := sum(counts.get((stage, state), 0) for state in settled):
-            own = (job_stages.c.job == job, job_stages.c.stage == stage)
-            connection.execute(update(job_stages).where(*own).values(cached=job_stages.c.cached + cached))
+def _add_counts(connection: Connection, job: int, held: Mapping[tuple[Stage, str, TaskState], int]) -> None:
+    """Count tasks that a job has, by stage, cost group and state."""
+    counts, left, cached = Counter[Any](), Counter[Any](), Counter[Stage]()
+    for (stage, group, state), count in held.items():
+        counts[job, stage, state] += count
+        left[job, stage, group] += count * (state not in OVER)
+        cached[stage] += count * state.is_settled
+    JOB_COUNTS.add(connection, counts)
+    JOB_GROUPS.add(connection, left)
+    for stage, count in (+cached).items():
+        own = (job_stages.c.job == job, job_stages.c.stage == stage)
+        connection.execute(update(job_stages).where(*own).values(cached=job_stages.c.cached + count))
