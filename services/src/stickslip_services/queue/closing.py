@@ -26,7 +26,7 @@ from stickslip_services.queue.ledger import (
     Ending,
     Holder,
     Ledger,
-    Move,
+    Task,
     give_up_tasks,
     live_jobs,
     runnable_tasks,
@@ -86,10 +86,10 @@ def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
     inserted, book.inserted = book.inserted, Counter()
     TASK_COUNTS.add(book.connection, inserted)
     if moves or runs:
-        holders = book.holders([*(move.task for move in moves), *(run.task for run in runs)])
+        holders = book.holders([*(task.seq for task, _ in moves), *(run.task for run in runs)])
         _count(book.connection, moves, holders)
         _add_costs(book.connection, runs, holders)
-        leased = (move.task for move in moves if move.new in (TaskState.leased, TaskState.running))
+        leased = (task.seq for task, state in moves if state in (TaskState.leased, TaskState.running))
         _start_jobs(book, {holder.job for task in leased for holder in holders.get(task, ())})
     return frozenset(book.endings)
 
@@ -146,16 +146,16 @@ def _end_job(book: Ledger, job: int, ending: Ending) -> None:
     set_job_state(book.connection, job, ending.state, book.now, reason=ending.reason, message=ending.message)
 
 
-def _count(connection: Connection, moves: list[Move], holders: dict[int, list[Holder]]) -> None:
+def _count(connection: Connection, moves: list[tuple[Task, TaskState]], holders: dict[int, list[Holder]]) -> None:
     overall: Counter[tuple[Stage, TaskState]] = Counter()
     by_job: Counter[tuple[int, Stage, TaskState]] = Counter()
     left: Counter[tuple[int, Stage, str]] = Counter()
-    for move in moves:
-        for state, change in ((move.old, -1), (move.new, 1)):
-            overall[move.stage, state] += change
-            for holder in holders.get(move.task, ()):
-                by_job[holder.job, move.stage, state] += change
-                left[holder.job, move.stage, holder.cost_group] += change * (state not in OVER)
+    for task, new in moves:
+        for state, change in ((task.state, -1), (new, 1)):
+            overall[task.stage, state] += change
+            for holder in holders.get(task.seq, ()):
+                by_job[holder.job, task.stage, state] += change
+                left[holder.job, task.stage, holder.cost_group] += change * (state not in OVER)
     TASK_COUNTS.add(connection, overall)
     JOB_COUNTS.add(connection, by_job)
     JOB_GROUPS.add(connection, {group: change for group, change in left.items() if change})

@@ -18,9 +18,9 @@ from stickslip_services.database.tables import jobs, task_dependencies, tasks
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
-from stickslip_services.queue.ledger import LIVE, Ending, Ledger
+from stickslip_services.queue.ledger import LIVE, Ending, Ledger, Task
 from stickslip_services.queue.plan import Terms
-from stickslip_services.queue.recompute import Maker, remake
+from stickslip_services.queue.recompute import remake
 
 
 def terms_of(row: Any) -> tuple[JobSpec, Terms | None]:
@@ -79,5 +79,5 @@ def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:
         whole = [state for state in TaskState if state.is_settled and result_digest(row, state) == row.digest]
         state = [*whole, *(state for state in TaskState if state == row.state), TaskState.succeeded][0]
         book.connection.execute(update(tasks).where(tasks.c.seq == row.seq).values(state=state))
-        makers.append(Maker(row.seq, Stage(row.stage), state))
+        makers.append(Task(row.seq, Stage(row.stage), state))
     remake(book, consumer, makers)

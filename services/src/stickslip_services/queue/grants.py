@@ -20,7 +20,7 @@ from stickslip_services.database.tables import job_counts, jobs, tasks
 from stickslip_services.queue.compose import STORED_COLUMNS, StoredTask, reserve_version
 from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger
+from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger, Task
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
 
@@ -127,7 +127,7 @@ def grant_leases(
     if not granted:
         return []
     for task in granted:
-        book.moved(task.seq, task.stage, TaskState.pending, TaskState.leased)
+        book.moved(Task(task.seq, Stage(task.stage), TaskState.pending), TaskState.leased)
     lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
     _LEASE.run_all(book.connection, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
     grants = [

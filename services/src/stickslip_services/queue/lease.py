@@ -146,13 +146,13 @@ def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -
         names = [(lease, (task_key(lease.task_id), lease.token)) for lease in left]
         mine = [(lease, held[name]) for lease, name in names if name in held]
         unneeded = _unneeded(book, mine)
-        cancel_tasks(book, [(task.seq, task.stage, task.state) for _, task in mine if task.seq in unneeded])
+        cancel_tasks(book, [task for _, task in mine if task.seq in unneeded])
         halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
         for _, task in mine:
             if task.seq in halted:
                 release(book, task, TaskState.pending)
         started = [task for lease, task in mine if lease.started and task.state is TaskState.leased]
-        start_tasks(book, [(task.seq, task.stage) for task in started if task.seq not in unneeded | halted])
+        start_tasks(book, [task for task in started if task.seq not in unneeded | halted])
         listed = {task_key(lease.task_id) for lease in message.leases}
         unlisted = [task for task in held.values() if task.key not in listed and task.expires_at <= book.now]
         lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
@@ -217,7 +217,7 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
     """Mend the rows that leased tasks need, and retry these, as after a report of damaged artifacts."""
     with context.ledger() as book:
         held = [task for task in find_held(book, [worker_id]) if task.seq in damaged]
-        start_tasks(book, [(task.seq, task.stage) for task in held])
+        start_tasks(book, held)
         why = Reason.storage_error, str(DamagedRowsError())
         fail_tries(book, [(replace(task, state=TaskState.running), *why) for task in held], context.settings)
         for task in held:

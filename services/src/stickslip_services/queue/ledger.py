@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from sqlalchemy import Connection, bindparam, case, select, update
+from sqlalchemy import Column, Connection, bindparam, case, select, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
@@ -18,6 +18,7 @@ from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Counters, Prepared
 from stickslip_services.database.tables import job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import Run
+from stickslip_services.queue.ids import task_id
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
 """States of a job whose tasks may be leased; a `planning` job has only a part of them."""
@@ -65,36 +66,40 @@ class Ending:
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
-    """A change of a task's state."""
+class Task:
+    """A task in a state."""
 
-    task: int
+    seq: int
     stage: Stage
-    old: TaskState
-    new: TaskState
+    state: TaskState
+
+    @classmethod
+    def columns(cls) -> list[Column[Any]]:
+        """Return the columns of `tasks` from which `of` makes one."""
+        return [tasks.c[field.name] for field in fields(cls)]
+
+    @classmethod
+    def of(cls, row: Any) -> Self:
+        """Return the task of a row with `columns`."""
+        rest = (getattr(row, field.name) for field in fields(cls)[3:])
+        return cls(row.seq, Stage(row.stage), TaskState(row.state), *rest)
 
 
 @dataclass(frozen=True, slots=True)
-class HeldTask:
+class HeldTask(Task):
     """A leased task, or one whose lease has just ended."""
 
-    seq: int
     key: bytes
-    stage: Stage
-    state: TaskState
     tries: int
     losses: int
     token: int
     expires_at: float
 
-    @classmethod
-    def of(cls, row: Any) -> Self:
-        """Return the task of a row of `tasks`."""
-        rest = row.tries, row.losses, row.token, row.expires_at
-        return cls(row.seq, row.key, Stage(row.stage), TaskState(row.state), *rest)
+    @property
+    def name(self) -> str:
+        """Name of the task outside the database."""
+        return task_id(self.stage, self.key)
 
-
-HELD_COLUMNS = [tasks.c[field.name] for field in fields(HeldTask)]
 
 _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
@@ -114,24 +119,26 @@ class Ledger:
     def __init__(self, connection: Connection, now: float) -> None:
         self.connection = connection
         self.now = now
-        self.moves: list[Move] = []
+        self.moves: list[tuple[Task, TaskState]] = []
+        """Tasks, and their new states."""
         self.runs: list[Run] = []
         self.inserted: Counter[tuple[Stage, TaskState]] = Counter()
         """New tasks by stage and state."""
         self.news: list[tuple[int, TaskStateEvent]] = []
         self.endings: dict[int, Ending] = {}
 
-    def moved(self, task: int, stage: str, old: str, new: TaskState) -> None:
-        """Note a change of a task's state."""
-        self.moves.append(Move(task, Stage(stage), TaskState(old), new))
+    def moved(self, task: Task, state: TaskState) -> None:
+        """Note the new state of a task."""
+        self.moves.append((task, state))
 
     def ran(self, run: Run) -> None:
         """Note the cost of a task."""
         self.runs.append(run)
 
-    def emit(self, task: int, event: TaskStateEvent) -> None:
-        """Note the events of all jobs of a task."""
-        self.news.append((task, event))
+    def emit(self, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
+        """Note an event of all jobs of a task."""
+        event = TaskStateEvent(task_id=task.name, stage=task.stage, state=state, reason=reason, message=message)
+        self.news.append((task.seq, event))
 
     def end_job(self, job: int, ending: Ending) -> None:
         """Note that a live job ends; the first ending counts."""
@@ -162,17 +169,15 @@ def give_up_piece(book: Ledger, job: int, after: int) -> int | None:
     """
     piece = select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task > after)
     seqs = list(book.connection.scalars(piece.order_by(job_tasks.c.task).limit(PIECE_TASKS)))
-    rows = book.connection.execute(
-        select(tasks.c.seq, tasks.c.stage, tasks.c.state).where(tasks.c.seq.in_(seqs), tasks.c.state.in_(_WAITING))
-    )
-    _give_up(book, [(seq, stage, state) for seq, stage, state in rows], ())
+    rows = book.connection.execute(select(*Task.columns()).where(tasks.c.seq.in_(seqs), tasks.c.state.in_(_WAITING)))
+    _give_up(book, list(map(Task.of, rows)), ())
     return seqs[-1] if len(seqs) == PIECE_TASKS else None
 
 
-def _give_up(book: Ledger, rows: Collection[tuple[int, str, str]], ending: Collection[int]) -> None:
-    chargeable = live_jobs(book.connection, [seq for seq, _, _ in rows], but=ending)
+def _give_up(book: Ledger, waiting: Collection[Task], ending: Collection[int]) -> None:
+    chargeable = live_jobs(book.connection, [task.seq for task in waiting], but=ending)
     _charge(book.connection, chargeable)
-    cancel_tasks(book, [row for row in rows if row[0] not in chargeable])
+    cancel_tasks(book, [task for task in waiting if task.seq not in chargeable])
 
 
 def charge_waiting_tasks(connection: Connection, job: int) -> None:
@@ -184,7 +189,7 @@ def charge_waiting_tasks(connection: Connection, job: int) -> None:
     kind = select(jobs.c.kind).where(jobs.c.seq == job).scalar_subquery()
     others = select(jobs.c.seq).where(jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE))
     if connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
-        charge_tasks(connection, (seq for seq, _, _ in _waiting_tasks(connection, job)))
+        charge_tasks(connection, (task.seq for task in _waiting_tasks(connection, job)))
 
 
 def charge_tasks(connection: Connection, waiting: Iterable[int]) -> None:
@@ -193,14 +198,14 @@ def charge_tasks(connection: Connection, waiting: Iterable[int]) -> None:
         _charge(connection, live_jobs(connection, batch))
 
 
-def _waiting_tasks(connection: Connection, job: int) -> list[tuple[int, str, str]]:
-    """Return (seq, stage, state) of the tasks of a job that wait to be leased."""
+def _waiting_tasks(connection: Connection, job: int) -> list[Task]:
+    """Return the tasks of a job that wait to be leased."""
     rows = connection.execute(
-        select(tasks.c.seq, tasks.c.stage, tasks.c.state)
+        select(*Task.columns())
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)
         .where(job_tasks.c.job == job, tasks.c.state.in_(_WAITING))
     )
-    return [(seq, stage, state) for seq, stage, state in rows]
+    return list(map(Task.of, rows))
 
 
 def _charge(connection: Connection, job_of: dict[int, int]) -> None:
@@ -211,13 +216,13 @@ def _charge(connection: Connection, job_of: dict[int, int]) -> None:
         )
 
 
-def cancel_tasks(book: Ledger, rows: Collection[tuple[int, str, str]]) -> None:
-    """Cancel tasks (seq, stage, state), leased ones included."""
-    if not rows:
+def cancel_tasks(book: Ledger, needless: Collection[Task]) -> None:
+    """Cancel tasks, leased ones included."""
+    if not needless:
         return
     book.connection.execute(
         update(tasks)
-        .where(tasks.c.seq.in_([row[0] for row in rows]))
+        .where(tasks.c.seq.in_([task.seq for task in needless]))
         .values(
             state=TaskState.cancelled,
             reason=Reason.cancelled,
@@ -228,8 +233,8 @@ def cancel_tasks(book: Ledger, rows: Collection[tuple[int, str, str]]) -> None:
             finished_at=book.now,
         )
     )
-    for seq, stage, state in rows:
-        book.moved(seq, stage, state, TaskState.cancelled)
+    for task in needless:
+        book.moved(task, TaskState.cancelled)
 
 
 def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) -> None:
@@ -237,21 +242,21 @@ def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) ->
     book.connection.execute(
         update(tasks).where(tasks.c.seq == task.seq).values(state=state, owner=None, expires_at=None, **values)
     )
-    book.moved(task.seq, task.stage, task.state, state)
+    book.moved(task, state)
 
 
-def reset_tasks(book: Ledger, rows: Collection[tuple[int, str, str]], job_of: Mapping[int, int]) -> None:
-    """Let ended tasks (seq, stage, state) run again, with all their tries, each charged to a job."""
+def reset_tasks(book: Ledger, ended: Collection[Task], job_of: Mapping[int, int]) -> None:
+    """Let ended tasks run again, with all their tries, each charged to a job."""
     values = {"reason": None, "message": "", "tries": 0, "losses": 0, "retry_at": None, "finished_at": None}
-    if rows:
+    if ended:
         book.connection.execute(
             update(tasks)
             .where(tasks.c.seq == bindparam("b_seq"))
             .values(state=TaskState.pending, job=bindparam("b_job"), **values),
-            [{"b_seq": seq, "b_job": job_of[seq]} for seq, _, _ in rows],
+            [{"b_seq": task.seq, "b_job": job_of[task.seq]} for task in ended],
         )
-    for seq, stage, state in rows:
-        book.moved(seq, stage, state, TaskState.pending)
+    for task in ended:
+        book.moved(task, TaskState.pending)
 
 
 _START = Prepared(
@@ -261,12 +266,12 @@ _START = Prepared(
 )
 
 
-def start_tasks(book: Ledger, leased: Collection[tuple[int, str]]) -> None:
-    """Note that leased tasks (seq, stage) have been started: from here on they may fail."""
+def start_tasks(book: Ledger, leased: Collection[Task]) -> None:
+    """Note that leased tasks have been started: from here on they may fail."""
     for batch in batches(leased):
-        _START.run(book.connection, {"b_tasks": [seq for seq, _ in batch], "b_now": book.now})
-    for seq, stage in leased:
-        book.moved(seq, stage, TaskState.leased, TaskState.running)
+        _START.run(book.connection, {"b_tasks": [task.seq for task in batch], "b_now": book.now})
+    for task in leased:
+        book.moved(task, TaskState.running)
 
 
 _OF_TASKS = job_tasks.c.task.in_(bindparam("b_tasks", expanding=True))

@@ -11,9 +11,10 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
-from sqlalchemy import Connection, bindparam, select, update
+from sqlalchemy import bindparam, select, update
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 
@@ -23,7 +24,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
-from stickslip_services.queue.ledger import LIVE, Ending, Ledger, live_jobs, reset_tasks
+from stickslip_services.queue.ledger import LIVE, Ending, Ledger, Task, live_jobs, reset_tasks
 
 logger = logging.getLogger(__name__)
 
@@ -33,32 +34,12 @@ CHECKED_AT_ONCE = 64 * 2**20
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-@dataclass(frozen=True, slots=True)
-class MadeJob:
-    """A live job whose dataset existed before its submission."""
-
-    job: int
-    publish_task: int
-    manifest: Sha256
-    group: Sha256
-    bytes: int
-
-
-@dataclass(frozen=True, slots=True)
-class Maker:
-    """A task whose result is damaged."""
-
-    seq: int
-    stage: Stage
-    state: TaskState
-
-
 def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> int:
     """Reset the tasks that made `digests`, and let `consumer` wait for them; return their number."""
     return remake(book, consumer, _find_makers(book, consumer, set(digests)))
 
 
-def remake(book: Ledger, consumer: int, makers: Sequence[Maker]) -> int:
+def remake(book: Ledger, consumer: int, makers: Sequence[Task]) -> int:
     """Reset tasks, and let `consumer` wait for them; return their number."""
     if not makers:
         return 0
@@ -72,6 +53,7 @@ def remake(book: Ledger, consumer: int, makers: Sequence[Maker]) -> int:
     return len(makers)
 
 
+# Live jobs whose dataset existed before their submission, and has not been checked yet.
 _MADE_JOBS = Prepared(
     select(
         jobs.c.seq,
@@ -87,22 +69,17 @@ _MADE_JOBS = Prepared(
 )
 
 
-def made_jobs(connection: Connection) -> list[MadeJob]:
-    """Return the live jobs whose dataset existed before their submission, and has not been checked yet."""
-    return [MadeJob(*row) for row in _MADE_JOBS.tuples(connection)]
-
-
 def check_made_datasets(context: Context, *, at_most: int | None = None) -> None:
-    """Check the datasets of `made_jobs`, and end the jobs or recompute what is damaged.
+    """Check datasets that existed before the submission of a live job, and end the jobs or recompute what is damaged.
 
     All files are read. Datasets of more than `at_most` bytes are left for a call without it.
     """
     with context.database.read() as connection:
-        found = made_jobs(connection)
+        found = _MADE_JOBS.rows(connection)
     for made in found:
         if at_most is None or made.bytes <= at_most:
             try:
-                damaged = damaged_files(context.store, made.manifest, made.group)
+                damaged = damaged_files(context.store, made.manifest, made.group_digest)
             except OSError as error:  # out of reach: the next sweep tries again
                 logger.warning("an existing dataset cannot be checked now: %s", error)
                 continue
@@ -110,27 +87,27 @@ def check_made_datasets(context: Context, *, at_most: int | None = None) -> None
                 end_made(book, made, damaged)
 
 
-def end_made(book: Ledger, made: MadeJob, damaged: Mapping[str, Sha256] | None) -> None:
-    """End a job whose dataset is intact; otherwise reset the tasks that made the damaged files.
+def end_made(book: Ledger, made: Any, damaged: Mapping[str, Sha256] | None) -> None:
+    """End a job (a row of `_MADE_JOBS`) whose dataset is intact; otherwise reset the tasks that made the damaged files.
 
     `damaged` has the paths and digests of the damaged files; None if the manifest itself cannot be trusted.
     """
-    if made not in made_jobs(book.connection):
+    if made not in _MADE_JOBS.rows(book.connection):
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
         own = dataset_versions.c.publish_task == made.publish_task
         book.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=book.now, damaged=0))
         ending = Ending.published(find_committed(book.connection, made.publish_task))
-        book.end_job(made.job, replace(ending, message=ending.message or "every result was cached"))
+        book.end_job(made.seq, replace(ending, message=ending.message or "every result was cached"))
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
-    set_job_state(book.connection, made.job, JobState.queued, book.now, message=message)
-    reopen(book, [Maker(made.publish_task, Stage.publish, TaskState.succeeded)])
+    set_job_state(book.connection, made.seq, JobState.queued, book.now, message=message)
+    reopen(book, [Task(made.publish_task, Stage.publish, TaskState.succeeded)])
     recompute(book, made.publish_task, damaged.values() if damaged else ())
 
 
-def reopen(book: Ledger, makers: Iterable[Maker]) -> None:
+def reopen(book: Ledger, makers: Iterable[Task]) -> None:
     """Reset ended tasks that a live job needs. Their outputs stay until there are new ones."""
     ended = [maker for maker in makers if maker.state.is_over]
     job_of = live_jobs(book.connection, [maker.seq for maker in ended])
@@ -141,28 +118,28 @@ def reopen(book: Ledger, makers: Iterable[Maker]) -> None:
         edges = select(task_dependencies.c.task).where(task_dependencies.c.depends_on.in_(batch))
         dependents.update(book.connection.scalars(edges))
     _wait_for(book, dependents)
-    reset_tasks(book, [(maker.seq, maker.stage, maker.state) for maker in ended], job_of)
+    reset_tasks(book, ended, job_of)
 
 
-def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Maker]:
+def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Task]:
     """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
-    makers: list[Maker] = []
+    makers: list[Task] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
         below: set[int] = set()
         for batch in batches(level):
             rows = book.connection.execute(
-                select(tasks.c.seq, tasks.c.stage, tasks.c.state, tasks.c.output)
+                select(*Task.columns(), tasks.c.output)
                 .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
                 .where(task_dependencies.c.task.in_(batch))
                 .distinct()
             )
-            for seq, stage, state, output in rows:
-                made = digests.intersection(_DIGEST.findall(output or ""))
-                if seq not in seen and made:
-                    makers.append(Maker(seq, Stage(stage), TaskState(state)))
+            for row in rows:
+                made = digests.intersection(_DIGEST.findall(row.output or ""))
+                if row.seq not in seen and made:
+                    makers.append(Task.of(row))
                     digests = digests - made
-                below.add(seq)
+                below.add(row.seq)
         level = below - seen
         seen |= below
     return makers

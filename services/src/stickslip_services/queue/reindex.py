@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import select, update
 from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.base.states import TaskState
+from stickslip_schemas.base.states import Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.plan.grid import dataset_id
@@ -25,7 +25,7 @@ from stickslip_services.catalog.versions import (
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import dataset_versions, jobs, tasks
 from stickslip_services.queue.closing import ledger
-from stickslip_services.queue.ledger import Ending
+from stickslip_services.queue.ledger import Ending, Task
 from stickslip_services.queue.plan import Terms, pieces
 from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
 
@@ -100,7 +100,7 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
                 .where(tasks.c.seq == task)
                 .values(state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at)
             )
-            book.moved(task, "publish", TaskState.pending, TaskState.succeeded)
+            book.moved(Task(task, Stage.publish, TaskState.pending), TaskState.succeeded)
             reserve_number(connection, manifest.dataset, manifest.version, task)
             commit_version(connection, task, read_version(store, output), name=manifest.spec.name, now=made_at)
             ending = Ending.published(find_committed(connection, task))

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 from sqlalchemy import bindparam, delete, insert, select, update
 from stickslip_schemas.base.states import Reason, Stage, TaskState
-from stickslip_schemas.documents.responses import TaskStateEvent
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
 from stickslip_schemas.format.manifest import seal_text
@@ -33,7 +32,7 @@ from stickslip_services.database.tables import jobs, previews, task_dependencies
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import row_digest, task_id, task_key
-from stickslip_services.queue.ledger import HELD_COLUMNS, LIVE, Ending, HeldTask, Ledger, start_tasks
+from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, Task, start_tasks
 from stickslip_services.queue.recompute import recompute
 from stickslip_services.queue.retries import fail_tries, give_back, lose
 from stickslip_services.queue.workers import find_worker, note_heard
@@ -56,7 +55,7 @@ _NOTE_REPORT = Prepared(
 )
 _FIND = Prepared(
     select(
-        *HELD_COLUMNS,
+        *HeldTask.columns(),
         *(tasks.c[name] for name in ("kind", "cost_group", "owner", "reported_by", "reported_token")),
     ).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
 )
@@ -195,7 +194,6 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, Any]:
 
 def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[str, ManifestSummary]) -> TaskResult:
     """Return the result, or a failure where it does not fit the task."""
-    name = task_id(task.stage, task.key)
     wrong: str | None = None
     reason = Reason.internal_error
     if result.output is not None and result.output.stage != task.stage:
@@ -205,7 +203,7 @@ def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[st
     elif result.output is not None and task.stage is Stage.publish:
         reason = Reason.storage_error
         reserved = find_reserved(book.connection, task.seq)
-        version = versions.get(name)
+        version = versions.get(task.name)
         if version is None or (version.dataset, version.version) != reserved:
             wrong = f"the manifest is not that of {reserved}"
     if wrong is None:
@@ -216,7 +214,7 @@ def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[st
 def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]) -> list[_Ended]:
     """Store results; return the failures."""
     # Who reports a result has started the task, whether or not a heartbeat said so in between.
-    start_tasks(book, [(end.task.seq, end.task.stage) for end in ended if end.task.state is TaskState.leased])
+    start_tasks(book, [end.task for end in ended if end.task.state is TaskState.leased])
     ended = [replace(end, task=replace(end.task, state=TaskState.running)) for end in ended]
     settled = [end for end in ended if end.result.outcome != "failed"]
     _settle(book, settled)
@@ -226,7 +224,7 @@ def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, Man
             book.connection.execute(delete(previews).where(previews.c.task == end.task.seq))  # of an earlier run
             book.connection.execute(insert(previews).values(task=end.task.seq, digest=output.preview))
         elif isinstance(output, PublishOutput):
-            _commit(book, end.task.seq, versions[task_id(end.task.stage, end.task.key)])
+            _commit(book, end.task.seq, versions[end.task.name])
     return [end for end in ended if end.result.outcome == "failed"]
 
 
@@ -245,43 +243,38 @@ def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
 
 def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
     """Store results, and release the tasks that depend on them."""
-    if not settled:
-        return
     _SETTLE.run_all(
         book.connection,
         [
-            {
-                "b_seq": end.task.seq,
-                "b_state": end.result.outcome,
-                "b_reason": end.result.reason,
-                "b_message": end.result.message,
-                "b_output": output,
-                "b_digest": row_digest(end.task.key, end.result.outcome, end.result.reason, end.result.message, output),
-                "b_cpu": end.result.cpu_seconds,
-                "b_wall": end.result.wall_seconds,
-                "b_now": book.now,
-            }
+            _settled(book, end.task.seq, end.task.key, result.outcome, result.reason, result.message, output)
+            | {"b_cpu": result.cpu_seconds, "b_wall": result.wall_seconds}
             for end in settled
-            for output in [None if end.result.output is None else end.result.output.model_dump_json()]
+            for result in [end.result]
+            for output in [None if result.output is None else result.output.model_dump_json()]
         ],
     )
     rejected: dict[int, tuple[Reason, str]] = {}
     for end in settled:
         task, result = end.task, end.result
         state = TaskState(result.outcome)
-        book.moved(task.seq, task.stage, TaskState.running, state)
+        book.moved(task, state)
         # Rejections often come early, so their durations are not representative.
         call_seconds = None if state is TaskState.rejected else result.call_seconds
         cost = (result.cpu_seconds, result.wall_seconds, call_seconds)
         book.ran(Run(task.seq, task.stage, end.kind, end.cost_group, *cost))
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
-            name = task_id(task.stage, task.key)
-            event = TaskStateEvent(
-                task_id=name, stage=task.stage, state=state, reason=result.reason, message=result.message
-            )
-            book.emit(task.seq, event)
+            book.emit(task, state, result.reason, result.message)
     _release_dependents(book, [end.task.seq for end in settled], rejected)
+
+
+def _settled(
+    book: Ledger, seq: int, key: bytes, state: str, reason: Reason | None, message: str, output: str | None
+) -> dict[str, Any]:
+    """Return the parameters of `_SETTLE` for a task whose run took no time."""
+    made = {"b_state": state, "b_reason": reason, "b_message": message, "b_output": output}
+    digest = row_digest(key, *made.values())
+    return {"b_seq": seq, **made, "b_digest": digest, "b_cpu": None, "b_wall": None, "b_now": book.now}
 
 
 def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
@@ -292,33 +285,12 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
     waits = Counter(task for _, task, _, _, _ in edges)
     _COUNT_DOWN.run_all(book.connection, [{"b_seq": task, "b_settled": count} for task, count in waits.items()])
     doomed = [
-        (task, key, state, rejected[dependency])
+        (Task(task, Stage.render, TaskState(state)), key, rejected[dependency])
         for dependency, task, key, stage, state in edges
         if stage == Stage.render and dependency in rejected and not TaskState(state).is_settled
     ]
-    if not doomed:
-        return
-    book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq == bindparam("b_seq"))
-        .values(
-            state=TaskState.rejected,
-            reason=bindparam("b_reason"),
-            message=bindparam("b_message"),
-            output=None,
-            digest=bindparam("b_digest"),
-            finished_at=book.now,
-        ),
-        [
-            {
-                "b_seq": task,
-                "b_reason": why[0],
-                "b_message": why[1],
-                "b_digest": row_digest(key, "rejected", *why, None),
-            }
-            for task, key, _, why in doomed
-        ],
-    )
-    for task, _, state, _ in doomed:
-        book.moved(task, Stage.render, state, TaskState.rejected)
-    _release_dependents(book, [task for task, *_ in doomed], {})
+    settled_too = [_settled(book, task.seq, key, TaskState.rejected, *why, None) for task, key, why in doomed]
+    _SETTLE.run_all(book.connection, settled_too)
+    for task, _, _ in doomed:
+        book.moved(task, TaskState.rejected)
+    _release_dependents(book, [task.seq for task, _, _ in doomed], {})

@@ -12,21 +12,19 @@ from typing import Any
 
 from sqlalchemy import Connection, func, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, TaskState
-from stickslip_schemas.documents.responses import TaskStateEvent
 
-from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import (
-    HELD_COLUMNS,
     LIVE,
     RUNNABLE,
     Ending,
     HeldTask,
     Ledger,
+    Task,
     cancel_tasks,
     live_jobs,
     release,
@@ -37,7 +35,7 @@ from stickslip_services.settings import Settings
 def find_held(book: Ledger, owners: Sequence[str]) -> list[HeldTask]:
     """Return the leased tasks of workers."""
     held = text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(owners)  # in the words of the partial index
-    return [HeldTask.of(row) for row in book.connection.execute(select(*HELD_COLUMNS).where(*held))]
+    return [HeldTask.of(row) for row in book.connection.execute(select(*HeldTask.columns()).where(*held))]
 
 
 def give_back(book: Ledger, held: Sequence[HeldTask]) -> None:
@@ -69,42 +67,35 @@ def fail_tries(book: Ledger, failures: Sequence[tuple[HeldTask, Reason, str]], s
         retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
         values = {"tries": tries, "reason": reason, "message": message, "retry_at": retry_at}
         release(book, task, TaskState.soft_failed, job=job, **values)
-        _emit(book, task, TaskState.soft_failed, reason, message)
+        book.emit(task, TaskState.soft_failed, reason, message)
 
 
 def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, times: int, settings: Settings) -> None:
     """Let a task fail for good after `times` failures or losses."""
     tries = task.tries + (reason is not Reason.worker_lost)
     values = {"job": job, "tries": tries, "finished_at": book.now}
-    name = task_id(task.stage, task.key)
     if not reason.ends_a_process:
         release(book, task, TaskState.failed, reason=reason, message=message, **values)
-        _emit(book, task, TaskState.failed, reason, message)
-        _fail_jobs(book, task, f"task {name} failed {times} times, at last with {reason}: {message}", settings)
+        book.emit(task, TaskState.failed, reason, message)
+        _fail_jobs(book, task, f"task {task.name} failed {times} times, at last with {reason}: {message}", settings)
         return
     message = (
-        f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(name, settings)}"
+        f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {reproducer(task.name, settings)}"
     )
     release(book, task, TaskState.failed, reason=Reason.quarantined, message=message, **values)
-    _emit(book, task, TaskState.failed, Reason.quarantined, message)
+    book.emit(task, TaskState.failed, Reason.quarantined, message)
     for job_seq in _live_holders(book, task):
         # The counters follow only when the ledger is closed.
         failed = select(func.count()).join(job_tasks, job_tasks.c.task == tasks.c.seq)
         failed = failed.where(job_tasks.c.job == job_seq, tasks.c.state == TaskState.failed)
         count = int(book.connection.scalar(failed) or 0)
         if count > settings.max_quarantined:
-            _fail_jobs(book, task, f"{count} of its tasks were quarantined, at last {name}: {message}", settings)
+            _fail_jobs(book, task, f"{count} of its tasks were quarantined, at last {task.name}: {message}", settings)
             return
         state = JobState(book.connection.execute(select(jobs.c.state).where(jobs.c.seq == job_seq)).scalar_one())
         if state in RUNNABLE:
-            news = f"task {name} was {message}. The job goes on with the others"
+            news = f"task {task.name} was {message}. The job goes on with the others"
             set_job_state(book.connection, job_seq, state, book.now, reason=Reason.quarantined, message=news)
-
-
-def _emit(book: Ledger, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
-    name = task_id(task.stage, task.key)
-    event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
-    book.emit(task.seq, event)
 
 
 # A lease ends when it has had its duration, and nothing has been heard of its worker for as long.
@@ -112,7 +103,7 @@ _EXPIRED = (
     "tasks.owner IS NOT NULL AND tasks.expires_at <= :b_now "  # in the words of the partial index
     "AND tasks.owner NOT IN (SELECT workers.id FROM workers WHERE workers.last_seen_at > :b_alive_since)"
 )
-_FIND_EXPIRED = Prepared(select(*HELD_COLUMNS).where(text(_EXPIRED)))
+_FIND_EXPIRED = Prepared(select(*HeldTask.columns()).where(text(_EXPIRED)))
 _IS_DUE = Prepared(
     f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) "
     "OR EXISTS (SELECT 1 FROM tasks WHERE tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now)"
@@ -138,17 +129,11 @@ def take_back(context: Context) -> None:
 
 def _retry_due(book: Ledger) -> None:
     """Return tasks whose retry is due to `pending`."""
-    due = book.connection.execute(
-        select(tasks.c.seq, tasks.c.stage).where(text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now)
-    ).all()
-    for batch in batches(due):
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq.in_([row.seq for row in batch]))
-            .values(state=TaskState.pending, retry_at=None)
-        )
-    for seq, stage in due:
-        book.moved(seq, stage, TaskState.soft_failed, TaskState.pending)
+    is_due = text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now
+    due = list(map(Task.of, book.connection.execute(select(*Task.columns()).where(*is_due))))
+    book.connection.execute(update(tasks).where(*is_due).values(state=TaskState.pending, retry_at=None))
+    for task in due:
+        book.moved(task, TaskState.pending)
 
 
 def reproducer(name: str, settings: Settings) -> str:
@@ -175,12 +160,12 @@ def failed_tasks(connection: Connection, job: int, settings: Settings, count: in
 def _still_needed(book: Ledger, held: Sequence[HeldTask]) -> list[tuple[HeldTask, int]]:
     """Return the tasks that a live job still needs, each with the job to charge it to; cancel the others."""
     job_of = live_jobs(book.connection, [task.seq for task in held])
-    cancel_tasks(book, [(task.seq, task.stage, task.state) for task in held if task.seq not in job_of])
+    cancel_tasks(book, [task for task in held if task.seq not in job_of])
     return [(task, job_of[task.seq]) for task in held if task.seq in job_of]
 
 
 def _fail_jobs(book: Ledger, task: HeldTask, message: str, settings: Settings) -> None:
-    command = reproducer(task_id(task.stage, task.key), settings)
+    command = reproducer(task.name, settings)
     ending = Ending(
         JobState.failed,
         Reason.failed_tasks,

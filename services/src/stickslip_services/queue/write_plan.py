@@ -7,7 +7,8 @@ wait for it; if it failed or was cancelled, the new job starts it again.
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.states import JobState, Stage, TaskState
@@ -25,7 +26,7 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
-from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, Ledger, charge_tasks, reset_tasks
+from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, Ledger, Task, charge_tasks, reset_tasks
 from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
@@ -99,12 +100,11 @@ def _has_started_tasks(connection: Connection, job: int) -> bool:
     return bool(connection.scalar(query))
 
 
-class _Known(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Known(Task):
     """A task that was in the database before the piece."""
 
-    seq: int
-    stage: Stage
-    state: TaskState
+    key: bytes
     reason: str | None
     message: str
     cost_group: str
@@ -139,8 +139,8 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     for (stage, _, state), count in new.items():
         book.inserted[stage, state] += count
     _add_counts(connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared))
-    lost = [(task.seq, task.stage, task.state) for task in shared if task.state in _LOST]
-    reset_tasks(book, lost, dict.fromkeys((seq for seq, _, _ in lost), job))  # its moves change the counts
+    lost = [task for task in shared if task.state in _LOST]
+    reset_tasks(book, lost, dict.fromkeys((task.seq for task in lost), job))  # its moves change the counts
     for key, old in known.items():
         if old.state in _LOST and key in plan.tasks:  # its row may have been damaged
             values = {"payload": _payload(plan.tasks[key], job), "build": plan.tasks[key].build}
@@ -162,10 +162,9 @@ def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
     found: dict[bytes, _Known] = {}
     if not connection.scalar(select(tasks.c.seq).limit(1)):
         return found
-    columns = [tasks.c[name] for name in ("key", *_Known._fields)]
     for batch in batches(keys):
-        for key, seq, stage, state, *rest in connection.execute(select(*columns).where(tasks.c.key.in_(batch))):
-            found[key] = _Known(seq, Stage(stage), TaskState(state), *rest)
+        for row in connection.execute(select(*_Known.columns()).where(tasks.c.key.in_(batch))):
+            found[row.key] = _Known.of(row)
     return found
 
 
