@@ -3,8 +3,8 @@
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 from sqlalchemy import Connection, bindparam, select
 from sqlalchemy.exc import NoResultFound
@@ -25,6 +25,7 @@ from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
 from stickslip_services.queue.damage import check_results, check_samples, read_plan
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id, task_key
+from stickslip_services.queue.ledger import KeyedTask
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
@@ -36,23 +37,12 @@ Publish = Callable[[bytes], Sha256]
 
 
 @dataclass(frozen=True, slots=True)
-class StoredTask:
-    """The columns of a task that define its document."""
+class StoredTask(KeyedTask):
+    """A task with all that defines its document."""
 
-    seq: int
-    key: bytes
-    stage: Stage
     build: str
     payload: str
     preview: bool
-
-    @classmethod
-    def of(cls, row: Any) -> Self:
-        """Return the task of a row of `tasks`."""
-        return cls(row.seq, row.key, Stage(row.stage), row.build, row.payload, bool(row.preview))
-
-
-STORED_COLUMNS = tuple(field.name for field in fields(StoredTask))
 
 
 def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish: Publish) -> dict[int, AnyTask]:
@@ -121,7 +111,9 @@ def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, 
         if simulation.output is None:
             raise ConflictError(f"the render {task.key.hex()} has nothing to render: its simulation was rejected")
         record = json.loads(simulation.output)["record"]
-        composed[task.seq] = RenderTask.model_validate({"render": render, "record": record, "preview": task.preview})
+        composed[task.seq] = RenderTask.model_validate(
+            {"render": render, "record": record, "preview": bool(task.preview)}
+        )
     return composed
 
 

@@ -9,7 +9,6 @@ of each stage it runs.
 
 import heapq
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, select, text, update
@@ -17,10 +16,9 @@ from stickslip_schemas.base.states import Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
-from stickslip_services.queue.compose import STORED_COLUMNS, StoredTask, reserve_version
+from stickslip_services.queue.compose import StoredTask, reserve_version
 from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
-from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger, Task
+from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
 
@@ -40,7 +38,9 @@ _READY_TASK = Prepared(
     .limit(1)
 )
 _READY_TASKS = Prepared(
-    select(*(tasks.c[name] for name in ("job", "kind", "cost_group", "tries", "token", "attempts", *STORED_COLUMNS)))
+    select(
+        *StoredTask.columns(), *(tasks.c[name] for name in ("job", "kind", "cost_group", "tries", "token", "attempts"))
+    )
     .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
     .order_by(tasks.c.seq)
     .limit(bindparam("b_count"))
@@ -102,50 +102,30 @@ def has_ready_task(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Grant:
-    """A leased task that is not composed yet."""
-
-    task: StoredTask
-    job: int
-    task_id: str
-    token: int
-    attempt: int
-    limit_seconds: float | None
-
-
 def grant_leases(
     book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings, *, at_most: float | None
-) -> list[Grant]:
-    """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds."""
+) -> list[tuple[StoredTask, dict[str, Any]]]:
+    """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds.
+
+    Return the tasks, each with the other fields of its `Lease`.
+    """
     granted: list[Any] = []
     costs = read_costs(book.connection)
     for stage in reversed(Stage):  # what is nearest to a dataset first
         count = min(wanted.get(stage, 0), settings.lease_limit)
         if count > 0:
             granted.extend(_pick(book.connection, worker, stage, count, costs, at_most))
-    if not granted:
-        return []
-    for task in granted:
-        book.moved(Task(task.seq, Stage(task.stage), TaskState.pending), TaskState.leased)
     lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
-    _LEASE.run_all(book.connection, [{"b_seq": task.seq, "b_token": task.token + 1, **lease} for task in granted])
-    grants = [
-        Grant(
-            task=StoredTask.of(task),
-            job=task.job,
-            task_id=task_id(task.stage, task.key),
-            token=task.token + 1,
-            attempt=task.attempts + 1,
-            limit_seconds=limit_seconds(
-                costs.get((task.stage, task.kind, task.cost_group)), task.tries, floor=settings.limit_floor_seconds
-            ),
-        )
-        for task in granted
-    ]
-    for grant in grants:
-        if grant.task.stage is Stage.publish:
-            reserve_version(book.connection, grant.task)
+    _LEASE.run_all(book.connection, [{"b_seq": row.seq, "b_token": row.token + 1, **lease} for row in granted])
+    grants = []
+    for row in granted:
+        task, cost = StoredTask.of(row), costs.get((row.stage, row.kind, row.cost_group))
+        limit = limit_seconds(cost, row.tries, floor=settings.limit_floor_seconds)
+        terms = {"task_id": task.name, "token": row.token + 1, "attempt": row.attempts + 1, "limit_seconds": limit}
+        grants.append((task, terms))
+        book.moved(task, TaskState.leased)
+        if task.stage is Stage.publish:
+            reserve_version(book.connection, task)
     return grants
 
 

@@ -25,10 +25,10 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
-from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, compose_tasks
+from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, StoredTask, compose_tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.damage import mend
-from stickslip_services.queue.grants import Grant, grant_leases, has_ready_task
+from stickslip_services.queue.grants import grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.ledger import (
@@ -186,31 +186,20 @@ def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
 
 
 def _compose_leases(
-    connection: Connection, grants: Sequence[Grant], publish: Publish
+    connection: Connection, grants: Sequence[tuple[StoredTask, dict[str, Any]]], publish: Publish
 ) -> tuple[tuple[Lease, ...], dict[int, Sequence[int]]]:
     """Return the leases of granted tasks, and by task the damaged results where rows that it needs are damaged."""
     composed: dict[int, AnyTask] = {}
     damaged: dict[int, Sequence[int]] = {}
     try:
-        composed = compose_tasks(connection, [grant.task for grant in grants], publish)
+        composed = compose_tasks(connection, [task for task, _ in grants], publish)
     except UNSOUND:
-        for grant in grants:
+        for task, _ in grants:
             try:
-                composed |= compose_tasks(connection, [grant.task], publish)
+                composed |= compose_tasks(connection, [task], publish)
             except UNSOUND as error:
-                damaged[grant.task.seq] = getattr(error, "results", ())
-    leases = tuple(
-        Lease(
-            task_id=grant.task_id,
-            token=grant.token,
-            attempt=grant.attempt,
-            limit_seconds=grant.limit_seconds,
-            task=composed[grant.task.seq],
-        )
-        for grant in grants
-        if grant.task.seq in composed
-    )
-    return leases, damaged
+                damaged[task.seq] = getattr(error, "results", ())
+    return tuple(Lease(task=composed[task.seq], **terms) for task, terms in grants if task.seq in composed), damaged
 
 
 def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -> None:

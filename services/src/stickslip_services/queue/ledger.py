@@ -86,19 +86,25 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldTask(Task):
-    """A leased task, or one whose lease has just ended."""
+class KeyedTask(Task):
+    """A task with its content key."""
 
     key: bytes
-    tries: int
-    losses: int
-    token: int
-    expires_at: float
 
     @property
     def name(self) -> str:
         """Name of the task outside the database."""
         return task_id(self.stage, self.key)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldTask(KeyedTask):
+    """A leased task, or one whose lease has just ended."""
+
+    tries: int
+    losses: int
+    token: int
+    expires_at: float
 
 
 _HOLDERS = Prepared(

@@ -26,7 +26,7 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
-from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, Ledger, Task, charge_tasks, reset_tasks
+from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, KeyedTask, Ledger, charge_tasks, reset_tasks
 from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
 _LOST = (TaskState.failed, TaskState.cancelled)
@@ -101,10 +101,9 @@ def _has_started_tasks(connection: Connection, job: int) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known(Task):
+class _Known(KeyedTask):
     """A task that was in the database before the piece."""
 
-    key: bytes
     reason: str | None
     message: str
     cost_group: str
