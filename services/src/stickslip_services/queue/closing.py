@@ -73,8 +73,8 @@ def close(book: Ledger) -> None:
     for job, ending in book.endings.items():
         _end_job(book, job, ending)
     if not {JobState.cancelling, JobState.pausing}.isdisjoint(state for _, state, _ in open_jobs):
-        _finish_cancelling(book.connection, book.now)
-        _finish_pausing(book.connection, book.now)
+        _finish_cancelling(book)
+        _finish_pausing(book)
 
 
 def _settle(book: Ledger, given_up: frozenset[int]) -> frozenset[int]:
@@ -131,7 +131,7 @@ def _emit(book: Ledger) -> None:
     holders = book.holders(task for task, _ in book.news)
     for task, event in book.news:
         for holder in holders.get(task, ()):
-            append_event(book.connection, holder.job, EventName.task_state, event, book.now)
+            append_event(book, holder.job, EventName.task_state, event)
 
 
 def _end_job(book: Ledger, job: int, ending: Ending) -> None:
@@ -141,9 +141,8 @@ def _end_job(book: Ledger, job: int, ending: Ending) -> None:
             .where(jobs.c.seq == job)
             .values(**ending.dataset.model_dump(), rejected_count=ending.rejected_count)
         )
-        event = DatasetPublishedEvent(dataset=ending.dataset)
-        append_event(book.connection, job, EventName.dataset_published, event, book.now)
-    set_job_state(book.connection, job, ending.state, book.now, reason=ending.reason, message=ending.message)
+        append_event(book, job, EventName.dataset_published, DatasetPublishedEvent(dataset=ending.dataset))
+    set_job_state(book, job, ending.state, reason=ending.reason, message=ending.message)
 
 
 def _count(connection: Connection, moves: list[tuple[Task, TaskState]], holders: dict[int, list[Holder]]) -> None:
@@ -189,30 +188,29 @@ def _start_jobs(book: Ledger, job_seqs: Collection[int]) -> None:
         if job not in job_seqs:
             continue
         if state == JobState.queued:
-            set_job_state(book.connection, job, JobState.running, book.now)
+            set_job_state(book, job, JobState.running)
         else:  # it runs when it has been planned
             book.connection.execute(update(jobs).where(jobs.c.seq == job).values(started_at=book.now))
 
 
-def _finish_cancelling(connection: Connection, now: float) -> None:
+def _finish_cancelling(book: Ledger) -> None:
     """Cancel the `cancelling` jobs of which no task waits or is on lease any more, unless another job needs it."""
     given_up = select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.cancelling, jobs.c.given_up.is_(None))
-    for job in connection.scalars(given_up).all():
-        held = held_tasks(connection, job)
-        if not set(held) - live_jobs(connection, held).keys():
+    for job in book.connection.scalars(given_up).all():
+        held = held_tasks(book.connection, job)
+        if not set(held) - live_jobs(book.connection, held).keys():
             message = "cancelled; what had been finished is kept and will not be done again"
-            set_job_state(connection, job, JobState.cancelled, now, reason=Reason.cancelled, message=message)
+            set_job_state(book, job, JobState.cancelled, reason=Reason.cancelled, message=message)
 
 
-def _finish_pausing(connection: Connection, now: float) -> None:
+def _finish_pausing(book: Ledger) -> None:
     """Pause the `pausing` jobs of which no task is on lease any more, unless a runnable job needs it."""
-    for job in connection.scalars(select(jobs.c.seq).where(_OPEN, jobs.c.state == JobState.pausing)).all():
-        held = held_tasks(connection, job)
-        if not set(held) - runnable_tasks(connection, held):
-            reason, message = connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job)).one()
-            if reason is None:
-                message = "paused; resume it to go on"
-            set_job_state(connection, job, JobState.paused, now, reason=reason, message=message)
+    pausing = select(jobs.c.seq, jobs.c.reason, jobs.c.message).where(_OPEN, jobs.c.state == JobState.pausing)
+    for job, reason, message in book.connection.execute(pausing).all():
+        held = held_tasks(book.connection, job)
+        if not set(held) - runnable_tasks(book.connection, held):
+            shown = message if reason else "paused; resume it to go on"
+            set_job_state(book, job, JobState.paused, reason=reason, message=shown)
 
 
 def held_tasks(connection: Connection, job: int) -> list[int]:

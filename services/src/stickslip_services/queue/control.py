@@ -30,7 +30,8 @@ def cancel_job(context: Context, job_id: str) -> JobDetail:
         if job.state not in (JobState.cancelling, JobState.cancelled):
             if not JobState(job.state).is_open:
                 raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
-            _set_state(book, job.seq, JobState.cancelling, Reason.cancelled, "tasks that are running are being stopped")
+            message = "tasks that are running are being stopped"
+            set_job_state(book, job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
             _give_up_more(book, job.seq, 0)
     return _shown(context, job.seq)
 
@@ -65,7 +66,8 @@ def pause_job(context: Context, job_id: str) -> JobDetail:
                 f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
             )
         if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
-            _set_state(book, job.seq, JobState.pausing, None, "nothing more is started; tasks that are running finish")
+            message = "nothing more is started; tasks that are running finish"
+            set_job_state(book, job.seq, JobState.pausing, message=message)
             charge_waiting_tasks(book.connection, job.seq)
     return _shown(context, job.seq)
 
@@ -98,7 +100,7 @@ def hold_jobs(book: Ledger, trouble: str) -> None:
     """Pause all runnable jobs because the store takes no results."""
     message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
     for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
-        _set_state(book, seq, JobState.pausing, Reason.store_unavailable, message)
+        set_job_state(book, seq, JobState.pausing, reason=Reason.store_unavailable, message=message)
         charge_waiting_tasks(book.connection, seq)
 
 
@@ -138,12 +140,8 @@ def _resume(book: Ledger, job: Row[Any]) -> None:
     if job.builds is not None and job.planned < job.sample_count:
         state = JobState.planning
     reason, message = (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
-    _set_state(book, job.seq, state, reason, message)
+    set_job_state(book, job.seq, state, reason=reason, message=message)
     charge_waiting_tasks(book.connection, job.seq)
-
-
-def _set_state(book: Ledger, job: int, state: JobState, reason: Reason | None, message: str) -> None:
-    set_job_state(book.connection, job, state, book.now, reason=reason, message=message)
 
 
 def _shown(context: Context, job: int) -> JobDetail:

@@ -11,6 +11,7 @@ from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.responses import EventName, JobStateEvent
 
 from stickslip_services.database.tables import events, jobs
+from stickslip_services.queue.ledger import Ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,24 +28,15 @@ class StoredEvent:
         return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
 
 
-def set_job_state(
-    connection: Connection,
-    job: int,
-    state: JobState,
-    now: float,
-    *,
-    reason: Reason | None = None,
-    message: str = "",
-) -> None:
+def set_job_state(book: Ledger, job: int, state: JobState, *, reason: Reason | None = None, message: str = "") -> None:
     """Set the state of a job with its reason and message, and store the event."""
     values: dict[str, object] = {"state": state, "reason": reason, "message": message}
     if state is JobState.running:
-        values["started_at"] = func.coalesce(jobs.c.started_at, now)
+        values["started_at"] = func.coalesce(jobs.c.started_at, book.now)
     if not state.is_open:
-        values["finished_at"] = now
-    connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
-    event = JobStateEvent(state=state, reason=reason, message=message)
-    append_event(connection, job, EventName.job_state, event, now)
+        values["finished_at"] = book.now
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
+    append_event(book, job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message))
 
 
 def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
@@ -58,5 +50,6 @@ def read_events(connection: Connection, job: int, *, after: int, limit: int) -> 
     return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
 
 
-def append_event(connection: Connection, job: int, name: EventName, data: Document, now: float) -> None:
-    connection.execute(insert(events).values(job=job, name=name, data=data.model_dump_json(), created_at=now))
+def append_event(book: Ledger, job: int, name: EventName, data: Document) -> None:
+    row = {"job": job, "name": name, "data": data.model_dump_json(), "created_at": book.now}
+    book.connection.execute(insert(events).values(row))

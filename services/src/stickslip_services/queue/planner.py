@@ -16,7 +16,6 @@ from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
-from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.damage import terms_of
 from stickslip_services.queue.events import set_job_state
@@ -55,20 +54,17 @@ def plan_waiting_jobs(context: Context) -> None:
         except PresetNotCertifiedError as error:
             refusal, reason = str(error), Reason.preset_not_certified
         plan = expand(spec, terms, previews=context.settings.previews_per_job) if terms and at_once else None
-        with context.database.write() as connection:
-            if row.seq not in {other.seq for other in unplanned_jobs(connection)}:
+        with context.ledger() as book:
+            if row.seq not in {other.seq for other in unplanned_jobs(book.connection)}:
                 continue  # cancelled, or planned by another coordinator
-            now = context.clock()
             if terms is None:
-                set_job_state(connection, row.seq, JobState.failed, now, reason=reason, message=refusal)
+                set_job_state(book, row.seq, JobState.failed, reason=reason, message=refusal)
                 continue
-            with ledger(connection, now) as book:
-                begin_planning(book, row.seq, terms)
-                if plan is not None:
-                    write_plan(book, row.seq, plan)
-                else:
-                    set_job_state(connection, row.seq, JobState.planning, now)
-        context.notifier.notify()
+            begin_planning(book, row.seq, terms)
+            if plan is not None:
+                write_plan(book, row.seq, plan)
+            else:
+                set_job_state(book, row.seq, JobState.planning)
 
 
 class Planner:
@@ -108,7 +104,6 @@ class Planner:
                 raise  # the disk or the database: it may work the next time
             logger.exception("job %s cannot be planned", row.id)
             self._fail(row, error)
-        self._context.notifier.notify()
         return True
 
     def _claim(self, connection: Connection) -> Row[tuple[object, ...]] | None:
@@ -145,21 +140,19 @@ class Planner:
         )
 
     def _write(self, job: int, piece: Plan) -> None:
-        with self._context.database.write() as connection:
+        with self._context.ledger() as book:
             still = (jobs.c.seq == job, jobs.c.state == JobState.planning, jobs.c.planner == self._name)
-            if connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
+            if book.connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
                 self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
                 return
-            with ledger(connection, self._context.clock()) as book:
-                write_plan(book, job, piece)
+            write_plan(book, job, piece)
         self._end = piece.end
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-        with self._context.database.write() as connection:
-            if connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                with ledger(connection, self._context.clock()) as book:
-                    book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))
+        with self._context.ledger() as book:
+            if book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
+                book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))
 
 
 def _pack_keys(connection: Connection, job: int) -> list[str]:

@@ -102,7 +102,7 @@ def end_made(book: Ledger, made: Any, damaged: Mapping[str, Sha256] | None) -> N
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
-    set_job_state(book.connection, made.seq, JobState.queued, book.now, message=message)
+    set_job_state(book, made.seq, JobState.queued, message=message)
     reopen(book, [Task(made.publish_task, Stage.publish, TaskState.succeeded)])
     recompute(book, made.publish_task, damaged.values() if damaged else ())
 

@@ -95,7 +95,7 @@ def _fail(book: Ledger, task: HeldTask, job: int, reason: Reason, message: str, 
         state = JobState(book.connection.execute(select(jobs.c.state).where(jobs.c.seq == job_seq)).scalar_one())
         if state in RUNNABLE:
             news = f"task {task.name} was {message}. The job goes on with the others"
-            set_job_state(book.connection, job_seq, state, book.now, reason=Reason.quarantined, message=news)
+            set_job_state(book, job_seq, state, reason=Reason.quarantined, message=news)
 
 
 # A lease ends when it has had its duration, and nothing has been heard of its worker for as long.

@@ -47,7 +47,7 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
                 spec, terms = read_plan(book.connection, made[0].seq)
                 job = insert_job(book, spec, project=made[0].project)
                 begin_planning(book, job, terms)
-                set_job_state(book.connection, job, JobState.planning, book.now)
+                set_job_state(book, job, JobState.planning)
     key, seal = context.settings.signing_key, seal_text(row.manifest, row.group_digest)
     if found is not None and key is not None and mend_signature(context.store, row.dataset, row.version, seal, key):
         damaged.append(SIGNATURE_NAME)

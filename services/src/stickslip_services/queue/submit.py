@@ -96,11 +96,10 @@ def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> 
 def _enqueue(book: Ledger, job: int, terms: Terms | None, plan: Plan | None) -> None:
     """Queue a new job with its whole plan, or for planning piece by piece, or to wait for the first worker."""
     if terms is None:
-        reason = Reason.waiting_for_worker
-        set_job_state(book.connection, job, JobState.queued, book.now, reason=reason, message=NO_WORKER)
+        set_job_state(book, job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
         return
     begin_planning(book, job, terms)
-    set_job_state(book.connection, job, JobState.planning if plan is None else JobState.queued, book.now)
+    set_job_state(book, job, JobState.planning if plan is None else JobState.queued)
     if plan is not None:
         write_plan(book, job, plan)
 

@@ -220,7 +220,7 @@ def _worker(row: Any) -> RegisteredWorker:
 
 
 _PLANNED_JOBS = Prepared(
-    select(jobs.c.seq, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
+    select(jobs.c.seq, jobs.c.state, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
         jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
     )
 )
@@ -231,22 +231,20 @@ def note_stranded(context: Context) -> None:
     with context.database.read() as connection:
         if not _find_stranded(context, connection):
             return
-    with context.database.write() as connection:
-        for job, message in _find_stranded(context, connection).items():
+    with context.ledger() as book:
+        for (job, state), message in _find_stranded(context, book.connection).items():
             reason = Reason.waiting_for_worker if message else None
-            state = JobState(connection.execute(select(jobs.c.state).where(jobs.c.seq == job)).scalar_one())
-            set_job_state(connection, job, state, context.clock(), reason=reason, message=message)
-    context.notifier.notify()
+            set_job_state(book, job, JobState(state), reason=reason, message=message)
 
 
-def _find_stranded(context: Context, connection: Connection) -> dict[int, str]:
-    """Return the planned jobs whose message must change, with the new message; empty for jobs that are served."""
+def _find_stranded(context: Context, connection: Connection) -> dict[tuple[int, str], str]:
+    """Return the new messages of planned jobs by seq and state, where they change; empty for jobs that are served."""
     alive = alive_workers(context, connection)
     found = {}
     for row in _PLANNED_JOBS.rows(connection):
         message = _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)
         if message != row.message and (message or row.reason == Reason.waiting_for_worker):
-            found[row.seq] = message
+            found[row.seq, row.state] = message
     return found
 
 

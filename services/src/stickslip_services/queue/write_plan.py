@@ -80,17 +80,12 @@ def write_plan(book: Ledger, job: int, piece: Plan) -> None:
     done = {"publish_task": publish_task, "planner": None, "planner_until": None}
     book.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
     if last is TaskState.succeeded:
-        set_job_state(
-            book.connection,
-            job,
-            JobState.queued,
-            book.now,
-            message="the dataset exists already: its files are being checked",
-        )
+        message = "the dataset exists already: its files are being checked"
+        set_job_state(book, job, JobState.queued, message=message)
     elif _has_started_tasks(book.connection, job):
-        set_job_state(book.connection, job, JobState.running, book.now)
+        set_job_state(book, job, JobState.running)
     elif piece.first > 0:
-        set_job_state(book.connection, job, JobState.queued, book.now)
+        set_job_state(book, job, JobState.queued)
 
 
 def _has_started_tasks(connection: Connection, job: int) -> bool:
