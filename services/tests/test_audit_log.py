@@ -69,10 +69,10 @@ def test_what_is_refused_or_fails_leaves_no_line(context: Context, monkeypatch: 
 def test_keys_and_webhooks_have_lines(context: Context) -> None:
     with asking(Asker("user ada")), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
-        revoke_key(connection, key.id, 2.0)
+        revoke_key(connection, key, 2.0)
         hook, sign = create_webhook(connection, sealer(context.settings), "https://example.org/hook", 3.0)
-        retry_webhook(connection, hook.id, 4.0)
-        delete_webhook(connection, hook.id, 5.0)
+        retry_webhook(connection, hook, 4.0)
+        delete_webhook(connection, hook, 5.0)
     found = lines(context)
     assert [(actor, action) for actor, action, _ in found] == [
         ("user ada", action)
@@ -107,7 +107,7 @@ def test_requests_are_told_apart_by_their_keys(settings: Settings, monkeypatch: 
                 answer = httpx.post(f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30)
                 assert answer.status_code == 202, answer.text
         found = [actor for actor, action, _ in lines(application.state.context) if action == "job.submit"]
-    assert found == [f"{made[number % 2][0].id} {('ada', 'bert')[number % 2]}" for number in range(6)]
+    assert found == [f"{made[number % 2][0]} {('ada', 'bert')[number % 2]}" for number in range(6)]
 
 
 def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:

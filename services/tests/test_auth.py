@@ -190,7 +190,7 @@ def test_a_revoked_key_opens_nothing_within_two_seconds(closed: FastAPI, strange
     headers = {"Authorization": f"Bearer {secret}"}
     wait_until(lambda: stranger.get("/v1/jobs", headers=headers).status_code == 200, seconds=3)
     with database.write() as connection:
-        revoke_key(connection, key.id, time.time())
+        revoke_key(connection, key, time.time())
     wait_until(lambda: stranger.get("/v1/jobs", headers=headers).status_code == 401, seconds=2)
 
 

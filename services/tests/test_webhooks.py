@@ -90,7 +90,7 @@ def made(context: Context, url: str) -> tuple[str, str]:
     """Make a webhook; return its id and its secret."""
     with context.database.write() as connection:
         webhook, secret = create_webhook(connection, sealer(context.settings), url, context.clock())
-    return webhook.id, secret
+    return webhook, secret
 
 
 def run_job(context: Context, worker: PretendWorker, gamma: float) -> None:

@@ -6,23 +6,22 @@ An entry is written in the transaction of the change itself, so that neither exi
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, insert, select
+from stickslip_schemas.base.document import Document
 
 from stickslip_services.access.asker import asking, this_asker, this_user
-from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import audit_log
 from stickslip_services.settings import Settings
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(Document):
     """An entry of the audit log."""
 
     at: datetime
@@ -49,10 +48,7 @@ def read_audit_log(connection: Connection, *, subject: str | None = None, limit:
     query = select(audit_log).order_by(audit_log.c.seq.desc()).limit(limit)
     if subject is not None:
         query = query.where(audit_log.c.subject == subject)
-    return [
-        Entry(as_datetime(row.at), row.actor, row.action, row.subject, json.loads(row.details))
-        for row in connection.execute(query)
-    ]
+    return [document_of(Entry, row, details=json.loads(row.details)) for row in connection.execute(query)]
 
 
 @contextmanager

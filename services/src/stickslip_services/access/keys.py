@@ -7,20 +7,20 @@ import secrets
 import threading
 import time
 from collections.abc import Collection
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from cryptography.fernet import Fernet
 from sqlalchemy import Connection, insert, select, update
+from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.access.asker import Asker
 from stickslip_services.access.audit_log import note
 from stickslip_services.access.scopes import Scope, check_project
-from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import api_keys
 from stickslip_services.errors import CommandError, NotFoundError, SettingsError
 from stickslip_services.settings import Settings
@@ -32,8 +32,7 @@ FRESH_SECONDS = 1.0
 """Delay until a new or revoked key takes effect, at most [s]."""
 
 
-@dataclass(frozen=True, slots=True)
-class ApiKey:
+class ApiKey(Document):
     """A key without its secret."""
 
     id: str
@@ -46,31 +45,21 @@ class ApiKey:
 
 def create_key(
     connection: Connection, name: str, scopes: Collection[Scope], now: float, *, project: str = ""
-) -> tuple[ApiKey, str]:
-    """Make a key; return it and its secret, which is not stored. Raise CommandError for a bad name or project."""
+) -> tuple[str, str]:
+    """Make a key; return its id and its secret, which is not stored. Raise CommandError for a bad name or project."""
     if not 1 <= len(name) <= 100:
         raise CommandError(f"name must have 1 to 100 characters, and has {len(name)}")
     secret = f"sk_{secrets.token_urlsafe(32)}"
-    key = _insert(connection, name, scopes, secret, now, project=check_project(project))
+    key_id = _insert(connection, name, scopes, secret, now, project=check_project(project))
     told = [scope for scope in Scope if scope in scopes]
-    note(connection, "key.create", key.id, now, name=name, scopes=told, project=project)
-    return key, secret
+    note(connection, "key.create", key_id, now, name=name, scopes=told, project=project)
+    return key_id, secret
 
 
 def list_keys(connection: Connection) -> list[ApiKey]:
     """Return all keys, also the revoked ones, newest first."""
     rows = connection.execute(select(api_keys).order_by(api_keys.c.seq.desc()))
-    return [
-        ApiKey(
-            id=row.id,
-            name=row.name,
-            scopes=frozenset(map(Scope, row.scopes.split())),
-            project=row.project,
-            created_at=as_datetime(row.created_at),
-            revoked_at=None if row.revoked_at is None else as_datetime(row.revoked_at),
-        )
-        for row in rows
-    ]
+    return [document_of(ApiKey, row, scopes=row.scopes.split()) for row in rows]
 
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:
@@ -143,17 +132,16 @@ class KeyRing:
 
 def _insert(
     connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float, *, project: str = ""
-) -> ApiKey:
-    ordered = [scope for scope in Scope if scope in scopes]
+) -> str:
     key_id = f"key-{secrets.token_hex(8)}"
     connection.execute(
         insert(api_keys).values(
             id=key_id,
             name=name,
             digest=sha256(secret.encode()),
-            scopes=" ".join(ordered),
+            scopes=" ".join(scope for scope in Scope if scope in scopes),
             project=project,
             created_at=now,
         )
     )
-    return ApiKey(key_id, name, frozenset(ordered), project, as_datetime(now), None)
+    return key_id

@@ -12,13 +12,13 @@ import secrets
 import threading
 import time
 from base64 import b64encode
-from dataclasses import dataclass
 from datetime import datetime
 
 import httpx
 from cryptography.fernet import Fernet, InvalidToken
 from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select, update
 from standardwebhooks import Webhook as Signer
+from stickslip_schemas.base.document import Document
 from stickslip_schemas.documents.responses import EventName
 
 from stickslip_services.access.audit_log import note
@@ -26,6 +26,7 @@ from stickslip_services.access.scopes import check_project
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime
 from stickslip_services.database.database import Database
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
 
@@ -53,8 +54,7 @@ TOLD = (EventName.job_state, EventName.dataset_published)
 """Events that are delivered."""
 
 
-@dataclass(frozen=True, slots=True)
-class Webhook:
+class Webhook(Document):
     """A webhook without its secret."""
 
     id: str
@@ -69,8 +69,8 @@ class Webhook:
 
 def create_webhook(
     connection: Connection, sealing: Fernet, url: str, now: float, *, project: str = ""
-) -> tuple[Webhook, str]:
-    """Make a webhook for events of the jobs of a project from now on; return it and its secret, which is kept sealed.
+) -> tuple[str, str]:
+    """Make a webhook for events of the jobs of a project from now on; return its id and its secret, kept sealed.
 
     Raises SettingsError for a bad URL, ValueError for a bad project.
     """
@@ -92,24 +92,13 @@ def create_webhook(
         )
     )
     note(connection, "webhook.create", name, now, url=url, project=project)
-    return Webhook(name, project, url, 0, None, "", as_datetime(now), is_given_up=False), secret
+    return name, secret
 
 
 def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
     """Return all webhooks, newest first."""
-    return [
-        Webhook(
-            id=row.id,
-            project=row.project,
-            url=row.url,
-            failures=row.failures,
-            failing_since=None if row.failing_since is None else as_datetime(row.failing_since),
-            fault=row.fault,
-            created_at=as_datetime(row.created_at),
-            is_given_up=row.failing_since is not None and row.failing_since < now - GIVE_UP_SECONDS,
-        )
-        for row in connection.execute(select(webhooks).order_by(webhooks.c.seq.desc()))
-    ]
+    rows = connection.execute(select(webhooks).order_by(webhooks.c.seq.desc())).all()
+    return [document_of(Webhook, row, is_given_up=(row.failing_since or now) < now - GIVE_UP_SECONDS) for row in rows]
 
 
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:

@@ -9,9 +9,8 @@ from stickslip_schemas.documents.responses import CertificateEntry, Page
 from stickslip_schemas.store import Store
 
 from stickslip_services.access.audit_log import note
-from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import Database
-from stickslip_services.database.paging import PageRequest, read_page
+from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import NotFoundError
 
@@ -65,12 +64,4 @@ def find_certificate(connection: Connection, digest: str) -> Row[tuple[Any, ...]
 
 
 def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:
-    return CertificateEntry(
-        digest=row.digest,
-        preset=row.preset,
-        sim_core=row.sim_core,
-        extent=row.extent,
-        passed=row.passed,
-        created_at=as_datetime(row.created_at),
-        href=f"/v1/certificates/{row.digest}",
-    )
+    return document_of(CertificateEntry, row, href=f"/v1/certificates/{row.digest}")

@@ -19,8 +19,7 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.store import Store
 
 from stickslip_services.access.asker import own_version
-from stickslip_services.clock import as_datetime
-from stickslip_services.database.paging import PageRequest, read_page
+from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
 from stickslip_services.errors import MissingArtifactError, NotFoundError
 
@@ -98,21 +97,5 @@ def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) ->
         .where(dataset_versions.c.dataset == row.id, dataset_versions.c.manifest.is_not(None), own_version())
         .order_by(dataset_versions.c.version)
     )
-    return Dataset(
-        id=row.id,
-        name=row.name,
-        kind=row.kind,
-        spec_digest=row.spec_digest,
-        versions=tuple(
-            DatasetVersion(
-                version=version.version,
-                manifest=version.manifest,
-                group=version.group_digest,
-                created_at=as_datetime(version.created_at),
-                sample_count=version.sample_count,
-                valid_count=version.valid_count,
-                bytes=version.bytes,
-            )
-            for version in versions
-        ),
-    )
+    shown = (document_of(DatasetVersion, version, group=version.group_digest) for version in versions)
+    return document_of(Dataset, row, versions=tuple(shown))

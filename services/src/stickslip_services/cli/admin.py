@@ -43,9 +43,9 @@ def keys() -> None:
 def create_key(name: str, scope: tuple[Scope, ...], project: str, data: Path, database: str | None) -> None:
     """Make a key and print it. It is shown only once, because the database keeps only its digest."""
     with audit.visited(data, database) as connection:
-        key, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
+        key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
-    say(f"{key.id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
+    say(f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
     say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
 
 
@@ -127,9 +127,9 @@ def create_webhook(url: str, project: str, data: Path, database: str | None) -> 
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
     with audit.visited(data, database) as connection:
         sealing = stored_keys.sealer(Settings.chosen(data=data))
-        webhook, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
+        webhook_id, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
     click.echo(secret)
-    say(f"{webhook.id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
+    say(f"{webhook_id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
 
 
 @webhooks.command("list")

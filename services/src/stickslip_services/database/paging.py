@@ -1,9 +1,10 @@
-"""Pages of lists. A token names the last item, so that a page does not change while the list grows."""
+"""Rows as documents, and pages of lists, whose tokens name the last item: a page stays while the list grows."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from pydantic import BaseModel
 from sqlalchemy import Column, Connection, Row, Select
 from stickslip_schemas.documents.responses import Page
 
@@ -13,6 +14,7 @@ TOKEN_PATTERN = r"^[0-9]{1,18}$"
 """Pattern of page tokens; every number is a valid position in a list."""
 
 T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,15 @@ class PageRequest:
     def from_query(cls, page_size: int, page_token: str | None) -> "PageRequest":
         """Read a page token of the form TOKEN_PATTERN."""
         return cls(page_size, None if page_token is None else int(page_token))
+
+
+def document_of(model: type[M], row: Any, **more: Any) -> M:
+    """Return a document with the values of a row, or of an object, for its fields, and with `more`.
+
+    Times, in seconds since 1970, become dates in UTC.
+    """
+    found = {name: getattr(row, name) for name in model.model_fields if name not in more and hasattr(row, name)}
+    return model.model_validate(found | more)
 
 
 def read_page(

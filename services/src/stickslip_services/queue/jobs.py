@@ -9,8 +9,7 @@ from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
 
 from stickslip_services.access.asker import own, own_task
-from stickslip_services.clock import as_datetime
-from stickslip_services.database.paging import PageRequest, read_page
+from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
@@ -107,17 +106,6 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
     if state is not None:
         query = query.where(tasks.c.state == state)
 
-    def shown(row: Row[Any]) -> SampleState:
-        return SampleState(
-            slot=row.slot,
-            sample_key=row.key.hex(),
-            split=row.split,
-            labels=json.loads(row.labels),
-            state=row.state,
-            reason=row.reason,
-            message=row.message,
-        )
-
     def checked(rows: Sequence[Row[Any]]) -> Iterable[SampleState]:
         first = 0 if page.after is None else page.after + 1
         planned = connection.execute(select(jobs.c.planned).where(jobs.c.seq == job)).scalar_one()
@@ -125,7 +113,7 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
         check_samples(rows, page_slots if state is None else [row.slot for row in rows])
         settled = [row.seq for row in rows if row.state not in _UNSETTLED]
         check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
-        return map(shown, rows)
+        return [document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels)) for row in rows]
 
     return read_page(connection, query, page, samples.c.slot, checked, newest_first=False)
 
@@ -184,26 +172,12 @@ def _shown(
     slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served}
     progress = read_progress(connection, rows, slots, costs=read_costs(connection), frames=frames)
     return [
-        Job(
-            id=row.id,
-            name=row.name,
-            kind=row.kind,
-            state=row.state,
-            reason=row.reason,
-            message=row.message,
-            project=row.project,
-            priority=row.priority,
-            created_at=as_datetime(row.created_at),
-            started_at=None if row.started_at is None else as_datetime(row.started_at),
-            finished_at=None if row.finished_at is None else as_datetime(row.finished_at),
-            sample_count=row.sample_count,
+        document_of(
+            Job,
+            row,
             rejected_count=row.rejected_count or rejected_samples(progress[row.seq]),
             progress=progress[row.seq],
-            dataset=(
-                None
-                if row.manifest is None
-                else DatasetRef(dataset=row.dataset, version=row.version, manifest=row.manifest)
-            ),
+            dataset=None if row.manifest is None else document_of(DatasetRef, row),
         )
         for row in rows
     ]

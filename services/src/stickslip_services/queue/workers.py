@@ -15,6 +15,7 @@ from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.access.asker import own
 from stickslip_services.clock import as_datetime
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
@@ -185,14 +186,9 @@ def show_workers(context: Context, connection: Connection) -> list[responses.Wor
     """Return the newest session of every worker as the API shows it."""
     alive_since, held = context.alive_since, running_tasks(connection, context.frames)
     return [
-        responses.WorkerEntry(
-            id=worker.id,
-            name=worker.name,
-            condition=worker.condition,
-            builds=dict(worker.builds),
-            versions=worker.versions,
-            registered_at=as_datetime(worker.registered_at),
-            last_seen_at=as_datetime(worker.last_seen_at),
+        document_of(
+            responses.WorkerEntry,
+            worker,
             alive=worker.last_seen_at >= alive_since,
             leased=len(held.get(worker.id, ())),
             running=tuple(task for task in held.get(worker.id, ()) if task.since is not None),
