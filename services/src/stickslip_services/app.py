@@ -33,7 +33,7 @@ from stickslip_services.api import problems
 from stickslip_services.api.auth import KeyMiddleware, OriginMiddleware
 from stickslip_services.api.connections import PatientProtocol, allow_many_files
 from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.middleware import BodyLimitMiddleware, RequestIdMiddleware, TimingMiddleware
+from stickslip_services.api.middleware import BodyLimitMiddleware, RequestMiddleware
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, uploads, workers
 from stickslip_services.api.sse import Feeds
@@ -127,8 +127,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
     app.add_middleware(KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
     app.add_middleware(OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
-    app.add_middleware(RequestIdMiddleware)
-    app.add_middleware(TimingMiddleware, observe=metrics.observe)
+    app.add_middleware(RequestMiddleware, observe=metrics.observe)
     return app
 
 

@@ -18,7 +18,7 @@ from stickslip_services.access.asker import Asker, asking
 from stickslip_services.access.keys import KeyRing
 from stickslip_services.access.scopes import Scope
 from stickslip_services.addresses import is_loopback
-from stickslip_services.api.problems import problem_response
+from stickslip_services.api.problems import ProblemError
 
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
@@ -39,27 +39,22 @@ class OriginMiddleware:
     async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
         """Handle a request."""
         refusal = self._refusal(scope) if scope["type"] == "http" else None
-        if refusal is None:
-            await self._app(scope, receive, send)
-            return
-        request_id = scope.get("state", {}).get("request_id")
-        response = problem_response(403, *refusal, path=scope["path"], request_id=request_id)
-        await response(scope, receive, send)
+        await (self._app if refusal is None else refusal.answer)(scope, receive, send)
 
-    def _refusal(self, scope: HttpScope) -> tuple[ProblemCode, str] | None:
+    def _refusal(self, scope: HttpScope) -> ProblemError | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name = _host_name(host)
         if name is None or not (is_loopback(name) or name in self._allowed_hosts):
-            return ProblemCode.host_not_allowed, (
+            detail = (
                 f"Host must be a loopback name such as 127.0.0.1, or one of STICKSLIP_ALLOWED_HOSTS; got {host[:100]!r}"
             )
+            return ProblemError(403, ProblemCode.host_not_allowed, detail)
         origin = headers.get("origin")
         if origin is None or scope["method"] in _SAFE or urlsplit(origin).netloc.lower() == host.lower():
             return None
-        return ProblemCode.origin_not_allowed, (
-            f"Origin must be that of the coordinator's own pages, http://{host[:100]}; got {origin[:100]!r}"
-        )
+        detail = f"Origin must be that of the coordinator's own pages, http://{host[:100]}; got {origin[:100]!r}"
+        return ProblemError(403, ProblemCode.origin_not_allowed, detail)
 
 
 def _host_name(host: str) -> str | None:
@@ -90,35 +85,37 @@ class KeyMiddleware:
         try:
             admitted = await self._admitted(Headers(scope=scope), needed)
         except OperationalError:
-            admitted = (503, ProblemCode.storage_error, "the coordinator cannot read its keys; its log says more")
-        if isinstance(admitted, Asker):
-            with asking(admitted):
-                await self._app(scope, receive, send)
+            detail = "the coordinator cannot read its keys; its log says more"
+            admitted = ProblemError(503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"})
+        if isinstance(admitted, ProblemError):
+            await admitted.answer(scope, receive, send)
             return
-        status, code, detail = admitted
-        request_id = scope.get("state", {}).get("request_id")
-        headers = {"WWW-Authenticate": _CHALLENGE} if status == 401 else {"Retry-After": "10"} if status == 503 else {}
-        response = problem_response(status, code, detail, path=scope["path"], request_id=request_id, headers=headers)
-        await response(scope, receive, send)
+        with asking(admitted):
+            await self._app(scope, receive, send)
 
-    async def _admitted(self, headers: Headers, needed: Scope) -> Asker | tuple[int, ProblemCode, str]:
-        """Return the holder of the request's key, or why the request is refused (status, code, detail)."""
+    async def _admitted(self, headers: Headers, needed: Scope) -> Asker | ProblemError:
+        """Return the holder of the request's key, or why the request is refused."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
                 return Asker(scopes=self._open)
-            return 401, ProblemCode.unauthorized, f"the request needs a key of the scope `{needed}`{_HOW}"
+            return _unauthorized(f"the request needs a key of the scope `{needed}`")
         secret = _secret(authorization)
         if secret is None or self._ring.is_fresh:
             holder = None if secret is None else self._ring.holder_of(secret)
         else:
             holder = await run_in_threadpool(self._ring.holder_of, secret)
         if holder is None:
-            return 401, ProblemCode.unauthorized, f"the key is not known, or it was revoked{_HOW}"
+            return _unauthorized("the key is not known, or it was revoked")
         if needed in self._open or holder.may(needed):
             return holder
         has = ", ".join(scope for scope in Scope if scope in holder.scopes)
-        return 403, ProblemCode.scope_missing, f"the request needs the scope `{needed}`, and the key has: {has}"
+        detail = f"the request needs the scope `{needed}`, and the key has: {has}"
+        return ProblemError(403, ProblemCode.scope_missing, detail)
+
+
+def _unauthorized(why: str) -> ProblemError:
+    return ProblemError(401, ProblemCode.unauthorized, f"{why}{_HOW}", headers={"WWW-Authenticate": _CHALLENGE})
 
 
 def needed_scope(method: str, path: str) -> Scope | None:

@@ -12,7 +12,7 @@ from http import HTTPStatus
 from stickslip_schemas.documents.problems import MEDIA_TYPE, ProblemCode
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from stickslip_services.api.problems import problem_document
+from stickslip_services.api.problems import ProblemError
 
 TURN_SECONDS = 10.0
 """Time to send a request [s]..."""
@@ -79,7 +79,7 @@ class PatientProtocol(H11Protocol):
 
     def _refuse(self, status: int, code: ProblemCode, detail: str) -> None:
         if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
-            body = problem_document(status, code, detail).model_dump_json().encode()
+            body = ProblemError(status, code, detail).document().model_dump_json().encode()
             headers = f"Content-Type: {MEDIA_TYPE}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n"
             self.transport.write(f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{headers}\r\n".encode() + body)
         self.transport.close()
