@@ -45,10 +45,9 @@ def describe(app: FastAPI) -> dict[str, Any]:
         }
         # Requests allow more forms than answers (short forms of axes), so their schema holds for both.
         components.update(body_components(_DOCUMENTS))
-        _drop_foreign_errors(document)
+        for operation in (each for methods in document["paths"].values() for each in methods.values()):
+            _tidy(operation)
         _name_by_title(document)
-        _summarise(document)
-        _drop_null_parameters(document)
         _require_tags(document)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
@@ -56,23 +55,17 @@ def describe(app: FastAPI) -> dict[str, Any]:
     return app.openapi_schema
 
 
-def _summarise(document: dict[str, Any]) -> None:
-    """Use the first sentence of an operation's description as its summary."""
-    for methods in document["paths"].values():
-        for operation in methods.values():
-            if "description" in operation:
-                sentence = re.split(r"(?<=[.;:]) |\n", operation["description"], maxsplit=1)[0]
-                operation["summary"] = sentence.rstrip(".;:")
-
-
-def _drop_null_parameters(document: dict[str, Any]) -> None:
-    """Remove null from parameters: an optional one is omitted."""
-    for methods in document["paths"].values():
-        for operation in methods.values():
-            for parameter in operation.get("parameters", ()):
-                kinds = [kind for kind in parameter["schema"].pop("anyOf", ()) if kind != {"type": "null"}]
-                for kind in kinds:
-                    parameter["schema"] |= kind
+def _tidy(operation: dict[str, Any]) -> None:
+    """Drop FastAPI's 422 answer where no parameter can be invalid; make a summary; remove null from parameters."""
+    content = operation["responses"].get("422", {}).get("content", {})
+    if content.get("application/json", {}).get("schema") == {"$ref": "#/components/schemas/HTTPValidationError"}:
+        del operation["responses"]["422"]
+    if "description" in operation:  # its first sentence
+        sentence = re.split(r"(?<=[.;:]) |\n", operation["description"], maxsplit=1)[0]
+        operation["summary"] = sentence.rstrip(".;:")
+    for parameter in operation.get("parameters", ()):  # an optional one is omitted
+        for kind in parameter["schema"].pop("anyOf", ()):
+            parameter["schema"] |= {} if kind == {"type": "null"} else kind
 
 
 def _objects(node: Any) -> Iterator[dict[str, Any]]:
@@ -104,13 +97,3 @@ def _name_by_title(document: dict[str, Any]) -> None:
                 for key, value in node.items():
                     if value == f"#/components/schemas/{name}":
                         node[key] = f"#/components/schemas/{title}"
-
-
-def _drop_foreign_errors(document: dict[str, Any]) -> None:
-    """Drop FastAPI's 422 answers from routes whose parameters cannot be invalid."""
-    foreign = {"$ref": "#/components/schemas/HTTPValidationError"}
-    for methods in document["paths"].values():
-        for operation in methods.values():
-            content = operation["responses"].get("422", {}).get("content", {})
-            if content.get("application/json", {}).get("schema") == foreign:
-                del operation["responses"]["422"]
