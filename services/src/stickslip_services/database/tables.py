@@ -66,7 +66,7 @@ jobs = Table(
     Column("sample_count", Integer, nullable=False),
     Column("builds", Text),  # JSON; null until its planning begins
     Column("certificate", String),  # digest of its certificate when planning began
-    Column("digest", _Wide, nullable=False),  # of spec, builds and certificate (queue/damage.py)
+    Column("digest", _Wide, nullable=False),  # of spec, builds and certificate (queue/recompute.py)
     Column("planned", Integer, nullable=False, server_default="0"),  # number of samples whose tasks are inserted
     Column("planner", String),  # the coordinator that plans it
     Column("planner_until", Float),  # when another coordinator may go on with that
@@ -128,7 +128,7 @@ tasks = Table(
     Column("reported_token", Integer),
     Column("reported_by", String),
     Column("output", Text),  # JSON
-    Column("digest", _Wide),  # of what it made, while it is settled (queue/damage.py)
+    Column("digest", _Wide),  # of what it made, while it is settled (queue/recompute.py)
     Column("cpu_seconds", Float),
     Column("wall_seconds", Float),
     Column("started_at", Float),
@@ -177,7 +177,7 @@ samples = Table(
     Column("render_task", _Wide),
     Column("split", Integer, nullable=False),
     Column("labels", Text, nullable=False),  # JSON: the point of the grid
-    Column("digest", _Wide, nullable=False),  # of the other columns (queue/damage.py)
+    Column("digest", _Wide, nullable=False),  # of the other columns (queue/recompute.py)
     sqlite_with_rowid=False,
 )
 

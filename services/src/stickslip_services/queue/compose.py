@@ -23,9 +23,9 @@ from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
-from stickslip_services.queue.damage import check_results, check_samples, read_plan
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id, task_key
 from stickslip_services.queue.ledger import KeyedTask
+from stickslip_services.queue.recompute import check_results, check_samples, read_plan
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 

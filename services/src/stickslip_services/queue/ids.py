@@ -1,4 +1,4 @@
-"""Names: random ones, and those of tasks, `<stage>-<content key>`; and digests of rows (`damage`)."""
+"""Names: random ones, and those of tasks, `<stage>-<content key>`; and digests of rows (`recompute`)."""
 
 import hashlib
 import json

@@ -14,11 +14,11 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.damage import check_results, check_samples, terms_of
 from stickslip_services.queue.eta import StageTimings, read_costs
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
+from stickslip_services.queue.recompute import check_results, check_samples, terms_of
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
 _UNSETTLED = [state for state in TaskState if not state.is_settled]

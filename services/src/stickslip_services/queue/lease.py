@@ -27,7 +27,6 @@ from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, StoredTask, compose_tasks
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.damage import mend
 from stickslip_services.queue.grants import grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
@@ -42,6 +41,7 @@ from stickslip_services.queue.ledger import (
     start_tasks,
 )
 from stickslip_services.queue.planner import plan_waiting_jobs
+from stickslip_services.queue.recompute import mend
 from stickslip_services.queue.retries import fail_tries, find_held, is_sweep_due, lose, take_back
 from stickslip_services.queue.workers import (
     RegisteredWorker,

@@ -17,12 +17,12 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.damage import terms_of
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import unplanned_jobs
 from stickslip_services.queue.ledger import Ending
 from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, pieces, terms_for
+from stickslip_services.queue.recompute import terms_of
 from stickslip_services.queue.write_plan import begin_planning, write_plan
 
 logger = logging.getLogger(__name__)

@@ -11,9 +11,9 @@ from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.damage import read_plan
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import has_runnable_job
+from stickslip_services.queue.recompute import read_plan
 from stickslip_services.queue.write_plan import begin_planning, insert_job
 
 EVERY_SECONDS = 30 * 24 * 3600.0

@@ -6,11 +6,10 @@ from stickslip_services.access.keys import admit_local_worker
 from stickslip_services.database import migrate
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import held_jobs, hold_jobs, release_jobs
-from stickslip_services.queue.damage import fail_damaged_jobs
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.lease import renew_all_leases
 from stickslip_services.queue.planner import plan_waiting_jobs, release_claims
-from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
+from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, fail_damaged_jobs
 from stickslip_services.queue.retries import take_back
 from stickslip_services.queue.workers import note_stranded
 
