@@ -4,10 +4,11 @@ import re
 from collections.abc import Callable
 
 import pytest
+from alembic import command
 from alembic.util import CommandError
 from sqlalchemy import inspect, text
-from stickslip_services.database import migrate
 from stickslip_services.database.database import Database
+from stickslip_services.database.opening import migration, upgrade
 from stickslip_services.database.tables import metadata
 
 pytestmark = pytest.mark.databases
@@ -25,8 +26,8 @@ def _plain(sql: str | None) -> str:
 
 def test_tables_are_those_of_the_migrations(empty_database: Callable[[], Database]) -> None:
     with empty_database().write() as connection:
-        migrate.upgrade(connection)
-        migrate.check(connection)
+        upgrade(connection)
+        command.check(migration(connection))
 
 
 def test_indexes_are_partial_where_the_tables_say_so(empty_database: Callable[[], Database]) -> None:
@@ -35,7 +36,7 @@ def test_indexes_are_partial_where_the_tables_say_so(empty_database: Callable[[]
     for name in ("migrated", "direct"):
         with empty_database().write() as connection:
             if name == "migrated":
-                migrate.upgrade(connection)
+                upgrade(connection)
             else:
                 metadata.create_all(connection)
             rows = connection.execute(text(INDEXES[connection.dialect.name]))
@@ -49,7 +50,7 @@ def test_a_migration_that_fails_leaves_nothing(empty_database: Callable[[], Data
 
     def fail_at_the_end() -> None:
         with database.write() as connection:
-            migrate.upgrade(connection)
+            upgrade(connection)
             raise CommandError("the power is gone")
 
     with pytest.raises(CommandError):

@@ -6,16 +6,46 @@ is thus not found. The coordinator itself, and commands on its machine, see ever
 """
 
 import getpass
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from enum import StrEnum
 
 from sqlalchemy import ColumnElement, exists, or_, true
 
-from stickslip_services.access.scopes import Scope, includes
 from stickslip_services.database.tables import dataset_versions, job_tasks, jobs
-from stickslip_services.errors import NotFoundError
+from stickslip_services.errors import CommandError, NotFoundError
+
+
+class Scope(StrEnum):
+    """What a key permits. `submit` includes `read`; `admin` includes everything."""
+
+    read = "read"
+    """Read what belongs to the project of the key: jobs, datasets, pages."""
+    submit = "submit"
+    """Submit jobs, and pause, resume, cancel and prioritise them."""
+    work = "work"
+    """Be a worker: register, lease tasks and report results."""
+    admin = "admin"
+    """Everything of all projects, and register certificates."""
+
+
+_IMPLIED = {
+    Scope.read: {Scope.read},
+    Scope.submit: {Scope.submit, Scope.read},
+    Scope.work: {Scope.work},
+    Scope.admin: set(Scope),
+}
+
+
+def check_project(name: str) -> str:
+    """Return the name of a project; raise CommandError where it is malformed."""
+    if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
+        raise CommandError(f"project must be lower-case letters, digits and '-', 63 at most; got {name[:100]!r}")
+    return name
+
 
 NOBODY = "no key"
 """Name of who asks without a key: anybody on this machine."""
@@ -32,7 +62,7 @@ class Asker:
 
     def may(self, needed: Scope) -> bool:
         """Return whether a scope of the asker includes `needed`."""
-        return any(includes(scope, needed) for scope in self.scopes)
+        return any(needed in _IMPLIED[scope] for scope in self.scopes)
 
     @property
     def sees_all(self) -> bool:

@@ -16,9 +16,8 @@ from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.access.asker import Asker
+from stickslip_services.access.asker import Asker, Scope, check_project
 from stickslip_services.access.audit_log import note
-from stickslip_services.access.scopes import Scope, check_project
 from stickslip_services.database.database import Database
 from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import api_keys

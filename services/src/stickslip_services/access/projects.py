@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, delete, func, insert, select
 from stickslip_schemas.base.states import JobState
 
+from stickslip_services.access.asker import check_project
 from stickslip_services.access.audit_log import note
-from stickslip_services.access.scopes import check_project
 from stickslip_services.database.tables import api_keys, jobs, projects
 from stickslip_services.errors import QuotaExceededError
 

@@ -21,8 +21,8 @@ from standardwebhooks import Webhook as Signer
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.documents.responses import EventName
 
+from stickslip_services.access.asker import check_project
 from stickslip_services.access.audit_log import note
-from stickslip_services.access.scopes import check_project
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime
 from stickslip_services.database.database import Database

@@ -14,9 +14,8 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import ProblemCode
 
-from stickslip_services.access.asker import Asker, asking
+from stickslip_services.access.asker import Asker, Scope, asking
 from stickslip_services.access.keys import KeyRing
-from stickslip_services.access.scopes import Scope
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import ProblemError
 

@@ -13,7 +13,7 @@ from starlette.types import Receive, Scope, Send
 from stickslip_schemas.documents.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
 
 from stickslip_services import errors
-from stickslip_services.api.html import html_page
+from stickslip_services.pages.rendering import html_page
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from stickslip_services.access import audit_log as audit
 from stickslip_services.access import keys as stored_keys
 from stickslip_services.access import projects as stored_projects
 from stickslip_services.access import webhooks as stored_webhooks
-from stickslip_services.access.scopes import Scope
+from stickslip_services.access.asker import Scope
 from stickslip_services.cli.common import print_table, say
 from stickslip_services.cli.errors import administers
 from stickslip_services.settings import Settings

@@ -1,4 +1,4 @@
-"""Opening a coordinator's database, or refusing it with one sentence on what to do."""
+"""Opening a coordinator's database and migrating it, or refusing it with one sentence on what to do."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -6,17 +6,20 @@ from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
+from alembic import command
+from alembic.config import Config
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, text
+from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import open_store
 
-from stickslip_services.database import migrate
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
 from stickslip_services.settings import Settings
+
+MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
@@ -34,6 +37,20 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
     return PostgresqlDatabase(url, durable=settings.durable, role=role)
 
 
+def migration(connection: Connection) -> Config:
+    """Return Alembic's configuration for an open transaction."""
+    made = Config()
+    made.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+    made.set_main_option("path_separator", "os")
+    made.attributes["connection"] = connection
+    return made
+
+
+def upgrade(connection: Connection) -> None:
+    """Apply all pending migrations; if one fails, none is applied."""
+    command.upgrade(migration(connection), "head")
+
+
 @contextmanager
 def opened(settings: Settings, role: Role) -> Iterator[Database]:
     """Open the database of a coordinator, and migrate it, or make it if there is none.
@@ -44,7 +61,7 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
     database = connect(settings, role)
     try:
         with database.write() as connection:
-            migrate.upgrade(connection)
+            upgrade(connection)
         yield database
     finally:
         database.close()
@@ -67,7 +84,7 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
             f"{settings.store_place} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
             f"{settings.data}`{same and f' with the same {same}'} to find them again"
         )
-    known = {script.revision for script in ScriptDirectory(str(migrate.MIGRATIONS)).walk_revisions()}
+    known = {script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()}
     if revision is not None and revision not in known:
         raise DatabaseRefusedError(
             f"{name} has the schema {revision}, and this version of stickslip knows {max(known)}: install the version "

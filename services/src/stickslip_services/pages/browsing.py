@@ -15,7 +15,7 @@ from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.pages.grid_map import grid_maps
 from stickslip_services.pages.motion import is_path
-from stickslip_services.pages.plots import plot, table
+from stickslip_services.pages.rendering import plot, table
 from stickslip_services.pages.sample_data import SampleData
 
 SHOWN_THUMBS = 48

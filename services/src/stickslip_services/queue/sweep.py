@@ -3,7 +3,7 @@
 import logging
 
 from stickslip_services.access.keys import admit_local_worker
-from stickslip_services.database import migrate
+from stickslip_services.database.opening import upgrade
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import held_jobs, hold_jobs, release_jobs
 from stickslip_services.queue.jobs import has_runnable_job
@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 def start(context: Context) -> None:
     """Bring the database up to date, and resume the work of an earlier process."""
     with context.database.write() as connection:
-        migrate.upgrade(connection)
+        upgrade(connection)
         admit_local_worker(connection, context.settings.worker_key_path, context.clock())
         if context.database.is_alone(connection):  # no other coordinator could have taken a heartbeat
             renew_all_leases(connection, context.clock(), context.settings.lease_seconds)

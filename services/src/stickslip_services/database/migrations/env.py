@@ -1,4 +1,4 @@
-"""Alembic's entry: runs migrations in the transaction that `migrate` has opened."""
+"""Alembic's entry: runs migrations in the transaction that `opening` has begun."""
 
 from alembic import context
 from stickslip_services.database.tables import metadata

@@ -2,8 +2,8 @@
 
 from fastapi import APIRouter
 
-from stickslip_services.api.routes.pages import datasets, jobs, scenes, system
+from stickslip_services.api.routes.pages import datasets, jobs, system
 
 router = APIRouter(include_in_schema=False)
-for _module in (jobs, datasets, scenes, system):
+for _module in (jobs, datasets, system):
     router.include_router(_module.router)

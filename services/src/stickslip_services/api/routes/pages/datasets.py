@@ -13,7 +13,6 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.files import matches
-from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
@@ -21,7 +20,7 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import coloured, histograms, losses, sample_view, sliders, thumbs
 from stickslip_services.pages.films import mp4
 from stickslip_services.pages.motion import motion
-from stickslip_services.pages.rendering import spec_text
+from stickslip_services.pages.rendering import html_page, spec_text
 from stickslip_services.pages.sample_data import SampleData
 from stickslip_services.queue.context import Context
 

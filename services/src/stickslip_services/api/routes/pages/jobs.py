@@ -15,13 +15,12 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import estimated
 from stickslip_schemas.plan.grid import count
 
-from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.grid_map import grid_maps
-from stickslip_services.pages.rendering import spec_text
+from stickslip_services.pages.rendering import html_page, spec_text
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import (

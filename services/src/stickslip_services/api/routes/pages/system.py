@@ -1,4 +1,4 @@
-"""Pages of certificates, of workers, and of the HTTP interface."""
+"""Pages of scenes, of certificates, of workers, and of the HTTP interface."""
 
 import pathlib
 from collections.abc import Iterator
@@ -8,17 +8,36 @@ from fastapi import APIRouter, Request, Response
 from sqlalchemy import Connection, func, select
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 
-from stickslip_services.api.html import html_page
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.catalog.certificates import find_certificate, list_certificates
+from stickslip_services.catalog.scenes import known_scenes
 from stickslip_services.clock import as_datetime
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import dataset_versions
-from stickslip_services.pages.plots import plot, table
+from stickslip_services.errors import NotFoundError
+from stickslip_services.pages.rendering import html_page, plot, table
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers, show_workers
 
 router = APIRouter()
+
+
+@router.get("/scenes")
+def get_scenes(context: ContextDep) -> Response:
+    """Show the scenes."""
+    with context.database.read() as connection:
+        scenes = known_scenes(connection)
+    return html_page("scenes.html", here="scenes", scenes=scenes)
+
+
+@router.get("/scenes/{digest}")
+def get_scene(digest: str, context: ContextDep) -> Response:
+    """Show a scene: how it looks, its parameters, and the datasets made of it."""
+    with context.database.read() as connection:
+        known = known_scenes(connection).get(digest)
+    if known is None:
+        raise NotFoundError(f"there is no scene {digest[:64]!r}")
+    return html_page("scene.html", here="scenes", known=known, scene=known.scene)
 
 
 @router.get("/certificates")
