@@ -12,7 +12,7 @@ from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.cli import app
 from stickslip_services.client.http import Client
-from stickslip_services.local.certifying import read_certificate
+from stickslip_services.local.making import read_certificate
 from stickslip_testing.servers import RunningServer, served
 from stickslip_testing.worker import BUILDS
 

@@ -16,7 +16,7 @@ from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
 from stickslip_services.cli.main import app
 from stickslip_services.cli.scenes import spec_of
-from stickslip_services.local.simulating import why_uncertified
+from stickslip_services.local.making import why_uncertified
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS
 from stickslip_sim_core.scenes.cloth_scene import KIND

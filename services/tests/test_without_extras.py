@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from stickslip_services.cli.errors import ARRAYS, shows_errors
+from stickslip_services.cli.common import ARRAYS, shows_errors
 
 ROOT = Path(__file__).parents[2]
 

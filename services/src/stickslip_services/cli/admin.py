@@ -15,8 +15,7 @@ from stickslip_services.access import keys as stored_keys
 from stickslip_services.access import projects as stored_projects
 from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.asker import Scope
-from stickslip_services.cli.common import print_table, say
-from stickslip_services.cli.errors import administers
+from stickslip_services.cli.common import administers, print_table, say
 from stickslip_services.settings import Settings
 
 webhook_argument = click.argument("webhook", help="id, as `stickslip webhooks list` shows it")

@@ -8,11 +8,10 @@ from stickslip_schemas.documents.responses import CertificateEntry
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_schemas.spec.jobs import PresetName
 
-from stickslip_services.cli.common import FILE, json_option, print_json, print_table
-from stickslip_services.cli.errors import asks
+from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table
 from stickslip_services.client.errors import UnreachableError
 from stickslip_services.client.http import Client
-from stickslip_services.local import certifying
+from stickslip_services.local import making
 
 PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
 
@@ -29,8 +28,8 @@ def certify(preset: str, out: Path | None, quick: bool, url: str) -> None:
     only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     directory = out or Path("certificates") / preset
-    certificate = certifying.measure(preset, directory, quick=quick)
-    written = directory / certifying.DOCUMENT_NAME
+    certificate = making.measure(preset, directory, quick=quick)
+    written = directory / making.DOCUMENT_NAME
     if quick:
         passed = "All" if certificate.passed else "NOT all"
         click.echo(f"{passed} of the few points that were measured are within the tolerances: {written}")
@@ -39,7 +38,7 @@ def certify(preset: str, out: Path | None, quick: bool, url: str) -> None:
         click.echo(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {written}")
     try:
         with Client(url, patience=1.0) as client:
-            _say_registered(client.register(certifying.read_certificate(directory)), url)
+            _say_registered(client.register(making.read_certificate(directory)), url)
     except UnreachableError:
         click.echo(f"no coordinator answers at {url}; later: stickslip register {directory}")
     raise Exit(0 if certificate.passed else 1)
@@ -50,7 +49,7 @@ def certify(preset: str, out: Path | None, quick: bool, url: str) -> None:
 @asks
 def register(directory: Path, url: str) -> None:
     """Register a certificate that was measured without a running coordinator."""
-    certificate = certifying.read_certificate(directory)
+    certificate = making.read_certificate(directory)
     with Client(url) as client:
         _say_registered(client.register(certificate), url)
 

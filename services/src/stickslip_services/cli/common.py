@@ -1,5 +1,6 @@
-"""Options, tables and JSON output, shared by the commands."""
+"""Options, tables, JSON output and errors (field, rule and value, without a traceback), shared by the commands."""
 
+import functools
 import json
 import math
 import shutil
@@ -9,17 +10,25 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import click
+from click.exceptions import Exit
 from pydantic import BaseModel
 
 from stickslip_services.addresses import DEFAULT_URL
-from stickslip_services.client.errors import MissingExtraError
+from stickslip_services.cli.specs import field_line
+from stickslip_services.client.errors import ClientError, MissingExtraError, ProblemError, UnreachableError
+from stickslip_services.errors import CommandError, StickslipError
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 FILE = click.Path(path_type=Path)
 DEFAULT_DATA = Path("stickslip-data")
 _SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
+ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "zarr"})
+"""Modules that the extra `arrays` installs; one that is missing is no fault of ours."""
 _LEAST_SENTENCE = 30
 """Least width of a column of sentences [characters]."""
 
@@ -102,3 +111,48 @@ def require_server() -> None:
     missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
     if missing:
         raise MissingExtraError("server", f"this command needs the server, and {', '.join(missing)}")
+
+
+def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Print the errors that a command expects, and exit with status 1."""
+
+    @functools.wraps(command)
+    def run(*arguments: P.args, **options: P.kwargs) -> R:
+        try:
+            return command(*arguments, **options)
+        except ProblemError as error:
+            _print_error(error.problem.detail if not error.problem.errors else "the document is not valid")
+            for field in error.problem.errors:
+                say(field_line(field))
+            if error.problem.request_id and error.problem.status >= 500:
+                say(f"  request {error.problem.request_id}; the coordinator's log says more")
+        except UnreachableError as error:
+            _print_error(
+                f"{error}. Is a coordinator running there? `stickslip up` starts one on this machine; "
+                "--url or STICKSLIP_URL names another."
+            )
+        except (ClientError, CommandError, StickslipError) as error:
+            _print_error(str(error))
+        except OSError as error:
+            _print_error(f"{error.filename or 'the file system'}: {error.strerror or error}")
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.partition(".")[0] not in ARRAYS:
+                raise
+            _print_error(str(MissingExtraError("arrays", f"this needs arrays, and {error.name}")))
+        raise Exit(1)
+
+    return run
+
+
+def asks(command: Callable[P, R]) -> Callable[P, R]:
+    """Give a command the option `--url` of a coordinator, and show its errors."""
+    return url_option(shows_errors(command))
+
+
+def administers(command: Callable[P, R]) -> Callable[P, R]:
+    """Give a command the options of a coordinator's database, and show its errors."""
+    return data_option(database_option(shows_errors(command)))
+
+
+def _print_error(message: str) -> None:
+    say(f"{click.style('error:', bold=True, fg='red')} {message}")

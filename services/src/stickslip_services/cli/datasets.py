@@ -14,8 +14,7 @@ from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.addresses import coordinator_url
-from stickslip_services.cli.common import FILE, json_option, print_json, print_table, say
-from stickslip_services.cli.errors import asks, shows_errors
+from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table, say, shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull

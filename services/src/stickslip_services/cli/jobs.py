@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
@@ -9,7 +10,16 @@ from pathlib import Path
 import click
 from click.exceptions import Exit
 from stickslip_schemas.base.states import JobState, TaskState
-from stickslip_schemas.documents.responses import FileUpload, JobDetail, TextureEntry
+from stickslip_schemas.documents.responses import (
+    DatasetPublishedEvent,
+    FileUpload,
+    JobDetail,
+    JobProgressEvent,
+    JobStateEvent,
+    TaskStateEvent,
+    TextureEntry,
+)
+from stickslip_schemas.documents.responses import Progress as JobProgress
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.plan.costs import Estimate, estimated
 from stickslip_schemas.plan.grid import count
@@ -18,22 +28,23 @@ from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_services.cli import wording
 from stickslip_services.cli.common import (
     FILE,
+    asks,
     job_argument,
     json_option,
     print_fields,
     print_json,
     print_table,
+    room,
     say,
     spec_argument,
 )
-from stickslip_services.cli.errors import asks
 from stickslip_services.cli.specs import check_spec, read_job
-from stickslip_services.cli.watch import GOOD, watch
 from stickslip_services.client.errors import ClientError, UnreachableError
 from stickslip_services.client.http import Client
 from stickslip_services.units import duration, size
 
 SHOWN_REJECTS = 50
+GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 
 PRIORITY = click.IntRange(-100, 100)
 PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of one number share evenly"
@@ -216,6 +227,58 @@ def watch_job(job_id: str, url: str) -> None:
     with Client(url) as client:
         state = watch(client, job_id)
     raise Exit(0 if state in GOOD else 1)
+
+
+def watch(client: Client, job_id: str) -> JobState:
+    """Show the progress of a job until it ends; return its final state."""
+    job = client.job(job_id)
+    try:
+        return _follow(client, job_id, _Lines(job.sample_count), job.state)
+    except KeyboardInterrupt:
+        say(f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}")
+        raise Exit(130) from None
+
+
+def _follow(client: Client, job_id: str, view: "_Lines", state: JobState) -> JobState:
+    for event in client.events(job_id):
+        match event:
+            case JobProgressEvent():
+                view.progress(event.progress)
+            case JobStateEvent():
+                state = event.state
+                view.line(f"{job_id}: {wording.state(state)}{_because(event.message)}")
+            case TaskStateEvent():
+                view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
+            case DatasetPublishedEvent():
+                name = wording.dataset(event.dataset)
+                view.line(f"published {click.style(name, bold=True)}")
+                view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
+                view.line(f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}")
+    return state
+
+
+def _because(message: str) -> str:
+    return f": {message}" if message else ""
+
+
+class _Lines:
+    """Prints a line for each event; on a terminal, the last one is the progress and changes."""
+
+    def __init__(self, sample_count: int) -> None:
+        self._sample_count = sample_count
+        self._last = ""
+        self._clear = "\r\x1b[K" if sys.stdout.isatty() else ""
+
+    def line(self, text: str) -> None:
+        click.echo(f"{self._clear}{text}")
+
+    def progress(self, progress: JobProgress) -> None:
+        text = ", ".join(filter(None, [wording.planned(progress, self._sample_count), wording.stages(progress)]))
+        if progress.eta is not None:
+            text += f"; {wording.eta(progress.eta)} left"
+        if text != self._last:
+            click.echo(f"{self._clear}{text[: room() - 1]}" if self._clear else text, nl=not self._clear)
+        self._last = text
 
 
 @click.command()

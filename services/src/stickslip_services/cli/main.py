@@ -58,8 +58,7 @@ def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
     module, attribute = _COMMANDS[name].split(".")
     if module in ("admin", "maintenance"):  # they import the server, which a client lacks
-        from stickslip_services.cli.common import require_server
-        from stickslip_services.cli.errors import shows_errors
+        from stickslip_services.cli.common import require_server, shows_errors
 
         shows_errors(require_server)()
     command: click.Command = getattr(import_module(f"stickslip_services.cli.{module}"), attribute)

@@ -11,8 +11,18 @@ from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.asker import asking, this_user
-from stickslip_services.cli.common import DEFAULT_DATA, FILE, amount, data_option, database_option, say, store_option
-from stickslip_services.cli.errors import P, R, shows_errors
+from stickslip_services.cli.common import (
+    DEFAULT_DATA,
+    FILE,
+    P,
+    R,
+    amount,
+    data_option,
+    database_option,
+    say,
+    shows_errors,
+    store_option,
+)
 from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened

@@ -13,11 +13,10 @@ from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
-from stickslip_services.cli.common import FILE, json_option, print_table, say
-from stickslip_services.cli.errors import shows_errors
+from stickslip_services.cli.common import FILE, json_option, print_table, say, shows_errors
 from stickslip_services.cli.specs import read_scene
 from stickslip_services.client.errors import ClientError
-from stickslip_services.local import certifying, simulating
+from stickslip_services.local import making
 from stickslip_services.units import size
 
 scene_argument = click.argument("scene", help="a scene, YAML or JSON, or the name of a built-in one")
@@ -46,9 +45,9 @@ def simulate(
     given, files = _scene(scene)
     usual = Path("certificates") / given.preset.value
     directory = certificate or (usual if usual.is_dir() else None)
-    found = None if directory is None else certifying.read_certificate(directory)
+    found = None if directory is None else making.read_certificate(directory)
     spec = spec_of(given, allow_uncertified=allow_uncertified)
-    result = simulating.simulate(spec, files, out, certificate=found, obj=obj)
+    result = making.simulate(spec, files, out, certificate=found, obj=obj)
     if as_json:
         click.echo(json.dumps(result, indent=2))
     else:
@@ -115,7 +114,7 @@ def preview(scene: str, out: Path, as_json: bool) -> None:
 
     Writes CAMERA.png and motion.webp. No coordinator is needed, but the environment of Blender is.
     """
-    pictures = simulating.preview(*_scene(scene), out)
+    pictures = making.preview(*_scene(scene), out)
     if as_json:
         click.echo(json.dumps({"pictures": pictures}))
     else:

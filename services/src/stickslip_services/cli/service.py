@@ -13,14 +13,15 @@ from stickslip_services.addresses import DEFAULT_PORT, DEFAULT_URL
 from stickslip_services.cli.common import (
     DEFAULT_DATA,
     FILE,
+    asks,
     database_option,
     json_option,
     print_json,
     print_table,
     require_server,
+    shows_errors,
     store_option,
 )
-from stickslip_services.cli.errors import asks, shows_errors
 from stickslip_services.client.http import Client
 from stickslip_services.units import duration
 

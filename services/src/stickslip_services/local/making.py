@@ -1,30 +1,78 @@
-"""One sample of a scene, made here by the workers' program with the stages of the queue."""
+"""What the workers' program makes on this machine: certificates of its build, and single samples of scenes.
+
+The core is not imported here: the program writes files.
+"""
 
 import io
 import json
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files
-from stickslip_schemas.store import open_store
+from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.errors import CommandError
-from stickslip_services.local.certifying import ask_workers
 
+DOCUMENT_NAME = "certificate.json"
 RESULT_NAME = "scene.json"
 TRAJECTORY_NAME = "trajectory.npz"
 
 
-class SimulateError(CommandError):
-    """The scene was not simulated."""
+class MakingError(CommandError):
+    """A certificate or a sample was not made, or is missing or damaged."""
+
+
+def _asked(arguments: list[str], refusal: str) -> str:
+    """Run the workers' program and return what it printed; raise MakingError where it made nothing."""
+    # The matrices of master curves are too small for the threads of NumPy's linear algebra.
+    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
+    command = [sys.executable, "-m", "stickslip_workers", *arguments]
+    try:
+        ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    except OSError as error:
+        raise MakingError(f"the workers' program does not start: {error}") from error
+    if ended.returncode not in (0, 1) or not ended.stdout.strip():
+        raise MakingError(f"{refusal}: the workers' program ended with status {ended.returncode}")
+    return ended.stdout
+
+
+def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
+    """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
+
+    Raises:
+        MakingError: The program failed, or `out` holds another certificate.
+    """
+    arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
+    digest = _asked(arguments, "no certificate was made").strip()
+    certificate = read_certificate(out)
+    if certificate.digest != digest:
+        raise MakingError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
+    return certificate
+
+
+def read_certificate(directory: Path) -> Certificate:
+    """Read a certificate from the directory that `measure` wrote; raise MakingError."""
+    try:
+        return Certificate.model_validate_json((directory / DOCUMENT_NAME).read_bytes())
+    except FileNotFoundError as error:
+        raise MakingError(f"{directory} holds no certificate: there is no {DOCUMENT_NAME}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the document"
+        raise MakingError(f"{directory / DOCUMENT_NAME} is not a valid certificate: {place}: {first['msg']}") from error
 
 
 def simulate(
@@ -43,26 +91,21 @@ def simulate(
         What `scene.json` holds.
 
     Raises:
-        SimulateError: It was not run.
+        MakingError: It was not run.
     """
     import numpy as np  # the extra `arrays`
 
     if out.exists():
-        raise SimulateError(f"out: must not exist, and {out} does")
+        raise MakingError(f"out: must not exist, and {out} does")
     build = _workers(["describe"])["builds"][spec.kind]["sim_core"]
     why = why_uncertified(spec, certificate, build)
     if why and spec.needs_certificate:
-        raise SimulateError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
-    with tempfile.TemporaryDirectory(prefix="stickslip-scene-") as temporary:
-        store = open_store(temporary)
-        for data in (*files.values(), *built_in_files().values()):
-            store.publish(data)
-        task = SimulateTask(simulation=spec.simulation(next(iter(grid(spec)))))
-        given = Path(temporary, "task.json")
-        given.write_text(task.model_dump_json(), encoding="utf-8")
-        result = TaskResult.model_validate(_workers(["replay", str(given), "--store", temporary]))
+        raise MakingError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
+    task = SimulateTask(simulation=spec.simulation(next(iter(grid(spec)))))
+    with _handed_over(task, files) as (given, store):
+        result = TaskResult.model_validate(_workers(["replay", *given]))
         if result.outcome == "failed":
-            raise SimulateError(f"the scene was not simulated: {result.message}")
+            raise MakingError(f"the scene was not simulated: {result.message}")
         arrays: dict[str, Any] = {}
         if isinstance(result.output, SimulateOutput):
             with np.load(io.BytesIO(store.read(result.output.record.digest)), allow_pickle=False) as record:
@@ -94,17 +137,23 @@ def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
     """Draw the start and the motions of a scene into a directory; return the names of the pictures.
 
     Raises:
-        SimulateError: It was not drawn.
+        MakingError: It was not drawn.
     """
+    with _handed_over(scene, files) as (given, _):
+        pictures: list[str] = _workers(["preview", *given, "--out", str(out)])["pictures"]
+    return pictures
+
+
+@contextmanager
+def _handed_over(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tuple[list[str], Store]]:
+    """Write a document and the files that it names; yield the arguments that name them, and their store."""
     with tempfile.TemporaryDirectory(prefix="stickslip-scene-") as temporary:
         store = open_store(temporary)
         for data in (*files.values(), *built_in_files().values()):
             store.publish(data)
-        given = Path(temporary, "scene.json")
-        given.write_text(scene.model_dump_json(), encoding="utf-8")
-        said = _workers(["preview", str(given), "--store", temporary, "--out", str(out)])
-    pictures: list[str] = said["pictures"]
-    return pictures
+        given = Path(temporary, "document.json")
+        given.write_text(document.model_dump_json(), encoding="utf-8")
+        yield [str(given), "--store", temporary], store
 
 
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
@@ -125,7 +174,7 @@ def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build
 
 def _workers(arguments: list[str]) -> dict[str, Any]:
     """Run the workers' program and return its answer, which is JSON."""
-    answer: dict[str, Any] = json.loads(ask_workers(arguments, "nothing was made of the scene", SimulateError))
+    answer: dict[str, Any] = json.loads(_asked(arguments, "nothing was made of the scene"))
     return answer
 
 
