@@ -4,21 +4,17 @@ from functools import lru_cache, partial
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, select
-from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.format.manifest import (
-    GROUP_NAME,
-    MANIFEST_NAME,
-    SEAL_NAME,
     BrokenSectionError,
     Contents,
     FileEntry,
-    Manifest,
-    seal_text,
 )
 from stickslip_schemas.store import Store
 
 from stickslip_services.access.asker import own_version
+from stickslip_services.catalog.versions import sealed_digests, stored_contents
 from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
 from stickslip_services.errors import MissingArtifactError, NotFoundError
@@ -48,8 +44,7 @@ def find_version(connection: Connection, dataset: str, version: int) -> DatasetV
 
 def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
     """Return the file at `path` of a version; raise NotFoundError where the version has none."""
-    seal = sha256(seal_text(version.manifest, version.group))
-    digests = {MANIFEST_NAME: version.manifest, GROUP_NAME: version.group, SEAL_NAME: seal}
+    digests = sealed_digests(version.manifest, version.group)
     if path in digests:
         return FileEntry(path=path, sha256=digests[path], size=_size(store, digests[path]))
     file = _listed(store, version.manifest, path)
@@ -67,10 +62,9 @@ def read_contents(store: Store, manifest: Sha256) -> Contents:
     A manifest never changes, so it is cached. A section is read with the first request for one of its files.
     """
     try:
-        document = Manifest.model_validate_json(store.read(manifest))
+        return stored_contents(store, manifest)
     except OSError as error:
         raise MissingArtifactError(f"the manifest {manifest} is damaged or not in the store") from error
-    return Contents(document, lambda file: store.read(file.sha256))
 
 
 def _listed(store: Store, manifest: Sha256, path: str) -> FileEntry | None:

@@ -54,14 +54,24 @@ class CommittedVersion:
     rejected_count: int
 
 
+def stored_contents(store: Store, manifest: Sha256) -> Contents:
+    """Return what a manifest in the store lists; raise OSError or ValueError. Sections are read on demand."""
+    document = Manifest.model_validate_json(store.read(manifest))
+    return Contents(document, lambda file: store.read(file.sha256))
+
+
+def sealed_digests(manifest: Sha256, group: Sha256) -> dict[str, Sha256]:
+    """Return the digests of the files of a version that its manifest does not list, by path."""
+    return {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: sha256(seal_text(manifest, group))}
+
+
 def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     """Read a manifest that a worker has published, and check that all its files are in the store.
 
     Raises ValueError or OSError.
     """
-    content, group = store.read(output.manifest), store.read(output.group)
-    check_seal(content, group, store.read(sha256(seal_text(output.manifest, output.group))))
-    contents = Contents(Manifest.model_validate_json(content), lambda file: store.read(file.sha256))
+    check_seal(*map(store.read, sealed_digests(output.manifest, output.group).values()))
+    contents = stored_contents(store, output.manifest)
     manifest = contents.manifest
     if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
@@ -173,23 +183,22 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256, *, rate: float 
     None if the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
     read, at `rate` [bytes/s]. Raises OSError where the store is out of reach.
     """
-    seal = sha256(seal_text(manifest, group))
+    own = sealed_digests(manifest, group)
     try:
-        document = Manifest.model_validate_json(store.read(manifest))
-        check_seal(store.read(manifest), store.read(group), store.read(seal))
-        listed = list(Contents(document, lambda file: store.read(file.sha256)).files())
+        contents = stored_contents(store, manifest)
+        check_seal(*map(store.read, own.values()))
+        listed = list(contents.files())
     except (OSError, ValueError) as error:
         if isinstance(error, OSError) and is_unavailable(error):
             raise
         return None
-    own = {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: seal}
     files = own | {file.path: file.sha256 for file in listed}
     sizes = {file.path: file.size for file in listed}
 
     def is_whole(shown: tuple[str, Sha256]) -> bool:
         path, digest = shown
         time.sleep(sizes.get(path, 0) / rate)
-        return store.shows(digest, document.dataset, document.version, path) and store.holds(digest)
+        return store.shows(digest, contents.manifest.dataset, contents.manifest.version, path) and store.holds(digest)
 
     # Threads of a pool would read to the end before the process may end.
     whole = in_parallel(is_whole, files.items()) if rate == inf else map(is_whole, files.items())

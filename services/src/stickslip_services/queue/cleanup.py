@@ -10,12 +10,12 @@ from collections import Counter
 from collections.abc import Iterator
 
 from sqlalchemy import Connection, delete, select
-from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
+from stickslip_schemas.base.keys import Sha256, is_sha256
 from stickslip_schemas.base.states import JobState
-from stickslip_schemas.format.manifest import Contents, Manifest, seal_text
 from stickslip_schemas.store import Store, Stored
 
 from stickslip_services.access.audit_log import note
+from stickslip_services.catalog.versions import sealed_digests, stored_contents
 from stickslip_services.database.database import Database, batches
 from stickslip_services.database.tables import (
     certificates,
@@ -125,10 +125,6 @@ def _needed(database: Database, store: Store) -> set[bytes]:
             select(columns.manifest, columns.group_digest).where(columns.manifest.is_not(None))
         )
         for manifest, group in versions.all():
-            contents = Contents(
-                Manifest.model_validate_json(store.read(manifest)), lambda file: store.read(file.sha256)
-            )
-            add(manifest, group, *(file.sha256 for file in contents.files()))
-            if group is not None:
-                add(sha256(seal_text(manifest, group)))
+            files = stored_contents(store, manifest).files()
+            add(*sealed_digests(manifest, group).values(), *(file.sha256 for file in files))
     return needed

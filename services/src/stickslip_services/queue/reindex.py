@@ -21,6 +21,7 @@ from stickslip_services.catalog.versions import (
     find_committed,
     read_version,
     reserve_number,
+    sealed_digests,
 )
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import dataset_versions, jobs, tasks
@@ -66,7 +67,7 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     manifest = Manifest.model_validate_json(content)
     if (dataset_id(manifest.spec), manifest.version) != place:
         raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
-    own = {MANIFEST_NAME: sha256(content), GROUP_NAME: sha256(group), SEAL_NAME: sha256(seal)}
+    own = sealed_digests(sha256(content), sha256(group))
     listed = list(Contents(manifest, lambda file: store.read_shown(*place, file.path)).files())
 
     def put_back(shown: tuple[str, Sha256]) -> None:
