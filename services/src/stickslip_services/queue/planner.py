@@ -60,11 +60,7 @@ def plan_waiting_jobs(context: Context) -> None:
             if terms is None:
                 set_job_state(book, row.seq, JobState.failed, reason=reason, message=refusal)
                 continue
-            begin_planning(book, row.seq, terms)
-            if plan is not None:
-                write_plan(book, row.seq, plan)
-            else:
-                set_job_state(book, row.seq, JobState.planning)
+            begin_planning(book, row.seq, terms, plan)
 
 
 class Planner:

@@ -11,7 +11,6 @@ from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.recompute import read_plan
 from stickslip_services.queue.write_plan import begin_planning, insert_job
@@ -47,7 +46,6 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
                 spec, terms = read_plan(book.connection, made[0].seq)
                 job = insert_job(book, spec, project=made[0].project)
                 begin_planning(book, job, terms)
-                set_job_state(book, job, JobState.planning)
     key, seal = context.settings.signing_key, seal_text(row.manifest, row.group_digest)
     if found is not None and key is not None and mend_signature(context.store, row.dataset, row.version, seal, key):
         damaged.append(SIGNATURE_NAME)

@@ -26,11 +26,10 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
 from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import show_job
-from stickslip_services.queue.ledger import Ledger
 from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, terms_for
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
 from stickslip_services.queue.workers import NO_WORKER, alive_workers
-from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
+from stickslip_services.queue.write_plan import begin_planning, insert_job
 
 LOOKED_UP = 10_000
 """The largest grid whose tasks are looked up one by one for existing results."""
@@ -81,7 +80,10 @@ def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> 
             now = context.clock()
             with ledger(connection, now) as book:
                 job = insert_job(book, spec, priority=priority, project=project)
-                _enqueue(book, job, terms, plan)
+                if terms is None:
+                    set_job_state(book, job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
+                else:
+                    begin_planning(book, job, terms, plan)
             shown = show_job(context, connection, job)
             details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
             note(connection, "job.submit", shown.id, now, **details)
@@ -91,17 +93,6 @@ def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> 
         context.notifier.notify()
         check_made_datasets(context, at_most=CHECKED_AT_ONCE)
         return shown
-
-
-def _enqueue(book: Ledger, job: int, terms: Terms | None, plan: Plan | None) -> None:
-    """Queue a new job with its whole plan, or for planning piece by piece, or to wait for the first worker."""
-    if terms is None:
-        set_job_state(book, job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
-        return
-    begin_planning(book, job, terms)
-    set_job_state(book, job, JobState.planning if plan is None else JobState.queued)
-    if plan is not None:
-        write_plan(book, job, plan)
 
 
 def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> Replay | None:

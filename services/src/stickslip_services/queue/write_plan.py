@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select, update
+from sqlalchemy import Connection, bindparam, func, insert, select, update
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -29,6 +29,9 @@ from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
 from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, KeyedTask, Ledger, charge_tasks, reset_tasks
 from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
+_STARTED = select(func.sum(job_counts.c.count)).where(
+    job_counts.c.job == bindparam("b_job"), job_counts.c.state.in_((TaskState.leased, TaskState.running))
+)
 _LOST = (TaskState.failed, TaskState.cancelled)
 
 
@@ -54,17 +57,18 @@ def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str =
     return int(result.inserted_primary_key[0])  # type: ignore[index]  # of one inserted row it is never None
 
 
-def begin_planning(book: Ledger, job: int, terms: Terms) -> None:
-    """Store the terms of a job, and start its counters; its tasks follow in pieces, from slot 0 on."""
+def begin_planning(book: Ledger, job: int, terms: Terms, plan: Plan | None = None) -> None:
+    """Store the terms of a job, start its counters, and write its whole plan, or have it planned piece by piece."""
     spec = book.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
     values = {"builds": terms.builds.model_dump_json(), "certificate": terms.certificate}
     digest = row_digest(spec, *values.values())
-    book.connection.execute(
-        update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest, "reason": None, "message": ""})
-    )
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest}))
     rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
     insert_rows(book.connection, job_counts, ("job", "stage", "state", "count"), rows)
     insert_rows(book.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
+    set_job_state(book, job, JobState.planning if plan is None else JobState.queued)
+    if plan is not None:
+        write_plan(book, job, plan)
 
 
 def write_plan(book: Ledger, job: int, piece: Plan) -> None:
@@ -82,17 +86,10 @@ def write_plan(book: Ledger, job: int, piece: Plan) -> None:
     if last is TaskState.succeeded:
         message = "the dataset exists already: its files are being checked"
         set_job_state(book, job, JobState.queued, message=message)
-    elif _has_started_tasks(book.connection, job):
+    elif book.connection.scalar(_STARTED, {"b_job": job}):
         set_job_state(book, job, JobState.running)
-    elif piece.first > 0:
+    elif book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == job)) == JobState.planning:
         set_job_state(book, job, JobState.queued)
-
-
-def _has_started_tasks(connection: Connection, job: int) -> bool:
-    query = select(func.sum(job_counts.c.count)).where(
-        job_counts.c.job == job, job_counts.c.state.in_((TaskState.leased, TaskState.running))
-    )
-    return bool(connection.scalar(query))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import Depends, Query, Request
+from fastapi import Depends, Path, Query, Request
 from stickslip_schemas.documents.problems import MEDIA_TYPE
 
 from stickslip_services.api.files import OPENAPI_HEADERS
@@ -28,6 +28,7 @@ def _page(
 
 
 PageDep = Annotated[PageRequest, Depends(_page)]
+Version = Annotated[int, Path(ge=1, lt=2**31)]
 
 _TITLES = {
     400: "The body is not JSON",

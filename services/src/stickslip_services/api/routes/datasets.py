@@ -3,22 +3,20 @@
 `.../versions/N/files/` is the root of a Zarr store: any Zarr reader opens it at its URL.
 """
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Request, Response
 from stickslip_schemas.base.keys import is_sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
 
 from stickslip_services.api.files import picture_format, serve
-from stickslip_services.api.routes.common import ContextDep, PageDep, file_responses, problem_responses
+from stickslip_services.api.routes.common import ContextDep, PageDep, Version, file_responses, problem_responses
 from stickslip_services.catalog.datasets import find_dataset, find_file, find_version, list_datasets
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.jobs import is_preview
 
 router = APIRouter(tags=["datasets"])
-
-Version = Annotated[int, Path(ge=1, lt=2**31)]
 
 _BINARY_SCHEMA = {"schema": {"type": "string", "format": "binary"}}
 _BINARY = {"application/octet-stream": _BINARY_SCHEMA}

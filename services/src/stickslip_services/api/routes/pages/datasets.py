@@ -1,11 +1,12 @@
 """Pages of datasets: the list, one version, and its samples."""
 
 import json
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
 from stickslip_schemas.format.pictures import png
@@ -13,7 +14,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.files import matches
-from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.common import ContextDep, Version
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
@@ -22,11 +23,34 @@ from stickslip_services.pages.films import mp4
 from stickslip_services.pages.motion import motion
 from stickslip_services.pages.rendering import html_page, spec_text
 from stickslip_services.pages.sample_data import SampleData
-from stickslip_services.queue.context import Context
 
 router = APIRouter()
 
-Version = Annotated[int, Path(ge=1, lt=2**31)]
+Slot = Annotated[int, Path(ge=0)]
+Step = Annotated[int, Query(ge=1, le=8)]
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """The version of a dataset that a path names, with its data."""
+
+    dataset: Dataset
+    version: DatasetVersion
+    data: SampleData
+
+
+def _opened(dataset: str, version: Version, context: ContextDep) -> Opened:
+    with context.database.read() as connection:
+        found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
+    return Opened(found, committed, _sample_data(context.store, committed.manifest))
+
+
+@lru_cache(maxsize=8)
+def _sample_data(store: Store, manifest: str) -> SampleData:
+    return SampleData(store, read_contents(store, manifest))
+
+
+OpenedDep = Annotated[Opened, Depends(_opened)]
 
 
 @router.get("/datasets")
@@ -48,15 +72,15 @@ def get_dataset(dataset: str, context: ContextDep) -> Response:
 
 
 @router.get("/datasets/{dataset}/v{version}")
-def get_version(request: Request, dataset: str, version: Version, context: ContextDep) -> Response:
+def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Response:
     """Show a version."""
-    found, committed, data = _open(context, dataset, version)
+    data = opened.data
     values = thumbs(data, request.query_params, 0) | losses(data)
     return html_page(
         "dataset.html",
         here="datasets",
-        dataset=found,
-        version=committed,
+        dataset=opened.dataset,
+        version=opened.version,
         manifest=data.manifest,
         sliders=sliders(data.manifest.spec),
         histograms=histograms(data),
@@ -70,48 +94,29 @@ def get_version(request: Request, dataset: str, version: Version, context: Conte
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")
-def get_thumbs(
-    request: Request,
-    dataset: str,
-    version: Version,
-    context: ContextDep,
-    start: Annotated[int, Query(ge=0, lt=2**31)] = 0,
-) -> Response:
+def get_thumbs(request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0) -> Response:
     """Show the samples within the sliders."""
-    found, committed, data = _open(context, dataset, version)
-    page = html_page("thumbs.html", dataset=found, version=committed, **thumbs(data, request.query_params, start))
+    shown = thumbs(opened.data, request.query_params, start)
+    page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **shown)
     if not start:
-        page.headers["HX-Replace-Url"] = f"/datasets/{found.id}/v{version}?{request.url.query}"
+        page.headers["HX-Replace-Url"] = f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
     return page
 
 
-def _open(context: Context, dataset: str, version: int) -> tuple[Dataset, DatasetVersion, SampleData]:
-    with context.database.read() as connection:
-        found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
-    return found, committed, _sample_data(context.store, committed.manifest)
-
-
-@lru_cache(maxsize=8)
-def _sample_data(store: Store, manifest: str) -> SampleData:
-    return SampleData(store, read_contents(store, manifest))
-
-
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
-def get_sample(
-    dataset: str, version: Version, slot: int, context: ContextDep, beside: Annotated[str, Query(max_length=20)] = ""
-) -> Response:
+def get_sample(opened: OpenedDep, slot: int, beside: Annotated[str, Query(max_length=20)] = "") -> Response:
     """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
-    found, committed, data = _open(context, dataset, version)
+    data, name = opened.data, f"version {opened.version.version} of {opened.dataset.id}"
     last = data.manifest.sample_count - 1
     slots = [slot, *([int(beside)] if beside.isdecimal() else [])]
     if not all(0 <= each <= last for each in slots):
-        raise NotFoundError(f"version {version} of {dataset} has slots 0 to {last}, not {', '.join(map(str, slots))}")
+        raise NotFoundError(f"{name} has slots 0 to {last}, not {', '.join(map(str, slots))}")
     rejections = {each: rejection for each in slots if (rejection := data.rejection(each))}
     return html_page(
         "sample.html",
         here="datasets",
-        dataset=found,
-        version=committed,
+        dataset=opened.dataset,
+        version=opened.version,
         slot=slot,
         last_slot=last,
         rejections=rejections.values(),
@@ -121,11 +126,9 @@ def get_sample(
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.mp4")
-def get_film(
-    dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], array: str, context: ContextDep
-) -> Response:
+def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
     """Return a clip, or its ground truth, as MP4 with 10 frames a second."""
-    _, _, data = _open(context, dataset, version)
+    data = opened.data
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
         raise NotFoundError(f"{array[:50]} is no clip")
@@ -134,26 +137,23 @@ def get_film(
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
-def get_spec(dataset: str, version: Version, context: ContextDep) -> Response:
+def get_spec(opened: OpenedDep) -> Response:
     """Return the spec of a version as YAML."""
-    _, _, data = _open(context, dataset, version)
-    return Response(spec_text(data.manifest.spec), media_type="application/yaml")
+    return Response(spec_text(opened.data.manifest.spec), media_type="application/yaml")
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
 def get_picture(
-    dataset: str,
-    version: Version,
-    slot: Annotated[int, Path(ge=0)],
+    opened: OpenedDep,
+    slot: Slot,
     array: str,
-    index: Annotated[int, Path(ge=0)],
+    index: Slot,
     request: Request,
-    context: ContextDep,
     step: Annotated[int, Query(ge=1, le=8)] = 1,
 ) -> Response:
     """Return a picture or a frame of ground truth of a sample as PNG; `step` takes every `step`-th pixel."""
-    _, committed, data = _open(context, dataset, version)
-    tag = f'"{committed.manifest[:32]}-{slot}-{index}-{step}"'
+    data = opened.data
+    tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}"'
     headers = {"Cache-Control": "private, max-age=86400", "ETag": tag}
     if matches(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=headers)
@@ -165,15 +165,15 @@ def get_picture(
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/motion.json")
-def get_motion(dataset: str, version: Version, slot: Annotated[int, Path(ge=0)], context: ContextDep) -> Response:
+def get_motion(opened: OpenedDep, slot: Slot) -> Response:
     """Return what the view of a sample in three dimensions draws, as JSON."""
-    _, _, data = _open(context, dataset, version)
     try:
-        if slot >= data.manifest.sample_count:
+        if slot >= opened.data.manifest.sample_count:
             raise KeyError(slot)
-        document = motion(data, slot)
+        document = motion(opened.data, slot)
     except KeyError as error:
-        raise NotFoundError(f"version {version} of {dataset} has no shape of a sample {slot}") from error
+        name = f"version {opened.version.version} of {opened.dataset.id}"
+        raise NotFoundError(f"{name} has no shape of a sample {slot}") from error
     return Response(json.dumps(document), media_type="application/json")
 
 
