@@ -9,7 +9,6 @@ import asyncio
 import time
 from collections import Counter
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
 from typing import ClassVar
 
 from fastapi.responses import StreamingResponse
@@ -102,13 +101,6 @@ class Feeds:
                     del self._feeds[job]
 
 
-@dataclass(frozen=True, slots=True)
-class _News:
-    events: list[StoredEvent]
-    progress: str | None
-    ended: bool
-
-
 class _Feed:
     """Events and progress of a job, kept up to date while it is watched."""
 
@@ -172,14 +164,15 @@ class _Feed:
         with self._context.database.read() as connection:
             return read_events(connection, self._job, after=after, limit=BATCH)
 
-    def _look(self, *, with_progress: bool) -> _News:
+    def _look(self, *, with_progress: bool) -> tuple[list[StoredEvent], str | None, bool]:
+        """Return new events, the progress if it was read, and whether the job has ended and these are its last."""
         with self._context.database.read() as connection:
             events = read_events(connection, self._job, after=self._newest, limit=BATCH)
             is_shown = with_progress or any(event.is_last for event in events)
             shown = show_job(self._context, connection, self._job) if is_shown else None
         ended = shown is not None and not shown.state.is_open and len(events) < BATCH
         progress = None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
-        return _News(events, progress, ended)
+        return events, progress, ended
 
     async def _follow(self) -> None:
         """Read new events until the job ends or nobody watches."""
@@ -189,11 +182,11 @@ class _Feed:
                 seen = self._context.notifier.count
                 now = time.monotonic()
                 is_progress_due = now - looked_at >= PROGRESS_SECONDS
-                news = await run_in_threadpool(self._look, with_progress=is_progress_due)
-                if news.progress is not None:
+                events, progress, ended = await run_in_threadpool(self._look, with_progress=is_progress_due)
+                if progress is not None:
                     looked_at = now
-                self._take(news)
-                if len(news.events) == BATCH or self._is_complete:
+                self._take(events, progress, ended=ended)
+                if len(events) == BATCH or self._is_complete:
                     continue
                 # A busy queue notifies all the time; a few looks a second are enough for people.
                 await asyncio.sleep(LOOK_SECONDS)
@@ -202,14 +195,14 @@ class _Feed:
         finally:
             self._tell()
 
-    def _take(self, news: _News) -> None:
-        is_new = bool(news.events) or news.ended or news.progress not in (None, self._progress)
-        self._events += news.events
+    def _take(self, events: list[StoredEvent], progress: str | None, *, ended: bool) -> None:
+        is_new = bool(events) or ended or progress not in (None, self._progress)
+        self._events += events
         if len(self._events) > 2 * KEPT_EVENTS:
             self._after = self._events[-KEPT_EVENTS - 1].id
             del self._events[:-KEPT_EVENTS]
-        self._progress = news.progress or self._progress
-        self._is_complete = news.ended
+        self._progress = progress or self._progress
+        self._is_complete = ended
         if is_new:
             self._tell()
 

@@ -2,13 +2,12 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, func, insert, select, update
+from sqlalchemy import Connection, Row, func, insert, select, update
 from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.documents.responses import DatasetRef
 from stickslip_schemas.documents.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
@@ -30,30 +29,6 @@ HEADS_AT_ONCE = 128
 """Number of parallel requests to the store; a worker waits for the answer."""
 
 
-@dataclass(frozen=True, slots=True)
-class ManifestSummary:
-    """The part of a manifest that the database stores."""
-
-    dataset: str
-    version: int
-    manifest: Sha256
-    group: Sha256
-    kind: str
-    spec_digest: Sha256
-    sample_count: int
-    valid_count: int
-    bytes: int
-
-
-@dataclass(frozen=True, slots=True)
-class CommittedVersion:
-    """A version that exists."""
-
-    reference: DatasetRef
-    sample_count: int
-    rejected_count: int
-
-
 def stored_contents(store: Store, manifest: Sha256) -> Contents:
     """Return what a manifest in the store lists; raise OSError or ValueError. Sections are read on demand."""
     document = Manifest.model_validate_json(store.read(manifest))
@@ -65,7 +40,7 @@ def sealed_digests(manifest: Sha256, group: Sha256) -> dict[str, Sha256]:
     return {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: sha256(seal_text(manifest, group))}
 
 
-def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
+def read_version(store: Store, output: PublishOutput) -> Manifest:
     """Read a manifest that a worker has published, and check that all its files are in the store.
 
     Raises ValueError or OSError.
@@ -80,17 +55,7 @@ def read_version(store: Store, output: PublishOutput) -> ManifestSummary:
     for file, size in zip(files, sizes, strict=True):
         if size != file.size:
             raise CorruptArtifactError(f"{file.path} has another size than the manifest says")
-    return ManifestSummary(
-        dataset=manifest.dataset,
-        version=manifest.version,
-        manifest=output.manifest,
-        group=output.group,
-        kind=manifest.spec.kind,
-        spec_digest=manifest.spec_digest,
-        sample_count=manifest.sample_count,
-        valid_count=manifest.valid_count,
-        bytes=output.bytes,
-    )
+    return manifest
 
 
 def sign_version(store: Store, dataset: str, version: int, seal: bytes, key: Path) -> None:
@@ -148,33 +113,37 @@ def reserve_number(connection: Connection, dataset: str, version: int, publish_t
 
 
 def commit_version(
-    connection: Connection, publish_task: int, summary: ManifestSummary, *, name: str | None, now: float
+    connection: Connection,
+    publish_task: int,
+    manifest: Manifest,
+    output: PublishOutput,
+    *,
+    name: str | None,
+    now: float,
 ) -> None:
     """Commit a version; with its first version a dataset gets its `name`."""
-    if connection.scalar(select(datasets.c.seq).where(datasets.c.id == summary.dataset)) is None:
-        connection.execute(
-            insert(datasets).values(id=summary.dataset, name=name, kind=summary.kind, spec_digest=summary.spec_digest)
-        )
+    if connection.scalar(select(datasets.c.seq).where(datasets.c.id == manifest.dataset)) is None:
+        row = {"id": manifest.dataset, "name": name, "kind": manifest.spec.kind, "spec_digest": manifest.spec_digest}
+        connection.execute(insert(datasets).values(row))
     connection.execute(
         update(dataset_versions)
         .where(dataset_versions.c.publish_task == publish_task)
         .values(
-            manifest=summary.manifest,
-            group_digest=summary.group,
+            manifest=output.manifest,
+            group_digest=output.group,
             created_at=func.coalesce(dataset_versions.c.created_at, now),
-            sample_count=summary.sample_count,
-            valid_count=summary.valid_count,
-            bytes=summary.bytes,
+            sample_count=manifest.sample_count,
+            valid_count=manifest.valid_count,
+            bytes=output.bytes,
             scrubbed_at=now,
             damaged=0,
         )
     )
 
 
-def find_committed(connection: Connection, publish_task: int) -> CommittedVersion:
-    row = connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
-    reference = DatasetRef(dataset=row.dataset, version=row.version, manifest=row.manifest)
-    return CommittedVersion(reference, row.sample_count, row.sample_count - row.valid_count)
+def find_committed(connection: Connection, publish_task: int) -> Row[Any]:
+    """Return the row of a version that exists."""
+    return connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
 
 
 def damaged_files(store: Store, manifest: Sha256, group: Sha256, *, rate: float = inf) -> Mapping[str, Sha256] | None:

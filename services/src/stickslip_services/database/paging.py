@@ -24,11 +24,6 @@ class PageRequest:
     size: int
     after: int | None
 
-    @classmethod
-    def from_query(cls, page_size: int, page_token: str | None) -> "PageRequest":
-        """Read a page token of the form TOKEN_PATTERN."""
-        return cls(page_size, None if page_token is None else int(page_token))
-
 
 def document_of(model: type[M], row: Any, **more: Any) -> M:
     """Return a document with the values of a row, or of an object, for its fields, and with `more`.

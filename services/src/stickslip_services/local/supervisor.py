@@ -18,7 +18,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO
 
 import httpx
 from stickslip_schemas.store import write_durably
@@ -81,7 +80,7 @@ class _Child:
             )
         self.started_at = time.monotonic()
 
-    def restart_if_dead(self, say: Callable[[str], None]) -> None:
+    def restart_if_dead(self) -> None:
         """Restart the process if it has died; raise SupervisorError after too many failed starts."""
         if self.process is None:
             if time.monotonic() >= self.start_again_at:
@@ -101,7 +100,7 @@ class _Child:
                 f"The end of {self.log}:\n{self.last_words()}"
             )
         wait = 0.0 if self.failed_starts == 0 else 0.25 * 2**self.failed_starts
-        say(f"the {self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
+        _say(f"the {self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
         self.start_again_at = time.monotonic() + wait
 
     def stop(self, is_urgent: Callable[[], bool]) -> None:
@@ -135,9 +134,8 @@ class _Child:
             os.killpg(self.process.pid, signal.SIGKILL)
 
 
-def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable[[str], None] | None = None) -> int:
+def run(service: LocalService, *, on_ready: Callable[[str], None]) -> int:
     """Run until a signal to stop; return the exit status. Raise SupervisorError."""
-    say = say or (lambda message: print_line(sys.stderr, message))
     settings = service.settings
     data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
@@ -169,7 +167,7 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             on_ready(settings.url)
             while not signals:
                 for child in children:
-                    child.restart_if_dead(say)
+                    child.restart_if_dead()
                 time.sleep(_TICK)
             return 0
         finally:
@@ -178,10 +176,9 @@ def run(service: LocalService, *, on_ready: Callable[[str], None], say: Callable
             (data / "url").unlink(missing_ok=True)
 
 
-def print_line(stream: IO[str], message: str) -> None:
-    """Write a line with the time, and flush it."""
-    stream.write(f"{time.strftime('%H:%M:%S')} {message}\n")
-    stream.flush()
+def _say(message: str) -> None:
+    """Write a line with the time on standard error."""
+    sys.stderr.write(f"{time.strftime('%H:%M:%S')} {message}\n")
 
 
 def _coordinator_command(settings: Settings, listener: int) -> list[str]:

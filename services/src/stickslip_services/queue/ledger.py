@@ -9,12 +9,12 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from sqlalchemy import Column, Connection, bindparam, case, select, update
+from sqlalchemy import Column, Connection, Row, bindparam, case, select, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
-from stickslip_services.catalog.versions import CommittedVersion
 from stickslip_services.database.database import batches
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.prepared import Counters, Prepared
 from stickslip_services.database.tables import job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import Run
@@ -56,13 +56,13 @@ class Ending:
     rejected_count: int = 0
 
     @staticmethod
-    def published(version: CommittedVersion) -> "Ending":
-        """Return the ending of a job whose dataset version exists."""
-        lost = version.rejected_count
+    def published(version: Row[Any]) -> "Ending":
+        """Return the ending of a job whose dataset version, a row of `dataset_versions`, exists."""
+        reference, lost = document_of(DatasetRef, version), version.sample_count - version.valid_count
         if lost == 0:
-            return Ending(JobState.succeeded, None, "", version.reference)
+            return Ending(JobState.succeeded, None, "", reference)
         message = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
-        return Ending(JobState.succeeded_with_rejects, None, message, version.reference, lost)
+        return Ending(JobState.succeeded_with_rejects, None, message, reference, lost)
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,9 +40,9 @@ def read_progress(
     return {row.seq: _progress(row, known, slots.get(row.seq, 0)) for row in rows}
 
 
-def _frames(connection: Connection, seqs: list[int], frames: Frames) -> dict[tuple[int, str, str], "_Sum"]:
-    """Return the reported frames by job, stage and cost group."""
-    found: dict[tuple[int, str, str], _Sum] = {}
+def _frames(connection: Connection, seqs: list[int], frames: Frames) -> "_Reported":
+    """Return what running simulations report, (frames done, frames total), by job, stage and cost group."""
+    found: _Reported = {}
     by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
     if not by_key:
         return found
@@ -52,17 +52,11 @@ def _frames(connection: Connection, seqs: list[int], frames: Frames) -> dict[tup
         .where(tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs))
     )
     for job, stage, group, key in rows:
-        done, total = by_key[key]
-        before = found.get((job, stage, group), _Sum(0, 0, 0.0))
-        found[job, stage, group] = _Sum(before.done + done, before.total + total, before.share + done / max(total, 1))
+        found.setdefault((job, stage, group), []).append(by_key[key])
     return found
 
 
-class _Sum(NamedTuple):
-    done: int
-    total: int
-    share: float
-    """Sum of the finished fractions of running tasks."""
+_Reported = dict[tuple[int, str, str], list[tuple[int, int]]]
 
 
 class _Known(NamedTuple):
@@ -70,7 +64,7 @@ class _Known(NamedTuple):
     stages: dict[tuple[int, str], Row[tuple[object, ...]]]
     groups: dict[tuple[int, str], list[tuple[str, int]]]
     costs: Mapping[Group, Cost]
-    frames: dict[tuple[int, str, str], _Sum]
+    frames: _Reported
 
 
 def rejected_samples(progress: Progress) -> int:
@@ -88,18 +82,18 @@ def _progress(row: Row[tuple[object, ...]], known: _Known, slots: int) -> Progre
         if kept is None:  # not planned yet
             continue
         mine = known.counts[row.seq, stage]
-        told = [frames for (job, of, _), frames in known.frames.items() if (job, of) == (row.seq, stage)]
+        told = [each for key, frames in known.frames.items() if key[:2] == (row.seq, stage) for each in frames]
         shown[stage] = StageProgress(
             counts={state: count for state, count in mine.items() if count},
             cached=kept.cached,
             cpu_seconds=kept.cpu_seconds,
-            frames=(sum(item.done for item in told), sum(item.total for item in told)) if told else None,
+            frames=(sum(done for done, _ in told), sum(total for _, total in told)) if told else None,
         )
         work[stage] = []
         for group, left in known.groups.get((row.seq, stage), ()):
             timings = timings_of(known.costs, stage, row.kind, group)
-            told_of = known.frames.get((row.seq, stage, group))
-            work[stage].append(StageWork(left - (0.0 if told_of is None else told_of.share), timings))
+            finished = sum(done / max(total, 1) for done, total in known.frames.get((row.seq, stage, group), ()))
+            work[stage].append(StageWork(left - finished, timings))
     eta = None
     if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
         eta = estimate(work, slots=slots)

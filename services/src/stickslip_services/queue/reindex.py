@@ -103,7 +103,7 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
             )
             book.moved(Task(task, Stage.publish, TaskState.pending), TaskState.succeeded)
             reserve_number(connection, manifest.dataset, manifest.version, task)
-            commit_version(connection, task, read_version(store, output), name=manifest.spec.name, now=made_at)
+            commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
             ending = Ending.published(find_committed(connection, task))
             message = ". ".join(filter(None, ["found again in the store", ending.message]))
             for holder in book.holders([task])[task]:

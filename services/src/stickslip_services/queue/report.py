@@ -13,11 +13,10 @@ from sqlalchemy import bindparam, delete, insert, select, update
 from stickslip_schemas.base.states import Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
-from stickslip_schemas.format.manifest import seal_text
+from stickslip_schemas.format.manifest import Manifest, seal_text
 from stickslip_schemas.store import is_unavailable
 
 from stickslip_services.catalog.versions import (
-    ManifestSummary,
     check_output,
     commit_version,
     find_committed,
@@ -89,7 +88,7 @@ _COUNT_DOWN = Prepared(
 
 def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
     """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
-    versions: dict[str, ManifestSummary] = {}
+    versions: dict[str, Manifest] = {}
     reports = [_checked_in_store(context, report, versions) for report in batch.reports]
     with context.ledger() as book:
         worker = find_worker(book.connection, batch.worker_id)
@@ -124,7 +123,7 @@ def _after_commit(context: Context, task: str) -> None:
             context.store.delete(digest)
 
 
-def _checked_in_store(context: Context, report: Report, versions: dict[str, ManifestSummary]) -> Report:
+def _checked_in_store(context: Context, report: Report, versions: dict[str, Manifest]) -> Report:
     """Return the report, or a failure where the store lacks its artifacts; add the summary of a manifest, signed."""
     if report.result is None or report.result.output is None:
         return report
@@ -133,7 +132,7 @@ def _checked_in_store(context: Context, report: Report, versions: dict[str, Mani
         if isinstance(output, PublishOutput):
             version = read_version(context.store, output)
             if context.settings.signing_key is not None:
-                seal = seal_text(version.manifest, version.group)
+                seal = seal_text(output.manifest, output.group)
                 sign_version(context.store, version.dataset, version.version, seal, context.settings.signing_key)
             versions[report.task_id] = version
         else:
@@ -153,7 +152,7 @@ def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
 
 
 def _judged(
-    book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, ManifestSummary]
+    book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, Manifest]
 ) -> tuple[list[ReportVerdict], list[HeldTask], list[_Ended]]:
     """Judge each report; return the verdicts, the tasks that were given back, and those that have ended.
 
@@ -192,7 +191,7 @@ def _find(book: Ledger, reports: Sequence[Report]) -> dict[str, Any]:
     }
 
 
-def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[str, ManifestSummary]) -> TaskResult:
+def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
     """Return the result, or a failure where it does not fit the task."""
     wrong: str | None = None
     reason = Reason.internal_error
@@ -211,7 +210,7 @@ def _checked(book: Ledger, task: HeldTask, result: TaskResult, versions: dict[st
     return _failed(result, reason, wrong)
 
 
-def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, ManifestSummary]) -> list[_Ended]:
+def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, Manifest]) -> list[_Ended]:
     """Store results; return the failures."""
     # Who reports a result has started the task, whether or not a heartbeat said so in between.
     start_tasks(book, [end.task for end in ended if end.task.state is TaskState.leased])
@@ -224,11 +223,11 @@ def _take_results(book: Ledger, ended: Sequence[_Ended], versions: dict[str, Man
             book.connection.execute(delete(previews).where(previews.c.task == end.task.seq))  # of an earlier run
             book.connection.execute(insert(previews).values(task=end.task.seq, digest=output.preview))
         elif isinstance(output, PublishOutput):
-            _commit(book, end.task.seq, versions[end.task.name])
+            _commit(book, end.task.seq, versions[end.task.name], output)
     return [end for end in ended if end.result.outcome == "failed"]
 
 
-def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
+def _commit(book: Ledger, publish_task: int, manifest: Manifest, output: PublishOutput) -> None:
     """Commit a version, and end the jobs that wait for it."""
     connection = book.connection
     holders = [holder.job for holder in book.holders([publish_task]).get(publish_task, ())]
@@ -236,7 +235,7 @@ def _commit(book: Ledger, publish_task: int, summary: ManifestSummary) -> None:
         select(jobs.c.seq, jobs.c.name).where(jobs.c.seq.in_(holders), jobs.c.state.in_(LIVE)).order_by(jobs.c.seq)
     ).all()
     name = next((row.name for row in waiting if row.name is not None), None)
-    commit_version(connection, publish_task, summary, name=name, now=book.now)
+    commit_version(connection, publish_task, manifest, output, name=name, now=book.now)
     for row in waiting:
         book.end_job(row.seq, Ending.published(find_committed(connection, publish_task)))
 

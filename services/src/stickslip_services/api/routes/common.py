@@ -24,7 +24,7 @@ def _page(
         str | None, Query(pattern=TOKEN_PATTERN, description="`next_page_token` of the page before")
     ] = None,
 ) -> PageRequest:
-    return PageRequest.from_query(page_size, page_token)
+    return PageRequest(page_size, None if page_token is None else int(page_token))
 
 
 PageDep = Annotated[PageRequest, Depends(_page)]
