@@ -11,8 +11,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
-from stickslip_services.pages.browsing import coloured, sample_view, sliders, thumbs
-from stickslip_services.pages.films import mp4
+from stickslip_services.pages.browsing import coloured, mp4, sample_view, sliders, thumbs
 from stickslip_services.pages.motion import deformed, motion
 
 

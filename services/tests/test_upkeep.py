@@ -24,9 +24,8 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.reindex import reindex
-from stickslip_services.queue.scrub import EVERY_SECONDS, scrub, scrub_when_idle
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start, sweep
+from stickslip_services.queue.sweep import EVERY_SECONDS, scrub, scrub_when_idle, start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job

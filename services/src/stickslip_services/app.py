@@ -51,8 +51,7 @@ from stickslip_services.queue.control import give_up_waiting
 from stickslip_services.queue.lease import renew_leases
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.scrub import scrub_when_idle
-from stickslip_services.queue.sweep import start, sweep
+from stickslip_services.queue.sweep import scrub_when_idle, start, sweep
 from stickslip_services.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -166,14 +165,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
     parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
     parser.add_argument("--signing-key", type=Path, help="file with the key of OpenSSH that signs new versions")
-    parser.add_argument("--openapi", action="store_true", default=None, help="print the OpenAPI document and end")
-    parser.add_argument("--migrate", action="store_true", default=None, help="bring the database up to date, and end")
+    parser.add_argument("--openapi", action="store_true", help="print the OpenAPI document and end")
+    parser.add_argument("--migrate", action="store_true", help="bring the database up to date, and end")
     parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
-    chosen = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
-    if chosen.pop("openapi", False):
+    chosen = vars(parser.parse_args(arguments))
+    if chosen.pop("openapi"):
         sys.stdout.write(openapi_text())
         return 0
-    descriptor, is_migrating = chosen.pop("fd", None), chosen.pop("migrate", False)
+    descriptor, is_migrating = chosen.pop("fd"), chosen.pop("migrate")
     try:
         settings = Settings.chosen(**chosen)
         if settings.signing_key is not None:

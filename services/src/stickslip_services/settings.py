@@ -72,9 +72,9 @@ class Settings(BaseSettings):
 
     @classmethod
     def chosen(cls, **values: Any) -> Self:
-        """Return settings with these values, the others from the environment; raise SettingsError."""
+        """Return settings with these values, those that are None from the environment; raise SettingsError."""
         try:
-            return cls(**values)
+            return cls(**{name: value for name, value in values.items() if value is not None})
         except ValidationError as error:
             rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
             raise SettingsError("; ".join(rules)) from None

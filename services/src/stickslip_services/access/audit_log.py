@@ -57,6 +57,6 @@ def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
 
     A coordinator may run meanwhile. Raises DatabaseRefusedError or SettingsError.
     """
-    settings = Settings.chosen(data=data, **({} if database_url is None else {"database": database_url}))
+    settings = Settings.chosen(data=data, database=database_url)
     with asking(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
         yield connection

@@ -31,7 +31,7 @@ from stickslip_services.local.process import locked
 from stickslip_services.queue.cleanup import remove, unused
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.reindex import reindex as reindexed
-from stickslip_services.queue.scrub import scrub as scrubbed
+from stickslip_services.queue.sweep import scrub as scrubbed
 from stickslip_services.settings import Settings
 
 _data_option = click.option(
@@ -46,8 +46,7 @@ def stopped(command: Callable[P, R]) -> Callable[P, R]:
 
 def _settings(data: Path, store: str | None, database: str | None, role: Role, *, is_new: bool = False) -> Settings:
     """Return the settings of a coordinator; raise DatabaseRefusedError if there is no database, unless `is_new`."""
-    given = {name: value for name, value in (("store", store), ("database", database)) if value is not None}
-    settings = Settings.chosen(data=data, **given)
+    settings = Settings.chosen(data=data, store=store, database=database)
     if not is_new and not check(settings, role, with_store=True):
         raise DatabaseRefusedError(
             f"the database {settings.database_name} does not exist or is empty: name the "

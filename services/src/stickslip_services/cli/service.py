@@ -76,10 +76,9 @@ def up(
     from stickslip_services.settings import Settings
 
     auth = {"allowed_hosts": allow_host, "require_keys": require_keys, "behind_proxy": behind_proxy}
-    given: dict[str, Any] = {name: value for name, value in auth.items() if value}
-    given |= {name: path.absolute() for name, path in files.items() if path is not None}
-    given |= {name: value for name, value in (("store", store), ("database", database)) if value is not None}
-    settings = Settings.chosen(data=data.absolute(), host=host, port=port, **given)
+    given: dict[str, Any] = {name: value or None for name, value in auth.items()}
+    given |= {name: path and path.absolute() for name, path in files.items()}
+    settings = Settings.chosen(data=data.absolute(), host=host, port=port, store=store, database=database, **given)
     check(settings, Role.coordinator, with_store=True)
     status = supervisor.run(
         supervisor.LocalService(settings, name or _name(settings), slots, workers),

@@ -1,6 +1,5 @@
 """The HTTP client of a coordinator: typed answers, problems as exceptions, retries while the coordinator restarts."""
 
-import json
 import os
 import random
 import secrets
@@ -340,6 +339,6 @@ def _read_event(message: Mapping[str, str]) -> Event | None:
     if model is None:
         return None
     try:
-        return model.model_validate(json.loads(message.get("data", "")))
+        return model.model_validate_json(message.get("data", ""))
     except ValueError as error:
         raise UnexpectedError(f"the event {name} has unexpected data: {error}") from error

@@ -23,7 +23,7 @@ from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
-from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id, task_key
+from stickslip_services.queue.ids import task_id, task_key
 from stickslip_services.queue.ledger import KeyedTask
 from stickslip_services.queue.recompute import check_results, check_samples, read_plan
 
@@ -123,7 +123,7 @@ _RESULTS = Prepared(
     ).where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
 )
 _SAMPLES = Prepared(
-    select(*(samples.c[name] for name in (*SAMPLE_COLUMNS, "digest")))
+    select(samples)
     .where(
         samples.c.job == bindparam("b_job"), samples.c.slot >= bindparam("b_first"), samples.c.slot < bindparam("b_end")
     )

@@ -106,20 +106,20 @@ def hold_jobs(book: Ledger, trouble: str) -> None:
 
 def release_jobs(book: Ledger) -> None:
     """Resume the jobs that waited for the store."""
-    for job_id in held_jobs(book.connection):
-        _resume(book, find_job(book.connection, job_id))
+    for job in held_jobs(book.connection):
+        _resume(book, job)
 
 
 _HELD_JOBS = Prepared(
-    select(jobs.c.id)
+    select(jobs)
     .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
     .order_by(jobs.c.seq)
 )
 
 
-def held_jobs(connection: Connection) -> list[str]:
-    """Return the ids of the jobs that wait for the store."""
-    return [job_id for (job_id,) in _HELD_JOBS.tuples(connection)]
+def held_jobs(connection: Connection) -> list[Any]:
+    """Return the rows of the jobs that wait for the store."""
+    return _HELD_JOBS.rows(connection)
 
 
 @contextmanager

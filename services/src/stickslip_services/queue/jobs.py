@@ -15,7 +15,7 @@ from stickslip_services.database.tables import job_stages, job_tasks, jobs, prev
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageTimings, read_costs
-from stickslip_services.queue.ids import SAMPLE_COLUMNS, task_id
+from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.recompute import check_results, check_samples, terms_of
@@ -92,14 +92,7 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
     """Return a page of the samples of a job by slot, each with the state of its last task."""
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     query = (
-        select(
-            *(samples.c[name] for name in SAMPLE_COLUMNS),
-            samples.c.digest,
-            tasks.c.seq,
-            tasks.c.state,
-            tasks.c.reason,
-            tasks.c.message,
-        )
+        select(samples, tasks.c.seq, tasks.c.state, tasks.c.reason, tasks.c.message)
         .join(tasks, tasks.c.seq == last)
         .where(samples.c.job == job)
     )

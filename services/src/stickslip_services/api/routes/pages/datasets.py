@@ -18,8 +18,7 @@ from stickslip_services.api.routes.common import ContextDep, Version
 from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import coloured, histograms, losses, sample_view, sliders, thumbs
-from stickslip_services.pages.films import mp4
+from stickslip_services.pages.browsing import coloured, histograms, losses, mp4, sample_view, sliders, thumbs
 from stickslip_services.pages.motion import motion
 from stickslip_services.pages.rendering import html_page, spec_text
 from stickslip_services.pages.sample_data import SampleData
