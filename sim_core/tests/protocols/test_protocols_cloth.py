@@ -125,23 +125,21 @@ class TestInclinedPlane:
         assert result.settings["drift_mm"] == 0.0
 
     def test_creep_is_not_passed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(inclined_plane, "drift", lambda *_, **__: 2e-5)
+        monkeypatch.setattr(inclined_plane.OnSlope, "drift", lambda _: 2e-5)
         result = protocols.run("inclined-plane", friction=(0.5,), cells=4, unstructured=0)
         assert math.isnan(result.curves[0].measured[0])
         assert not result.passed
 
     def test_patch_that_does_not_slide_is_nan(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(inclined_plane, "UP_TO", 0.99)
+        monkeypatch.setattr(inclined_plane.OnSlope, "share_to", 0.99)
         mesh = meshes.grid(0.1, 0.1, 4, 4)
-        assert math.isnan(inclined_plane.slip_slope(mesh, 0.5, CERTIFIED))
+        assert math.isnan(inclined_plane.patch(mesh, 0.5, CERTIFIED).slip_slope())
 
     def test_slips_late_by_the_tolerance(self) -> None:
         """A residual that is as good as zero for the solver is friction beyond mu: tolerance over mu at most."""
         mesh = meshes.grid(0.1, 0.1, 4, 4)
         loose = replace(CERTIFIED, tolerance=1e-2)
-        late = [
-            inclined_plane.slip_slope(mesh, 0.5, preset, force_share=1.0) / 0.5 - 1.0 for preset in (loose, CERTIFIED)
-        ]
+        late = [inclined_plane.patch(mesh, 0.5, preset).slip_slope() / 0.5 - 1.0 for preset in (loose, CERTIFIED)]
         assert 0.0 < late[1] < late[0] < 1e-2 / 0.5 * 1.5
 
 

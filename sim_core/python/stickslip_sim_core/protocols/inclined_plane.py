@@ -1,10 +1,12 @@
 """Inclined plane: the slope at which a patch of cloth begins to slide, and its creep below that slope."""
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -21,42 +23,95 @@ SIDE = 0.1  # m
 FABRIC = "gray-interlock"
 DIRECTION = np.array([np.cos(0.5), np.sin(0.5)])  # down the slope, along no edge
 
-RATE = 0.01  # 1/s: of tan(alpha) over mu
-FROM, UP_TO = 0.95, 1.05  # tan(alpha) over mu
-MOVED = 1e-9  # m: a patch whose vertices have all come so far slides
-
 HOLD_SHARE = 0.9  # of the slip angle
 HOLD_TIME = 10.0  # s
 DRIFT_MAX = 1e-5  # m
 
-# Of a node's weight: the force that residuals are measured in. A resting node may bear a force beyond friction by the
-# preset's tolerance times this, and slides late by as much over mu.
-FORCE_SHARE = 1.0
+
+class OnSlope:
+    """Cloth at rest on a slope. What lies above an interface of friction mu is to slip as the slope grows, alone.
+
+    Args:
+        cloth: Without a state.
+        start: (V, 3): where it lies [m].
+        mu: Friction of the interface.
+        floor: Friction of the plane.
+        upper: (V,): which vertices are above the interface.
+    """
+
+    share_from: ClassVar[float] = 0.95
+    share_to: ClassVar[float] = 1.05
+    """Tan(alpha) over mu, at first and at last."""
+
+    rate: ClassVar[float] = 0.01
+    """By which it grows [1/s]."""
+
+    slid: ClassVar[float] = 1e-9
+    """What slides has come so far with all of its vertices [m]."""
+
+    def __init__(self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]) -> None:
+        self.cloth, self.start, self.mu, self.upper = cloth, start, mu, upper
+        self.floor = [plane(floor)]
+        cloth.set_state(start)
+
+    def moved(self) -> Floats:
+        """Return the displacement of each vertex (V,) [m]."""
+        return np.asarray(np.abs(self.cloth.positions - self.start).max(axis=1))
+
+    def drift(self) -> float:
+        """Return the largest displacement in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
+        dt = self.cloth.preset.time_step
+        self.cloth.gravity[:] = tilted(HOLD_SHARE * np.arctan(self.mu))
+        for _ in range(round(HOLD_TIME / dt)):
+            self.cloth.step(dt, bodies=self.floor)
+        return float(self.moved().max())
+
+    def slip_slope(self) -> float:
+        """Return tan(alpha) of the slope at which all that is above slides, or NaN.
+
+        NaN, too, where what is below has moved.
+        """
+        dt = self.cloth.preset.time_step
+        for step in range(1, round((self.share_to - self.share_from) / (self.rate * dt)) + 1):
+            slope = self.mu * (self.share_from + self.rate * step * dt)
+            self.cloth.gravity[:] = tilted(np.arctan(slope))
+            self.cloth.step(dt, bodies=self.floor)
+            moved = self.moved()
+            if moved[self.upper].min() > self.slid:
+                return float(slope) if moved[~self.upper].max(initial=0.0) <= DRIFT_MAX else np.nan
+        return np.nan
+
+
+def tilted(angle: float) -> Floats:
+    """Return gravity [m/s^2] in axes whose third is normal to a plane of this slope [rad]."""
+    return GRAVITY * np.append(np.sin(angle) * DIRECTION, -np.cos(angle))
 
 
 @dataclass(kw_only=True, eq=False)
-class InclinedPlane(MeshedProtocol):
-    """Tan(alpha) of the slope at which a patch slides, against mu.
+class SlopeProtocol(MeshedProtocol):
+    """Tan(alpha) of the slope at which cloth slips, against mu.
 
-    A patch that comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its measurement is NaN.
+    What comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its measurement is NaN.
     """
 
-    name, x_name, y_name = "inclined-plane", "mu", "tan(alpha) at slip"
-    points = "friction"
-    grids_max = 1
+    x_name, y_name, points = "mu", "tan(alpha) at slip", "friction"
 
-    friction: Sequence[float] = FRICTION
-    """Of the plane."""
-    cells: int = 10
-    force_share: float = FORCE_SHARE
-    """Force that residuals are measured in, over a node's weight."""
-    tolerance: float = 0.005
+    force_share: ClassVar[float]
+    """Of a node's weight: the force that residuals are measured in."""
+
+    friction: Sequence[float]
+    """mu."""
+
+    @abstractmethod
+    def lay(self, mu: float, at: Mapping[str, Any]) -> OnSlope:
+        """Return cloth at rest on a slope."""
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        mesh = rectangle(SIDE, SIDE, (self.cells, self.cells), SIDE / self.cells, self.kinds[at["mesh"]], 0)
-        moved = drift(mesh, mu, self.solver, force_share=self.force_share)
+        creeping, slipping = self.lay(mu, at), self.lay(mu, at)
+        moved, slope = creeping.drift(), slipping.slip_slope()
         self.tally.note(moved)
-        slope = slip_slope(mesh, mu, self.solver, force_share=self.force_share)
+        self.tally.count(creeping.cloth)
+        self.tally.count(slipping.cloth)
         return slope if moved <= DRIFT_MAX else np.nan, mu
 
     def reported(self) -> dict[str, Setting]:
@@ -69,38 +124,29 @@ class InclinedPlane(MeshedProtocol):
         }
 
 
-def slip_slope(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
-    """Return tan(alpha) of the slope, growing by 1 % of mu a second, at which all of the patch slides, or NaN."""
-    cloth, start = _laid(mesh, preset, force_share)
-    floor, dt = [plane(mu)], preset.time_step
-    for step in range(1, round((UP_TO - FROM) / (RATE * dt)) + 1):
-        slope = mu * (FROM + RATE * step * dt)
-        cloth.gravity[:] = tilted(np.arctan(slope))
-        cloth.step(dt, bodies=floor)
-        if np.abs(cloth.positions - start).max(axis=1).min() > MOVED:
-            return float(slope)
-    return np.nan
+@dataclass(kw_only=True, eq=False)
+class InclinedPlane(SlopeProtocol):
+    """A patch on a plane.
+
+    A resting node may bear a force beyond friction by the preset's tolerance times the force that residuals are
+    measured in, and slides late by as much over mu.
+    """
+
+    name, grids_max, force_share = "inclined-plane", 1, 1.0
+
+    friction: Sequence[float] = FRICTION
+    cells: int = 10
+    tolerance: float = 0.005
+
+    def lay(self, mu: float, at: Mapping[str, Any]) -> OnSlope:
+        mesh = rectangle(SIDE, SIDE, (self.cells, self.cells), SIDE / self.cells, self.kinds[at["mesh"]], 0)
+        return patch(mesh, mu, self.solver)
 
 
-def drift(mesh: meshes.Mesh, mu: float, preset: SolverSettings, *, force_share: float = FORCE_SHARE) -> float:
-    """Return the largest displacement in `HOLD_TIME` at `HOLD_SHARE` of the slip angle [m]."""
-    cloth, start = _laid(mesh, preset, force_share)
-    cloth.gravity[:] = tilted(HOLD_SHARE * np.arctan(mu))
-    floor = [plane(mu)]
-    for _ in range(round(HOLD_TIME / preset.time_step)):
-        cloth.step(preset.time_step, bodies=floor)
-    return float(np.abs(cloth.positions - start).max())
-
-
-def tilted(angle: float) -> Floats:
-    """Return gravity [m/s^2] in axes whose third is normal to a plane of this slope [rad]."""
-    return GRAVITY * np.append(np.sin(angle) * DIRECTION, -np.cos(angle))
-
-
-def _laid(mesh: meshes.Mesh, preset: SolverSettings, force_share: float) -> tuple[Cloth, Floats]:
+def patch(mesh: meshes.Mesh, mu: float, preset: SolverSettings) -> OnSlope:
+    """Return a patch of cloth on a plane of friction mu."""
     laid = fabric(FABRIC)
     weight = laid.density * mesh.spacing**2 * GRAVITY
-    cloth = Cloth(mesh, laid, preset, force_scale=force_share * weight)
+    cloth = Cloth(mesh, laid, preset, force_scale=InclinedPlane.force_share * weight)
     start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
-    cloth.set_state(start)
-    return cloth, start
+    return OnSlope(cloth, start, mu, mu, np.ones(len(start), dtype=bool))
