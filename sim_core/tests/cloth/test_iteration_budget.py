@@ -7,11 +7,11 @@ Results stay right in both cases; only the cost grows. So they do where cloth sl
 
 import numpy as np
 import pytest
+from stickslip_testing.drums import OverCloth
 
 from stickslip_sim_core import Cloth, SelfContact, fabric, plane, preset_named, sphere
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS
-from stickslip_sim_core.protocols.capstan import Strip
 
 pytestmark = pytest.mark.physics
 
@@ -56,7 +56,7 @@ def test_on_a_floor_that_is_shaken() -> None:
 
 def test_over_a_curved_cloth() -> None:
     """Measured: 5.1 a step; where edges of both bear, too: 13.3; with pairs as stiff along normals as across: 11.3."""
-    strip = Strip(0.5, 0.05, preset_named("certified"), 120, of_cloth=True)
+    strip = OverCloth(0.5, 0.05, preset_named("certified"), 120)
     strip.draw()
     assert strip.cloth.unconverged_steps == 0
     assert strip.iterations < 9

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stickslip_testing.drums import OverTriangles
 
 from stickslip_sim_core import SelfContact, cylinder, preset_named, protocols
 from stickslip_sim_core.protocols import capstan, heavy_fold, pull_out
@@ -23,7 +24,7 @@ class TestCapstan:
 
     @pytest.mark.parametrize("facets", [36, 60])
     def test_facets_are_not_felt(self, facets: int) -> None:
-        strip = capstan.Strip(0.3, 0.05, preset_named("certified"), facets)
+        strip = OverTriangles(0.3, 0.05, preset_named("certified"), facets)
         heavy, wrap = strip.draw()
         measured, expected = np.log(heavy.mean() / capstan.LIGHT), np.log(master_curves.capstan(0.3, wrap, 0.05))
         assert measured == pytest.approx(expected, rel=3e-3)

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body, cylinder
-from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
-from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.contact import THICKNESS
+from stickslip_sim_core.cloth.fabrics import Fabric, isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.protocol import ClothProtocol
@@ -19,7 +19,7 @@ from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 BENDING = (1e-4, 0.05)  # B / T1, B = D / (2 R^2)
-RADIUS, WRAP = 0.05, 2.0  # m, rad
+RADIUS, WRAP, WIDTH = 0.05, 2.0, 2  # m, rad, cells
 CELLS_PER_TURN = 72  # 5 degrees each
 FREE = 2.0 * np.pi / 3.0  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
 LIGHT = 2.0  # T1, N/m
@@ -72,62 +72,30 @@ class Strip:
         mu: Friction.
         bending: B / T1.
         preset: Solver settings.
-        facets: Of a cylinder of triangles, all around; None: the cylinder is round.
-        of_cloth: These triangles are another cloth, all of whose vertices are held.
-        width: In cells.
         cells_per_turn: How fine the strip is.
-
-    Raises:
-        ValueError: The cylinder is of cloth, and `facets` is None.
     """
 
-    def __init__(
-        self,
-        mu: float,
-        bending: float,
-        preset: SolverSettings,
-        facets: int | None = None,
-        *,
-        of_cloth: bool = False,
-        width: int = 2,
-        cells_per_turn: int = CELLS_PER_TURN,
-    ) -> None:
+    apart: ClassVar[float] = 0.0
+    """Distance from the cylinder at the start, in thicknesses."""
+
+    def __init__(self, mu: float, bending: float, preset: SolverSettings, cells_per_turn: int = CELLS_PER_TURN) -> None:
         self.preset = preset
-        cell = 2.0 * np.pi * RADIUS / cells_per_turn
-        free = round(FREE * RADIUS / cell)
-        cells = 2 * free + round(WRAP * RADIUS / cell)
-        mesh = meshes.grid(cells * cell, width * cell, cells, width)
-        along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * cell
-        self.held = np.flatnonzero(along > along.max() - 0.1 * cell)
-        light = np.flatnonzero(along < along.min() + 0.1 * cell)
-        parts, self.below = [mesh], np.empty((0, 3))
-        surfaces: list[Surface] = []
+        self.cell = 2.0 * np.pi * RADIUS / cells_per_turn
+        free = round(FREE * RADIUS / self.cell)
+        cells = 2 * free + round(WRAP * RADIUS / self.cell)
+        mesh = meshes.grid(cells * self.cell, WIDTH * self.cell, cells, WIDTH)
+        along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * self.cell
+        self.held = np.flatnonzero(along > along.max() - 0.1 * self.cell)
+        light = np.flatnonzero(along < along.min() + 0.1 * self.cell)
         self.bodies: list[Body] = []
-        if of_cloth:
-            if facets is None:
-                raise ValueError("facets: must be a number where the cylinder is of cloth, got None")
-            sheet, self.below = cover(facets, (width + 2) * cell)
-            parts.append(sheet)
-            apart = 0.1
-        elif facets is None:
-            self.bodies.append(cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]]))
-            apart = 0.0
-        else:
-            surfaces.append(tube(facets, width * cell, mu))
-            apart = 0.01
-        self.cloth = Cloth(
-            meshes.together(*parts),
-            isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT),
-            preset,
-            held=np.append(self.held, len(mesh.rest) + np.arange(len(self.below))),
-            self_contact=SelfContact(mu, bearing="vertices") if of_cloth else None,
-            surfaces=surfaces,
-            force_scale=FORCE_SHARE * LIGHT * cell,
-        )
-        self.breadth = width * cell
+        self.below = np.empty((0, 3))
+        """Held vertices of other cloth, after those of the strip."""
+        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT)
+        self.cloth = self.over(mu, mesh, material, FORCE_SHARE * LIGHT * self.cell)
+        self.breadth = WIDTH * self.cell
         self.cloth.gravity[:] = 0.0
         self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
-        clearance = RADIUS + apart * THICKNESS
+        clearance = RADIUS + self.apart * THICKNESS
         angle = np.clip(along / RADIUS, 0.0, WRAP)
         beyond = along - RADIUS * angle
         self.start = np.column_stack(
@@ -141,6 +109,11 @@ class Strip:
         self.cloth.set_state(np.concatenate([self.start, self.below]))
         self.iterations = 0.0
         """Of Newton's method in a measured step, in the mean."""
+
+    def over(self, mu: float, mesh: meshes.Mesh, material: Fabric, force_scale: float) -> Cloth:
+        """Return the cloth that is drawn over the cylinder: tests draw it over other ones, too."""
+        self.bodies = [cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])]
+        return Cloth(mesh, material, self.preset, held=self.held, force_scale=force_scale)
 
     def draw(self) -> tuple[Floats, float]:
         """Return the heavy pull at each measured step [N/m], and the angle between the far directions [rad]."""
@@ -157,23 +130,3 @@ class Strip:
         mean = heavy.mean(axis=0)
         # Far directions: straight down at the light end, along the pull at the held one.
         return np.linalg.norm(heavy, axis=1), float(np.arctan2(mean[0], mean[2]) % (2.0 * np.pi))
-
-
-def tube(facets: int, breadth: float, mu: float) -> Surface:
-    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches at the radius."""
-    angle = 2.0 * np.pi * np.arange(facets) / facets
-    ring = (RADIUS - THICKNESS) * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
-    i = np.arange(facets)
-    j = (i + 1) % facets
-    triangles = np.concatenate([np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])])
-    return Surface(triangles, np.concatenate([ring + np.array([0.0, s * breadth, 0.0]) for s in (-1.0, 1.0)]), mu)
-
-
-def cover(facets: int, breadth: float) -> tuple[meshes.Mesh, Floats]:
-    """Return a sheet around the arc that the strip lies on and 30 degrees more, and its vertices (V, 3) [m]."""
-    angle = 2.0 * np.pi / facets
-    cells = int(np.ceil((WRAP + np.pi / 6.0) / angle))
-    radius = RADIUS - THICKNESS
-    mesh = meshes.grid(cells * angle * radius, breadth, cells, max(2, round(breadth / (angle * radius))))
-    at = 0.5 * WRAP + mesh.rest[:, 0] / radius
-    return mesh, np.column_stack([-radius * np.cos(at), mesh.rest[:, 1], radius * np.sin(at)])
