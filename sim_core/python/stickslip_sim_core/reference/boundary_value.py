@@ -10,7 +10,7 @@ Newton's method, so that unlike shooting nothing is integrated over many growth 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +107,8 @@ def solve(rate: Rate, conditions: Conditions, mesh: Floats, y: Floats, parameter
         size = max(np.abs(part).max() for part in (stage, step, ends))
         scale = max(np.abs(y).max(), np.abs(slope).max(), 1.0)
         # Stages: (I - h J A) dslope = J dy + F dp + stage. Solved per element for all right-hand sides at once.
-        J, F = _jacobians(rate, x, at_stages(y, slope), p)
+        # J = df/dy is (n, E, n, STAGES), F = df/dp (n, E, q, STAGES).
+        J, F = np.split(np.stack(_derivatives(partial(rate, x), at_stages(y, slope), p), axis=2), [n], axis=2)
         matrix = np.einsum("e,iejs,st->esitj", -h, J, A).reshape(elements, STAGES * n, STAGES * n)
         matrix += np.eye(STAGES * n)
         right = np.concatenate([J, F, stage[:, :, None, :]], axis=2).transpose(1, 3, 0, 2)
@@ -122,9 +123,8 @@ def solve(rate: Rate, conditions: Conditions, mesh: Floats, y: Floats, parameter
             system[rows, there] = -np.eye(n)
             system[rows, total - q :] = moved[e, :, n : n + q]
             rhs[rows] = -step[:, e] - moved[e, :, -1]
-        first, last, parameter = _jacobians_of_conditions(conditions, y[:, 0], y[:, -1], p)
-        system[n * elements :, :n], system[n * elements :, n * elements : n * (elements + 1)] = first, last
-        system[n * elements :, total - q :] = parameter
+        first_last_parameters = np.r_[:n, n * elements : total]
+        system[n * elements :, first_last_parameters] = np.stack(_derivatives(conditions, y[:, 0], y[:, -1], p), axis=1)
         rhs[n * elements :] = -ends
         try:
             update = np.linalg.solve(system, rhs)
@@ -151,28 +151,12 @@ def solve(rate: Rate, conditions: Conditions, mesh: Floats, y: Floats, parameter
     raise NotSolvedError(f"no convergence in {ITERATIONS} iterations")
 
 
-def _jacobians(rate: Rate, x: Floats, y: Floats, p: Floats) -> tuple[Floats, Floats]:
-    """df/dy, shape (n, E, n, STAGES), and df/dp, shape (n, E, q, STAGES)."""
+def _derivatives(f: Callable[..., Numbers], *parts: Floats) -> list[Floats]:
+    """Derivatives of f(*parts) by each row of each part."""
     columns = []
-    for k in range(len(y) + len(p)):
-        z, r = y.astype(complex), p.astype(complex)
-        if k < len(y):
-            z[k] += 1j * COMPLEX_STEP
-        else:
-            r[k - len(y)] += 1j * COMPLEX_STEP
-        columns.append(np.imag(rate(x, z, r)) / COMPLEX_STEP)
-    both = np.stack(columns, axis=2)
-    return both[:, :, : len(y)], both[:, :, len(y) :]
-
-
-def _jacobians_of_conditions(conditions: Conditions, first: Floats, last: Floats, p: Floats) -> tuple[Floats, ...]:
-    """db/dy(x_0), db/dy(x_E) and db/dp, shapes (n + q, n), (n + q, n) and (n + q, q)."""
-    n = len(first)
-    point = np.concatenate([first, last, p])
-    columns = []
-    for k in range(len(point)):
-        z = point.astype(complex)
-        z[k] += 1j * COMPLEX_STEP
-        columns.append(np.imag(conditions(z[:n], z[n : 2 * n], z[2 * n :])) / COMPLEX_STEP)
-    matrix = np.stack(columns, axis=1)
-    return matrix[:, :n], matrix[:, n : 2 * n], matrix[:, 2 * n :]
+    for part, rows in enumerate(parts):
+        for row in range(len(rows)):
+            moved = [np.array(other, dtype=complex) for other in parts]
+            moved[part][row] += 1j * COMPLEX_STEP
+            columns.append(np.imag(f(*moved)) / COMPLEX_STEP)
+    return columns

@@ -92,7 +92,7 @@ def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
         ValueError: An argument breaks its rule.
     """
     values = _within("aspect", aspect, 0.01, 1.0)
-    nu = _checked_poisson(poisson)
+    nu = float(_within("poisson", poisson, 0.0, 0.5))
     return np.array([plate_buckling.buckling_weight(float(v), nu) for v in values.ravel()]).reshape(values.shape)
 
 
@@ -118,10 +118,10 @@ def stick_slip(strain: ArrayLike) -> Floats:
     Raises:
         ValueError: A strain is outside its range.
     """
-    values = _within("strain", strain, 0.0, _triple_point().strain * (1.0 + 1e-9), open_below=True)
+    values = _within("strain", strain, 0.0, stick_slip_triple_point()[0] * (1.0 + 1e-9), open_below=True)
 
     def friction(e: float) -> float:
-        return _pressed(lambda w, p: p[2] - np.sqrt(e), e).friction
+        return _pressed(lambda w, p: p[2] - np.sqrt(e), e)[1]
 
     return np.array([friction(float(e)) for e in values.ravel()]).reshape(values.shape)
 
@@ -136,38 +136,23 @@ def stick_slip_strain(friction: ArrayLike) -> Floats:
     Raises:
         ValueError: A friction is outside its range.
     """
-    top = _triple_point()
-    values = _within("friction", friction, 0.0, top.friction * (1.0 + 1e-9), open_below=True)
+    top_strain, top = stick_slip_triple_point()
+    values = _within("friction", friction, 0.0, top * (1.0 + 1e-9), open_below=True)
 
     def strain(mu: float) -> float:
-        guess = top.strain * (mu / top.friction) ** 2
-        return _pressed(lambda w, p: p[1] * p[2] - mu * p[0], guess).strain
+        return _pressed(lambda w, p: p[1] * p[2] - mu * p[0], top_strain * (mu / top) ** 2)[0]
 
     return np.array([strain(float(mu)) for mu in values.ravel()]).reshape(values.shape)
 
 
+@lru_cache(maxsize=1)
 def stick_slip_triple_point() -> tuple[float, float]:
     """Return (strain, mu) where sticking, slipping and lying on the wall meet: there theta(1) = pi."""
-    top = _triple_point()
-    return top.strain, top.friction
-
-
-@dataclass(frozen=True)
-class _Pressed:
-    """A strip pressed against the wall."""
-
-    strain: float
-    friction: float
-    """Q/P."""
-
-
-@lru_cache(maxsize=1)
-def _triple_point() -> _Pressed:
     return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
 
 
-def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> _Pressed:
-    """Find the strip that fulfils one more condition on w(1) and (P, q, a), from a guess of its strain.
+def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> tuple[float, float]:
+    """Return (strain, Q/P) of the strip that fulfils one more condition on w(1) and (P, q, a), from a guessed strain.
 
     With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may be as small as it
     likes:
@@ -198,7 +183,7 @@ def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> 
     w = found.y[0]
     if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] == w.max()):
         raise NotSolvedError(f"stick_slip: near strain = {guess} the solution found is not the first mode")
-    return _Pressed(float(a**2), float(a * q / P))
+    return float(a**2), float(a * q / P)
 
 
 def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
@@ -230,13 +215,13 @@ def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
         ValueError: An argument breaks its rule.
     """
     values = _positive("phi", phi)
-    curve = _boundary(_checked_poisson(poisson))
+    curve = _boundary(poisson)
     return np.array([curve.gamma_at(float(v)) for v in values.ravel()]).reshape(values.shape)
 
 
 def bend_twist_onset(poisson: float) -> tuple[float, float]:
     """Return (phi, Gamma) of the least natural curvature at which a weight makes the rod three-dimensional."""
-    onset = _boundary(_checked_poisson(poisson)).onset
+    onset = _boundary(poisson).onset
     return onset.phi, onset.Lambda**3
 
 
@@ -382,7 +367,7 @@ def _mesh(Lambda: float) -> Floats:
 
 @lru_cache(maxsize=8)
 def _boundary(poisson: float) -> _Boundary:
-    return _Boundary(poisson)
+    return _Boundary(float(_within("poisson", poisson, 0.0, 0.5)))
 
 
 def capstan(mu: ArrayLike, wrap: float, bending: float = 0.0) -> Floats:
@@ -519,12 +504,6 @@ def heavy_fold(gap: float) -> HeavyFold:
         landing_force=float(found.parameters[1:].sum()),
         tension=-float(found.parameters[0]),
     )
-
-
-def _checked_poisson(poisson: float) -> float:
-    if not 0.0 <= poisson <= 0.5:
-        raise ValueError(f"poisson: must be in [0, 0.5], got {poisson}")
-    return float(poisson)
 
 
 def _positive(name: str, values: ArrayLike) -> Floats:
