@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core import Cloth, Fabric, fabric, isotropic, preset_named
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
-from stickslip_sim_core.protocols.strip import LENGTH, MeshKind, mesh_kinds, strip
+from stickslip_sim_core.protocols.strip import DIAGONALS, LENGTH, MeshKind, strip
 
 Floats = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def test_pure_bending(poisson: float) -> None:
     assert (1.0 - poisson**2) * 0.9 < bending < 1.0 + 1e-9  # triangles at the ends are free to lie flat
 
 
-@pytest.mark.parametrize("kind", mesh_kinds(2, 2))
+@pytest.mark.parametrize("kind", [*DIAGONALS[:2], 0, 1])
 def test_linear_plate(kind: MeshKind) -> None:
     """The tip of a horizontal cantilever, nu = 0, sags by rho g L^4 / 8D: to 0.08 %."""
     clamped = strip(0.02, 50, kind)

@@ -82,7 +82,7 @@ class TestCertification:
         certification = protocols.CERTIFICATION[preset]
         assert certification.protocols
         assert set(certification.protocols) <= set(protocols.PROTOCOLS)
-        assert set(certification.quick) <= set(certification.protocols)
+        assert set(certification.quick) <= set(protocols.PROTOCOLS)
         json.dumps(dict(certification.numbers()), allow_nan=False)
 
     def test_rods_take_no_notice_of_a_preset(self) -> None:

@@ -7,6 +7,19 @@ from typing import Any
 
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings
 
+QUICK: Mapping[str, Mapping[str, Any]] = {
+    "bend-twist": {"phi": (6.0, 10.0), "poisson": (0.5,), "elements": 256},
+    "rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512},
+    "inclined-plane": {"friction": (0.3,)},
+    "lateral-buckling": {"aspect": (0.2,), "poisson": (0.3,)},
+    "stick-slip": {"friction": (0.1, 0.3), "phases": False},
+    "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
+    "capstan": {"friction": (0.3,), "bending": (0.05,)},
+    "heavy-fold": {"friction": (0.3,), "cells": 80},
+    "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
+    "pull-out": {"friction": (0.3,), "loads": (1.0,), "unstructured": 0},
+}
+
 
 @dataclass(frozen=True)
 class Certification:
@@ -21,50 +34,24 @@ class Certification:
     numbers: Callable[[], Mapping[str, Any]] = dict
     """Returns the settings that the preset stands for, constants of the solver included, in JSON's types."""
 
-    quick: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
     """Settings by protocol for a first look; a certificate made with them certifies nothing."""
 
 
-_ROD_QUICK: Mapping[str, Mapping[str, Any]] = {
-    "bend-twist": {"phi": (6.0, 10.0), "poisson": (0.5,), "elements": 256},
-    "rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512},
-}
-
 _CLOTH = ("inclined-plane", "lateral-buckling", "stick-slip", "cantilever")
-_CLOTH_QUICK: Mapping[str, Mapping[str, Any]] = {
-    "inclined-plane": {"friction": (0.3,)},
-    "lateral-buckling": {"aspect": (0.2,), "poisson": (0.3,), "structured": 1, "unstructured": 1},
-    "stick-slip": {"friction": (0.1, 0.3), "structured": 1, "unstructured": 1, "phases": False},
-    "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
-}
-_CONTACT = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
-SCENE_PROTOCOLS = _CLOTH + _CONTACT
+SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-out")
 """What a certificate has to have for a scene with self-contact."""
-
-_CONTACT_QUICK: Mapping[str, Mapping[str, Any]] = {
-    "capstan": {"friction": (0.3,), "bending": (0.05,)},
-    "heavy-fold": {"friction": (0.3,), "cells": 80},
-    "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
-    "pull-out": {"friction": (0.3,), "loads": (1.0,), "unstructured": 0},
-}
 
 
 def _of_cloth(preset: SolverSettings) -> Certification:
     # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
     touches = not preset.name.startswith("thesis-")
-    return Certification(
-        SCENE_PROTOCOLS if touches else _CLOTH,
-        "stickslip_sim_core.cloth",
-        preset.numbers,
-        {**_CLOTH_QUICK, **_CONTACT_QUICK} if touches else _CLOTH_QUICK,
-    )
+    return Certification(SCENE_PROTOCOLS if touches else _CLOTH, "stickslip_sim_core.cloth", preset.numbers)
 
 
 CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
     {
-        "rods": Certification(
-            ("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods", quick=_ROD_QUICK
-        ),
+        "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods"),
         **{name: _of_cloth(preset) for name, preset in PRESETS.items()},
     }
 )

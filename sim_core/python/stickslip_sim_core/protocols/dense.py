@@ -31,21 +31,14 @@ def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
     known = np.isfinite(x) & np.isfinite(y)
     x, order = np.unique(x[known], return_index=True)
     y = y[known][order]
-    if len(x) == 0:
+    if len(x) == 0 or (len(x) == 1 and protocol not in _EXACT):
         return x, y
-    dense = _spread(x)
-    if protocol in _EXACT:
-        return dense, np.asarray(_EXACT[protocol](dense), dtype=np.float64)
-    if len(x) < 2:
-        return x, y
-    is_log = bool(x[0] > 0.0 and np.all(y > 0.0))
-    dense = np.geomspace(x[0], x[-1], POINTS) if is_log else np.linspace(x[0], x[-1], POINTS)
-    if is_log:
-        return dense, np.exp(PchipInterpolator(np.log(x), np.log(y))(np.log(dense)))
-    return dense, np.asarray(PchipInterpolator(x, y)(dense))
-
-
-def _spread(x: Floats) -> Floats:
-    """Return abscissae from the first to the last measured one, or around a single one."""
     first, last = (x[0], x[-1]) if len(x) > 1 else (x[0] / 1.5, x[0] * 1.5)
-    return np.geomspace(first, last, POINTS) if first > 0.0 else np.linspace(first, last, POINTS)
+    if protocol in _EXACT:
+        dense = np.geomspace(first, last, POINTS) if first > 0.0 else np.linspace(first, last, POINTS)
+        return dense, np.asarray(_EXACT[protocol](dense), dtype=np.float64)
+    if first > 0.0 and np.all(y > 0.0):
+        dense = np.geomspace(first, last, POINTS)
+        return dense, np.exp(PchipInterpolator(np.log(x), np.log(y))(np.log(dense)))
+    dense = np.linspace(first, last, POINTS)
+    return dense, np.asarray(PchipInterpolator(x, y)(dense))

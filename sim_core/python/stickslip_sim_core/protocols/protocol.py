@@ -12,7 +12,7 @@ from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.result import Curve, Numbers, ProtocolResult, Refinement, Setting
-from stickslip_sim_core.protocols.strip import LENGTH, MeshKind, cell_of, mesh_kinds, mesh_names
+from stickslip_sim_core.protocols.strip import DIAGONALS, LENGTH, MeshKind, cell_of
 
 
 @dataclass
@@ -135,14 +135,16 @@ class MeshedProtocol(ClothProtocol):
 
     @property
     def kinds(self) -> list[MeshKind]:
-        return mesh_kinds(min(self.structured, self.grids_max), self.unstructured)
+        return [*DIAGONALS[: min(self.structured, self.grids_max)], *range(self.unstructured)]
 
     @property
     def meshes(self) -> range:
         return range(len(self.kinds))
 
     def reported(self) -> dict[str, Setting]:
-        return {**super().reported(), "cells": self.cells, "meshes": mesh_names(self.kinds)}
+        kinds = [f"{'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for kind in self.kinds]
+        meshes = ", ".join(f"{number} {kind}" for number, kind in enumerate(kinds))
+        return {**super().reported(), "cells": self.cells, "meshes": meshes}
 
 
 @dataclass(kw_only=True, eq=False)

@@ -1,6 +1,5 @@
 """Meshes that protocols vary, and strips of cloth that are clamped along one short edge."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,18 +20,6 @@ ALIGNED = 3
 
 MeshKind = Diagonals | int
 """Diagonals of a grid, or the seed of an unstructured mesh."""
-
-
-def mesh_kinds(structured: int, unstructured: int) -> list[MeshKind]:
-    """Return so many kinds of meshes: grids (at most 4) first."""
-    return [*DIAGONALS[:structured], *range(unstructured)]
-
-
-def mesh_names(kinds: Sequence[MeshKind]) -> str:
-    """Return the numbered names of kinds of meshes, for the settings of a result."""
-    return ", ".join(
-        f"{i} {'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for i, kind in enumerate(kinds)
-    )
 
 
 def rectangle(

@@ -1,7 +1,6 @@
 """Hanging rods: from their three numbers to shapes at rest."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
 from operator import itemgetter
 from typing import Any
 
@@ -22,12 +21,11 @@ def simulate(simulations: Sequence[Mapping[str, Any]], _on_frame: OnFrame | None
 
     The numbers of a rod do not depend on the others.
     """
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for i, rod in enumerate(simulations):
+        alike.setdefault(_settings(rod), []).append(i)
     outcomes: dict[int, Outcome] = {}
-    for _, group in groupby(
-        sorted(range(len(simulations)), key=lambda i: _settings(simulations[i])),
-        key=lambda i: _settings(simulations[i]),
-    ):
-        indices = list(group)
+    for indices in alike.values():
         outcomes.update(zip(indices, _solved([simulations[i] for i in indices]), strict=True))
     return [outcomes[i] for i in range(len(simulations))]
 
