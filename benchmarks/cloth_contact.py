@@ -28,7 +28,6 @@ from stickslip_sim_core import (
     Cloth,
     SelfContact,
     fabric,
-    plane,
     preset_named,
     protocols,
     self_intersections,
@@ -41,6 +40,7 @@ from stickslip_sim_core.reference import master_curves
 from stickslip_sim_core.scenes import cloth_drag, cloth_scene
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_testing import tumbles
+from stickslip_testing.drums import OverCloth, OverTriangles
 
 PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
     "capstan": {},
@@ -63,7 +63,7 @@ def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tupl
     cloth = Cloth(mesh, fabric(material), preset_named("certified"), held=held, self_contact=feels)
     cloth.set_state(hung.positions)
     hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
-    motion = hands.driving(cloth_drag.motion_of(hung, len(mesh.rest), [plane(0.5)]))
+    motion = hands.driving(cloth_drag.motion_of(hung, 0.5))
     crossed = looking = 0.0
 
     def watched(at: float) -> tuple[Floats, ArrayLike, Sequence[Body]]:
@@ -158,16 +158,18 @@ def over_facets() -> None:
 
     Then over a held cloth on such a cylinder, which is rough, with strips of cells of 5 to 2.5 degrees.
     """
-    rigid = [(72, facets, False) for facets in (None, 72, 60, 24)]
+    preset = preset_named("certified")
     of_cloth_cases = ((72, 60), (72, 120), (96, 120), (120, 90), (144, 60), (144, 120))
-    cases = [*rigid, *((cells, facets, True) for cells, facets in of_cloth_cases)]
     for mu in capstan.FRICTION:
-        for cells, facets, of_cloth in cases:
-            strip = capstan.Strip(mu, 0.05, preset_named("certified"), facets, of_cloth=of_cloth, cells_per_turn=cells)
+        strips: dict[str, capstan.Strip] = {"round": capstan.Strip(mu, 0.05, preset)}
+        strips |= {f"{facets} facets": OverTriangles(mu, 0.05, preset, facets) for facets in (72, 60, 24)}
+        for cells, facets in of_cloth_cases:
+            strips[f"{cells} cells a turn, {facets} facets of cloth"] = OverCloth(mu, 0.05, preset, facets, cells)
+        for name, strip in strips.items():
             heavy, wrap = strip.draw()
             cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
             print(
-                f"capstan, mu {mu}, {cells} cells a turn, facets {facets}{' of cloth' if of_cloth else ''}: "
+                f"capstan, mu {mu}, {name}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
                 f"ripple {np.ptp(heavy) / heavy.mean():.2%}, "
                 f"{strip.iterations:.1f} iterations a measured step, {cloth.newton / cloth.steps:.1f} a step in all, "

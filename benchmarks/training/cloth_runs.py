@@ -25,7 +25,7 @@ import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 from stickslip_schemas.spec.appearance import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, fabric_names  # noqa: E402
-from stickslip_sim_core.cloth import fabric as fabric_named  # noqa: E402
+from stickslip_sim_core import fabric as fabric_named  # noqa: E402
 from stickslip_sim_core.scenes import cloth_drag  # noqa: E402
 from stickslip_training.cloth.runs import STEP  # noqa: E402
 

@@ -63,11 +63,6 @@ class Fabric:
         object.__setattr__(self, "stretching", k)
         object.__setattr__(self, "rigidity", d)
 
-    @property
-    def bending_length(self) -> float:
-        """Gravito-bending length (D / (rho g))^(1/3) [m] with the mean of both directions, g = 9.81 m/s^2."""
-        return float((0.5 * (self.rigidity[0, 0] + self.rigidity[1, 1]) / (self.density * 9.81)) ** (1.0 / 3.0))
-
     def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> "Fabric":
         """Return a fabric whose numbers are those of this one times factors.
 
@@ -189,15 +184,6 @@ def fabric(name: str) -> Fabric:
     across_weft, between, across_warp = np.mean(facts["bending"], axis=1) / 4.0
     twist = max(between - 0.25 * (across_weft + across_warp), 0.1 * min(across_weft, across_warp))
     return Fabric(name, float(facts["density"]), k, np.diag([across_warp, across_weft, twist]))
-
-
-def fabric_of(fabric_or_name: Fabric | str) -> Fabric:
-    """Return the fabric of this name; a fabric is returned as it is.
-
-    Raises:
-        ValueError: The name is unknown.
-    """
-    return fabric_or_name if isinstance(fabric_or_name, Fabric) else fabric(fabric_or_name)
 
 
 def fabric_names() -> tuple[str, ...]:

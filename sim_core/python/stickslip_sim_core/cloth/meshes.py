@@ -1,6 +1,5 @@
 """Triangulations of rectangles, structured and unstructured."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,13 +26,12 @@ class Mesh:
         u, v = b - a, c - a
         return float(np.sqrt(np.mean(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])))
 
-    def boundary(self, on: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int32]:
-        """Return the edges (E, 2) of the boundary of which `on` is true at both ends; it takes positions (V, 2)."""
+    @property
+    def rim(self) -> NDArray[np.int32]:
+        """(R,): vertices of the boundary, ascending."""
         edges = np.sort(np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
         unique, counts = np.unique(edges, axis=0, return_counts=True)
-        outer = unique[counts == 1]
-        chosen = on(self.rest)
-        return np.ascontiguousarray(outer[chosen[outer].all(axis=1)], dtype=np.int32)
+        return np.unique(unique[counts == 1])
 
 
 def grid(

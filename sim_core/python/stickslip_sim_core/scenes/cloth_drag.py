@@ -10,7 +10,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body, plane
 from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
-from stickslip_sim_core.cloth.fabrics import Fabric, fabric_of
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.scenes.hanging import Hung, hung
@@ -110,22 +110,26 @@ def scene(
     Raises:
         ValueError: An argument breaks its rule.
     """
-    square = checked_square(mesh, frames)
-    cloth = hang(square, fabric_of(material), seed=seed, kernel=kernel)
+    check_range("frames", frames, 1, FRAMES)
+    if not isinstance(mesh, meshes.Mesh):
+        check_range("mesh", mesh, 5, np.inf)
+        mesh = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
+    made = fabric(material) if isinstance(material, str) else material
+    cloth = hang(mesh, made, seed=seed, kernel=kernel)
     return Scene(
-        mesh=square,
-        fabrics=[fabric_of(material)],
+        mesh=mesh,
+        fabrics=[made],
         preset=preset_named(preset),
         start=cloth.positions,
         holders=[Holder(cloth.held, holder_pose)],
-        motion=motion_of(cloth, len(square.rest), [plane(mu)]),
+        motion=motion_of(cloth, mu),
         poses=lambda times: np.broadcast_to(plane(mu).pose, (len(times), 1, 3, 4)),
         self_contact=None if self_friction is None else SelfContact(self_friction),
         frames=frames,
         frame_rate=FRAME_RATE,
-        forces=lambda solver: dragged_forces(solver, cloth, solver.contact_force()),
+        forces=lambda solver: _forces(solver, cloth),
         tracks={"holder_pose": holder_pose},
-        labels=lambda run: drop_labels(run, cloth, fabric_of(material)),
+        labels=lambda run: _labels(run, cloth, made),
         kernel=kernel,
         reason=cloth.reason,
     )
@@ -134,33 +138,13 @@ def scene(
 KIND = cloth_kind(scene)
 
 
-def checked_square(mesh: int | meshes.Mesh, frames: int) -> meshes.Mesh:
-    """Return the mesh of the square of cloth.
-
-    Raises:
-        ValueError: There are too few vertices, or too many frames.
-    """
-    check_range("frames", frames, 1, FRAMES)
-    if isinstance(mesh, meshes.Mesh):
-        return mesh
-    check_range("mesh", mesh, 5, np.inf)
-    return meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
-
-
-def motion_of(hung: Hung, vertices: int, floor: Sequence[Body]) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
-    """Return the motion of the drag scene; gravity is upright one second after the drop.
-
-    Args:
-        hung: The dragged sheet, which comes first.
-        vertices: Number of vertices of all sheets.
-        floor: Bodies below.
-    """
+def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
+    """Return the motion over a floor of friction mu; gravity is upright one second after the drop."""
+    floor = [plane(mu)]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-        gravity = np.tile([0.0, 0.0, -GRAVITY], (vertices, 1))
-        gravity[: len(hung.positions)] += hung.tilt * GRAVITY * (1.0 - upright)
-        return gravity, floor
+        return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), floor
 
     return motion
 
@@ -173,18 +157,14 @@ def holder_pose(time: ArrayLike) -> Floats:
     return pose
 
 
-def dragged_forces(cloth: Cloth, hung: Hung, contact: Floats) -> Record:
-    """Return the forces of bodies and other cloth, and of the holders, on the dragged sheet (3,) [N].
-
-    Before the first step the holders bear its weight.
-    """
-    if cloth.steps:
-        return {"contact_force": contact, "holder_force": cloth.reactions[hung.held].sum(axis=0)}
-    weight = cloth.masses[: len(hung.positions)].sum() * np.array([0.0, 0.0, -GRAVITY])
-    return {"contact_force": np.zeros(3), "holder_force": -weight}
+def _forces(cloth: Cloth, hung: Hung) -> Record:
+    """Return the forces of the floor and of the holders (3,) [N]; before the first step the holders bear the weight."""
+    weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
+    holders = cloth.reactions[hung.held].sum(axis=0) if cloth.steps else -weight
+    return {"contact_force": cloth.contact_force(), "holder_force": holders}
 
 
-def drop_labels(run: ClothRun, hung: Hung, fabric: Fabric) -> dict[str, Any]:
+def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
     """Return the labels of a drop: those of the fabric, the bias, and the side of the holders on which the cloth lay.
 
     `landed_side` is the sign of its mean x less that of the holders in the first frame after the drop; 0 without one.
@@ -194,4 +174,4 @@ def drop_labels(run: ClothRun, hung: Hung, fabric: Fabric) -> dict[str, Any]:
     if frame < len(run.positions):
         x = run.positions[frame, :, 0]
         landed = int(np.sign(x.mean() - x[hung.held].mean()))
-    return {**fabric_labels(fabric), "bias_side": hung.side, "bias": hung.bias, "landed_side": landed}
+    return {**fabric_labels(made), "bias_side": hung.side, "bias": hung.bias, "landed_side": landed}

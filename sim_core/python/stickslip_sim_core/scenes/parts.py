@@ -128,7 +128,7 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
             raise ValueError(f"{place}.vertices: must be below {len(rest)}, got {max(holder['vertices'])}")
         held[list(holder["vertices"])] = True
     elif holder["rim"]:
-        held[np.unique(mesh.boundary(lambda points: np.ones(len(points), dtype=bool)))] = True
+        held[mesh.rim] = True
     elif holder["edge"] is not None:
         axis, at = {"left": (0, low), "right": (0, high), "bottom": (1, low), "top": (1, high)}[holder["edge"]]
         held[:] = np.abs(rest[:, axis] - at[axis]) <= slack
