@@ -27,6 +27,7 @@ RELATIONS = (
     "must not redefine what is built in",
     "must be [low, high]",
     "distortion must be 0",
+    "distortion must move places",
     "camera_matrix must be",
     "rvec and tvec must put",
     "give stretching, or",

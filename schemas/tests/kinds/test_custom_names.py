@@ -109,7 +109,9 @@ def lab(fx: float, cx: float) -> dict[str, Any]:
             "textures must not redefine what is built in, and 'dots' is",
         ),
         ({"textures": {}}, "/axes/texture/1", "Input should be one of checker, .*, terrazzo"),
-        ({"viewpoints": {"lab": LAB | {"distortion": [0.1, 0.0, 0.0, 0.0]}}}, "/viewpoints/lab", "cv2.undistort"),
+        ({"viewpoints": {"lab": LAB | {"distortion": [0.0] * 5 + [0.1]}}}, "/viewpoints/lab", "must be 0 after k1"),
+        ({"viewpoints": {"lab": LAB | {"distortion": [-6.0]}}}, "/viewpoints/lab", "in their order over the whole"),
+        ({"viewpoints": {"lab": LAB | {"distortion": [0.0, 0.0, 9.0]}}}, "/viewpoints/lab", "in their order over"),
         (
             {
                 "viewpoints": {

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, Strict, model_validator
 
 from stickslip_schemas.base.document import WHOLE, Document, Float
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.cameras import NO_LENS, Camera, distorted
 
 CLIP_SIZE = 224
 """Width and height of a clip [px]."""
@@ -27,6 +27,8 @@ FIELD_OF_VIEW = (3.0, 150.0)
 """Of a calibrated image along each side [degree]."""
 
 _TOLERANCE = 1e-9
+_RADII = 64  # at which a lens is checked
+_FOUND = 1e-3  # to which the border of a clip must be found through its lens [px]
 
 Azimuth = Annotated[Float, Field(ge=-180, le=180)]
 Elevation = Annotated[Float, Field(ge=5, le=90)]
@@ -133,17 +135,17 @@ class Calibration(Document):
     distortion: tuple[Float, ...] = Field(
         default=(),
         max_length=14,
-        description="distortion coefficients: all 0, because pictures have no lens distortion",
+        description="distortion coefficients k1, k2, p1, p2, k3 of the lens; further ones must be 0",
     )
     rvec: Row = Field(description="rotation from the world to the camera, as a Rodrigues vector [rad]")
     tvec: Row = Field(description="the world's origin in the camera's axes [m]")
 
     @model_validator(mode="after")
     def _can_be_rendered(self) -> Self:
-        if any(self.distortion):
+        if any(self.distortion[5:]):
             raise ValueError(
-                "distortion must be 0: the renderer has no lens distortion. Undistort your pictures (cv2.undistort), "
-                f"and give the camera matrix of what you get; it is {list(self.distortion)}"
+                "distortion must be 0 after k1, k2, p1, p2, k3: calibrate without rational, prism and tilted models; "
+                f"it is {list(self.distortion)}"
             )
         (fx, skew, cx), (zero, fy, cy), last = self.camera_matrix
         if skew != 0 or zero != 0 or last != (0.0, 0.0, 1.0) or fx <= 0 or fy <= 0:
@@ -159,6 +161,7 @@ class Calibration(Document):
                         f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, for a field of view of "
                         f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; it is {value:g} px"
                     )
+        self._check_lens()
         x, y, z = self.camera("own").position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
@@ -166,6 +169,24 @@ class Calibration(Document):
                 f"more above the floor, and it is at ({x:.3g}, {y:.3g}, {z:.3g}) m"
             )
         return self
+
+    def _check_lens(self) -> None:
+        """Refuse a lens that shows a place twice within the square, or that sees farther than any camera may."""
+        camera = self.camera("own")
+        border = camera.border()
+        farthest = sum(max(abs(place[axis]) for place in border) ** 2 for axis in range(2))
+        k1, k2, _, _, k3 = camera.distortion
+        radii = (k / _RADII * farthest for k in range(_RADII + 1))
+        rising = all(1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3)) > 0.0 for s in radii)  # d(r g) / dr
+        shown = [distorted(x, y, camera.distortion) for x, y in border]
+        pixels = [(camera.fx * u + camera.cx, camera.fy * v + camera.cy) for u, v in shown]
+        sides = [min(abs(p - side) for p in pixel for side in (-0.5, CLIP_SIZE - 0.5)) for pixel in pixels]
+        found = all(side < _FOUND for side in sides)
+        if not (rising and found and farthest <= 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2):
+            raise ValueError(
+                "distortion must move places outwards in their order over the whole square of the clip, for a field of "
+                f"view of up to {FIELD_OF_VIEW[1]:g} degrees; it is {list(self.distortion)}"
+            )
 
     def camera(self, name: str) -> Camera:
         """Return the camera of the clip: of the square in the middle of the image, scaled to `CLIP_SIZE`."""
@@ -185,6 +206,7 @@ class Calibration(Document):
             cy=(cy - top + 0.5) * scale - 0.5,
             rotation=_rotation(self.rvec),
             translation=self.tvec,
+            distortion=(*self.distortion, *NO_LENS)[:5],
         )
 
 

@@ -1,10 +1,11 @@
-"""Calibrated pinhole cameras, as data.
+"""Calibrated cameras, as data.
 
-A point X [scene units] lands on the pixel (u, v):
+A point X [scene units] lands on the pixel (u, v), with the distortion of the lens as in OpenCV [Brown 1971]:
 
-    x = R X + t                      camera axes: x right, y down, z forward (as in OpenCV)
-    u = fx x_x / x_z + cx            x_z is the depth
-    v = fy x_y / x_z + cy
+    (X', Y', Z) = R X + t            camera axes: x right, y down, z forward; Z is the depth
+    x = X' / Z,   y = Y' / Z,   s = x^2 + y^2,   g = 1 + k1 s + k2 s^2 + k3 s^3
+    u = fx (x g + 2 p1 x y + p2 (s + 2 x^2)) + cx
+    v = fy (y g + p1 (s + 2 y^2) + 2 p2 x y) + cy
 
 Integer pixel coordinates are pixel centres: the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5] and v grows
 downwards. A camera is nothing but a name and numbers, so its JSON form is what enters a content key.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
+from math import ceil, floor
 from operator import mul
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,7 +35,34 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]  # rows
 RIGS = Path(__file__).parents[1] / "rigs"
 """Folder of the rigs that this package ships."""
 
+Lens = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+"""k1, k2, p1, p2, k3, in the order of OpenCV."""
+
+NO_LENS: Lens = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_TOLERANCE = 1e-6  # of R R^T - 1: calibration files print six digits or more
+
+_INVERSIONS = 60  # steps to the place that a lens moved: each leaves two thirds of the error, or less
+_BORDER = 16  # places along each side of a picture at which it is found out how far a lens sees
+
+
+def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
+    """Return where a lens shows places of the plane at depth 1; numbers or arrays."""
+    k1, k2, p1, p2, k3 = lens
+    s = x * x + y * y
+    g = 1.0 + s * (k1 + s * (k2 + s * k3))
+    return x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x), y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+
+
+def undistorted(u: Any, v: Any, lens: Lens) -> tuple[Any, Any]:
+    """Return the places that a lens shows at (u, v), by fixed-point steps; numbers or arrays."""
+    x, y = u, v
+    k1, k2, p1, p2, k3 = lens
+    for _ in range(_INVERSIONS):
+        s = x * x + y * y
+        g = 1.0 + s * (k1 + s * (k2 + s * k3))
+        xy = 2.0 * x * y
+        x, y = (u - p1 * xy - p2 * (s + 2.0 * x * x)) / g, (v - p1 * (s + 2.0 * y * y) - p2 * xy) / g
+    return x, y
 
 
 class Camera(Document):
@@ -57,6 +86,8 @@ class Camera(Document):
     """R, rows: the camera's x, y and z axes in world coordinates, shape (3, 3)."""
     translation: Vector3
     """t [scene units]: the world's origin in camera coordinates, shape (3,)."""
+    distortion: Lens = NO_LENS
+    """k1, k2, p1, p2, k3 of the lens."""
 
     @field_validator("rotation")
     @classmethod
@@ -71,6 +102,18 @@ class Camera(Document):
                 f"R R^T is off by {error:.2g}, det R = {det:.6g}"
             )
         return rotation
+
+    @field_validator("distortion", mode="before")
+    @classmethod
+    def _all_five(cls, distortion: Any) -> Any:
+        """Take what OpenCV gives for a lens with fewer numbers: none, or k1, k2, p1, p2."""
+        short = isinstance(distortion, list | tuple) and len(distortion) in (0, 4)
+        return [*distortion, *NO_LENS[len(distortion) :]] if short else distortion
+
+    @property
+    def straight(self) -> Camera:
+        """The same camera without distortion; its frame may not have all that the lens sees."""
+        return self.model_copy(update={"distortion": NO_LENS})
 
     @property
     def position(self) -> Vector3:
@@ -88,9 +131,40 @@ class Camera(Document):
         x = np.asarray(points, dtype=np.float64) @ np.asarray(self.rotation).T + np.asarray(self.translation)
         depth = x[..., 2]
         inverse = 1.0 / np.where(depth > 0.0, depth, np.nan)
-        u = self.fx * x[..., 0] * inverse + self.cx
-        v = self.fy * x[..., 1] * inverse + self.cy
-        return np.stack([u, v], axis=-1), depth
+        u, v = distorted(x[..., 0] * inverse, x[..., 1] * inverse, self.distortion)
+        return np.stack([self.fx * u + self.cx, self.fy * v + self.cy], axis=-1), depth
+
+    def rays(self) -> npt.NDArray[np.float64]:
+        """Return the rays of depth 1 through the middle of all pixels, in the camera's axes, (height, width, 3)."""
+        import numpy as np
+
+        v, u = np.mgrid[: self.height, : self.width]
+        x, y = undistorted((u - self.cx) / self.fx, (v - self.cy) / self.fy, self.distortion)
+        return np.stack([x, y, np.ones(x.shape)], axis=-1)
+
+    def border(self) -> list[tuple[float, float]]:
+        """Return the places of the plane at depth 1 that the lens shows along the border of the picture."""
+        sides = [(k / _BORDER - 0.5, side) for k in range(_BORDER + 1) for side in (-0.5, 0.5)]
+        places = [*sides, *((b, a) for a, b in sides)]
+        middle = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
+        return [
+            undistorted(
+                (middle[0] + a * self.width - self.cx) / self.fx,
+                (middle[1] + b * self.height - self.cy) / self.fy,
+                self.distortion,
+            )
+            for a, b in places
+        ]
+
+    def pinhole(self) -> Camera:
+        """Return the camera without distortion, of the same focal lengths, that sees all that this one does."""
+        if not any(self.distortion):
+            return self
+        x, y = zip(*self.border(), strict=True)
+        left, top = floor(self.fx * min(x) + self.cx), floor(self.fy * min(y) + self.cy)
+        right, bottom = ceil(self.fx * max(x) + self.cx), ceil(self.fy * max(y) + self.cy)
+        size = {"width": right - left + 1, "height": bottom - top + 1, "cx": self.cx - left, "cy": self.cy - top}
+        return self.straight.model_copy(update=size)
 
     @property
     def numbers(self) -> list[float]:

@@ -113,7 +113,7 @@ def predict(
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.model import WEIGHTS, load_friction
-    from stickslip_training.cloth.video import import_video, load_calibration
+    from stickslip_training.cloth.video import import_video, load_camera
 
     with readable_errors():
         friction = load_friction(model or WEIGHTS)
@@ -121,7 +121,7 @@ def predict(
         if camera is not None:
             if split is not None:
                 raise ValueError(f"split must not be given with camera: a video has none, and it is {split!r}")
-            calibration = load_calibration(camera)
+            calibration = load_camera(camera)
             clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate, holders=holders)
             Console(stderr=True).print(f"the video: {found_in}", soft_wrap=True)
             slots = [0]

@@ -42,6 +42,10 @@ class Cameras:
 
     @staticmethod
     def of(cameras: Sequence[Camera]) -> "Cameras":
+        if bent := [camera.name for camera in cameras if any(camera.distortion)]:
+            raise ValueError(
+                f"clips must be without lens distortion, and those of {', '.join(sorted(set(bent)))} have it"
+            )
         return Cameras(
             torch.tensor([camera.rotation for camera in cameras], dtype=torch.float32),
             torch.tensor([camera.translation for camera in cameras], dtype=torch.float32),

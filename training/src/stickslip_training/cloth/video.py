@@ -22,7 +22,7 @@ import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.cameras import Camera, undistorted
 
 from stickslip_training.arrays import Array, Floats
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, Clips, frames_at
@@ -56,15 +56,6 @@ CUT_MAX = 1.0
 
 class VideoError(ValueError):
     """The video cannot be measured; the message has the measured number and its limit."""
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A camera as OpenCV calibrates it: pinhole, and how its lens distorts."""
-
-    camera: Camera
-    distortion: tuple[float, ...]
-    """(k1, k2, p1, p2, k3), or fewer, or none [Brown 1966]."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +98,8 @@ class Registration:
         return reasons
 
 
-def load_calibration(path: str | Path) -> Calibration:
-    """Read a camera: the keys of a camera of our rigs, and `distortion`; `rotation` may be OpenCV's vector.
+def load_camera(path: str | Path) -> Camera:
+    """Read a camera: the keys of a camera of our rigs; `rotation` may be OpenCV's vector.
 
     Raises ValueError, naming the field, the rule and the value.
     """
@@ -116,27 +107,19 @@ def load_calibration(path: str | Path) -> Calibration:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be TOML: {error}") from error
-    distortion = content.pop("distortion", [])
-    if (
-        not isinstance(distortion, list)
-        or len(distortion) not in (0, 4, 5)
-        or not all(isinstance(k, int | float) and math.isfinite(k) for k in distortion)
-    ):
-        raise ValueError(f"distortion must be 4 or 5 finite numbers (k1, k2, p1, p2, k3) or none, and is {distortion}")
     rotation = content.get("rotation")
     if isinstance(rotation, list) and len(rotation) == 3 and all(isinstance(r, int | float) for r in rotation):
         content["rotation"] = Rotation.from_rotvec(rotation).as_matrix().tolist()
     try:
-        camera = Camera.model_validate({"name": "custom", **content})
+        return Camera.model_validate({"name": "custom", **content})
     except ValidationError as error:
         problems = [f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors()]
         raise ValueError(f"{path} must describe a camera: {'; '.join(problems)}") from error
-    return Calibration(camera, tuple(map(float, distortion)))
 
 
 def import_video(
     path: str | Path,
-    calibration: Calibration,
+    camera: Camera,
     *,
     start: float | None = None,
     frame_rate: float | None = None,
@@ -146,32 +129,32 @@ def import_video(
 
     Args:
         path: The video; it may begin up to `CUT_MAX` after the holders start.
-        calibration: The camera.
+        camera: The camera that took it.
         start: Time in the video at which the holders start [s]; by default it is found.
         frame_rate: Frames a second; by default the video has the time of every frame.
         holders: Column and row of the middle of each held patch in the first frame, smaller y first [px]; by default
-            those of the calibration.
+            where the camera sees them.
 
     Raises:
         VideoError: The video cannot be measured.
     """
     if frame_rate is not None and not 0 < frame_rate < math.inf:
         raise VideoError(f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}")
-    times, tracks = _follow(path, calibration, holders, frame_rate)
+    times, tracks = _follow(path, camera, holders, frame_rate)
     last = INSTANTS[-1] / RATE - CUT_MAX
     if times[-1] - times[0] < last:
         raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.1f} s")
     if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
         raise VideoError(f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}")
-    registration, wanders = _register(times, tracks, calibration.camera, start)
+    registration, wanders = _register(times, tracks, camera.straight, start)
     if reasons := registration.refusals():
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
-    crops = _cut(path, calibration, chosen, instants, np.asarray(registration.offset) + wanders[chosen])[None]
+    crops = _cut(path, camera, chosen, instants, np.asarray(registration.offset) + wanders[chosen])[None]
     unknown = np.array([-1])
     clip = Clips(
         crops=crops,
-        direction=torch.tensor(calibration.camera.rotation[2])[None],
+        direction=torch.tensor(camera.rotation[2])[None],
         material=unknown,
         mu=np.array([math.nan]),
         landed=unknown,
@@ -214,7 +197,7 @@ def holder_points(instants: Array) -> Floats:
 
 def _follow(
     path: str | Path,
-    calibration: Calibration,
+    camera: Camera,
     holders: tuple[float, float, float, float] | None,
     frame_rate: float | None,
 ) -> tuple[Floats, Floats]:
@@ -223,15 +206,8 @@ def _follow(
         import cv2
     except ModuleNotFoundError as error:
         raise VideoError("following the holders needs OpenCV: pip install 'stickslip-training[video]'") from error
-    camera = calibration.camera
-    matrix = _intrinsics(camera)
-    distortion = np.array(calibration.distortion or (0.0,) * 4)
-    first, depth = camera.project(holder_points(np.zeros(1))[0])
-    if holders is None:
-        homogeneous = (first - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        rays = np.concatenate([homogeneous, np.ones((2, 1))], axis=1)
-        seen = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(2, 2)
-    else:
+    seen, depth = camera.project(holder_points(np.zeros(1))[0])
+    if holders is not None:
         seen = np.array(holders).reshape(2, 2)
     window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
@@ -273,13 +249,10 @@ def _follow(
         before = picture
     if len(times) < 2:
         raise VideoError(f"{path} must have frames, and has {len(times)}")
-    raw = np.array(places, dtype=np.float64)
-    flat = cv2.undistortPoints(raw.reshape(-1, 1, 2), matrix, distortion, P=matrix)
-    return np.array(times), np.asarray(flat, dtype=np.float64).reshape(raw.shape)
-
-
-def _intrinsics(camera: Camera) -> Floats:
-    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    focal, center = np.array((camera.fx, camera.fy)), np.array((camera.cx, camera.cy))
+    u, v = np.moveaxis((np.array(places, dtype=np.float64) - center) / focal, -1, 0)
+    flat = np.stack(undistorted(u, v, camera.distortion), axis=-1)
+    return np.array(times), focal * flat + center
 
 
 def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None) -> tuple[Registration, Floats]:
@@ -336,7 +309,7 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
 
 def _cut(
     path: str | Path,
-    calibration: Calibration,
+    camera: Camera,
     chosen: list[int],
     instants: tuple[float, ...],
     off: Floats,
@@ -344,13 +317,13 @@ def _cut(
     """Return the crops of some frames, whose holders are `off` (F, 2) [px]."""
     import cv2
 
-    camera = calibration.camera
+    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     pictures = {}
     for number, (_, picture) in enumerate(_frames(path)):
         if number in chosen:
-            flat = cv2.undistort(picture, _intrinsics(camera), np.array(calibration.distortion or (0.0,) * 4))
+            flat = cv2.undistort(picture, matrix, np.array(camera.distortion))
             pictures[number] = torch.from_numpy(flat.astype(np.float32) / 255)
-    crops = holder_crops(Cameras.of([camera]), instants)
+    crops = holder_crops(Cameras.of([camera.straight]), instants)
     place = Crops(crops.origin + torch.from_numpy(off.astype(np.float32))[None], crops.scale)
     parts = [
         cut(pictures[number][None, None], Crops(place.origin[:, frame : frame + 1], place.scale[:, frame : frame + 1]))

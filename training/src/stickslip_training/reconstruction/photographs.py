@@ -114,9 +114,15 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
     if rig is None:
         if len(rigs) != 1:
             raise ReconstructionError(f"rig must be given where a calibration has several; {path} has {names}")
-        return next(iter(rigs.values()))
+        rig = next(iter(rigs))
     if rig not in rigs:
         raise ReconstructionError(f"rig must be one of {names} in {path}; got {rig!r}")
+    for camera in rigs[rig]:
+        if any(camera.distortion):
+            raise ReconstructionError(
+                f"distortion must be 0: undistort the photographs (cv2.undistort); that of {camera.name} in {path} is "
+                f"{list(camera.distortion)}"
+            )
     return rigs[rig]
 
 

@@ -18,7 +18,7 @@ from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_di
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
-from stickslip_schemas.spec.cameras import load_rig, rig_digest
+from stickslip_schemas.spec.cameras import distorted, load_rig, rig_digest
 from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.store import DirectoryStore
 
@@ -157,6 +157,24 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     seen = _frame(store, _output(actor, _task(record, viewpoint="lab", camera=own.model_dump(mode="json"))))
     expected = _frame(store, _output(actor, _task(record, viewpoint="left")))
     assert (np.abs(seen.astype(int) - expected) > 2).mean() < 0.002
+
+
+def test_a_lens_shows_what_the_straight_camera_sees_elsewhere(
+    actor: RenderActor, store: DirectoryStore, record: str
+) -> None:
+    ours = load_rig("drag")[1]
+    bent = ours.model_copy(update={"distortion": (-2.0, 1.0, 0.01, -0.02, 0.0)})  # of a lens that sees 25 degrees
+    straight, seen = (
+        _frame(store, _output(actor, _task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))))
+        for camera in (ours, bent)
+    )
+    rows, columns = np.mgrid[:224, :224]
+    x, y = distorted((columns - ours.cx) / ours.fx, (rows - ours.cy) / ours.fy, bent.distortion)
+    place = np.rint(np.stack([ours.fy * y + ours.cy, ours.fx * x + ours.cx])).astype(int)
+    assert np.abs(place - (rows, columns)).max() >= 8, "pixels by which the lens moves a corner"
+    shown = seen[place[0].clip(0, 223), place[1].clip(0, 223)]
+    far, off = (np.abs(frame.astype(int) - straight).mean() for frame in (seen, shown))
+    assert off < 0.4 * far, "levels"
 
 
 def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: DirectoryStore, record: str) -> None:

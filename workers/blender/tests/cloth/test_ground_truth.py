@@ -4,11 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from stickslip_blender.cloth import ground_truth as module
 from stickslip_blender.cloth.geometry import BACKGROUND, CLOTH, FLOOR, GROUND, PROP, Geometry, Holders
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_schemas.kinds.cloth.spec import SEGMENTS, GroundTruth
-from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.cameras import Lens, load_rig
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:
@@ -17,16 +18,17 @@ def test_the_contract_and_the_renderer_name_the_same_things() -> None:
     assert set(module.GroundTruth.__annotations__) == set(GroundTruth)
 
 
-def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.28, 0.09, 0.0012, -0.0008, 0.0), (0.3, 0.0, 0.0, 0.0, 0.0)])
+def test_ground_truth_is_what_projection_says(make_sheet: Callable[..., Any], lens: Lens) -> None:
     sheet = make_sheet(17)
     geometry = Geometry(sheet.triangles, sheet.rest, Holders(sheet.rest))
-    camera = load_rig("drag")[0]
+    camera = load_rig("drag")[0].model_copy(update={"distortion": lens})
     now, then = (geometry.points(sheet.track[k], k) for k in (1, 2))
     truth = ground_truth(geometry, now, then, camera)
 
     assert set(np.unique(truth.segmentation)) == {GROUND, CLOTH, PROP}
     v, u = np.mgrid[:224, :224]
-    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    ray = camera.rays()
     place = (truth.depth[..., None] * ray - camera.translation) @ np.asarray(camera.rotation)
     floor = truth.segmentation == GROUND
     np.testing.assert_allclose(place[floor][:, 2], FLOOR, atol=1e-6)

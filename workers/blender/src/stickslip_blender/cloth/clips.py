@@ -24,6 +24,7 @@ from stickslip_schemas.spec.fabrics import Texture
 from stickslip_blender.build import build_digest
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
+from stickslip_blender.cloth.lens import bent
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
 from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene, Shot
@@ -68,13 +69,14 @@ class ClothRenderer:
         self.geometry.surface.dress(hem=1e-3 * fabric.hem, creases=look.creases, seed=look.crease_seed)
         light = drawn_light(look.lighting, look.light_seed, look.lamp)
         substrate = drawn_substrate(look.substrate, look.light_seed, look.finish)
-        self.scene.set_up(camera, light, substrate, fabric)
+        pinhole = camera.pinhole()
+        self.scene.set_up(pinhole, light, substrate, fabric)
         shots = [self.scene.shot(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
         height = self.geometry.surroundings.floor
         floor = (
-            np.ones((camera.height, camera.width, 3), dtype=np.float32)
+            np.ones((pinhole.height, pinhole.width, 3), dtype=np.float32)
             if height is None
-            else floor_factor(substrate, camera, height)
+            else floor_factor(substrate, pinhole, height)
         )
         chosen = CLOTH_SAMPLING[look.quality] if sampling is None else sampling
         labels = {
@@ -85,7 +87,7 @@ class ClothRenderer:
             "substrate": look.substrate,
             "creases": look.creases,
         }
-        return ClipRenderer(self.scene, camera, shots, floor, fabric, chosen, look.light_seed, labels)
+        return ClipRenderer(self.scene, camera, pinhole, shots, floor, fabric, chosen, look.light_seed, labels)
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,8 @@ class ClipRenderer:
 
     scene: ClothScene
     camera: Camera
+    pinhole: Camera
+    """Renders what the camera's lens then bends."""
     shots: Sequence[Shot]
     floor: npt.NDArray[np.float32]
     fabric: Look
@@ -108,10 +112,11 @@ class ClipRenderer:
     def clips(self, shading: Light, textures: Sequence[Clip]) -> tuple[Clip, dict[str, Any]]:
         """Return the clips of textures, and labels that they share.
 
-        Textures: pictures as `texture_image` returns them; clips: shape (textures, frames, height, width, 3).
+        Textures: pictures as `texture_image` returns them; clips: of the pinhole camera, shape (textures, frames,
+        height, width, 3).
         """
         packed = Textures(list(map(self._grained, textures)))
-        camera = self.camera
+        camera = self.pinhole
         videos = np.empty((packed.count, len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
         sights = [
             self.scene.composer.compose(
@@ -132,13 +137,13 @@ class ClipRenderer:
         for frame in instants(len(self.shots), share, self.sampling.usual, (self.seed, *draw)):
             shot = self.shots[frame]
             window = self.scene.window(shot)
-            light = np.zeros((2, self.camera.height, self.camera.width, 3), dtype=np.float32)
+            light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
             for half in range(2):
                 sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1, skipped=HALF_SAMPLES)
                 light[half][window.slices] = self.scene.direct(shot, picture, sampling, window)
-            factor = self.scene.composer.floor_factor(shot.points, self.camera, self.floor)
+            factor = self.scene.composer.floor_factor(shot.points, self.pinhole, self.floor)
             light *= factor[..., 1:2]
-            yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.camera))
+            yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.pinhole))
 
     def _grained(self, texture: Clip) -> Clip:
         return grained(texture, self.fabric, self.scene.geometry.surface)
@@ -194,7 +199,7 @@ def render_clips(
         lambda: ClothRenderer(triangles, rest, make),
     )
     camera = look.camera or (frame(renderer.geometry) if frame else rig_camera(look))
-    if unfit := why_unfit("cloth", track, 0.0, (camera,)):
+    if unfit := why_unfit("cloth", track, 0.0, (camera.pinhole(),)) or why_unfit("cloth", track, 0.0, (camera,)):
         return unfit
     clip = renderer.clip(look, camera, track[list(look.instants)])
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}
@@ -231,6 +236,7 @@ def _results(
             if shortfall := measured.shortfall(clip.sampling.floors):
                 poor[name] = shortfall
                 continue
+            video = bent(video, clip.camera)
             preview = workshop.store.publish(moving(video, side=_PREVIEW_SIDE)) if task.preview else None
             chunks = {"video": workshop.clip(video), **known}
             output = RenderOutput(chunks=chunks, preview=preview, labels=shared | measured.labels | labels)
@@ -270,7 +276,7 @@ def _shading(clip: ClipRenderer, sampling: ClothSampling, look: AnyLook, task: R
             workshop.keep_shading(key, encode_chunk(kept[key]))
         else:
             kept[key] = np.empty(
-                (len(clip.shots), FINE * clip.camera.height, FINE * clip.camera.width, 3), dtype=np.float16
+                (len(clip.shots), FINE * clip.pinhole.height, FINE * clip.pinhole.width, 3), dtype=np.float16
             )
             decode_chunk(stored, kept[key])
         while len(kept) > _KEPT_SHADINGS:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import BACKGROUND, Geometry
+from stickslip_blender.cloth.lens import pinhole_places
 from stickslip_blender.raster import Window, _raster, projected, see
 
 Floats = npt.NDArray[np.float32]
@@ -39,15 +40,19 @@ def ground_truth(
     geometry: Geometry, points: npt.NDArray[np.float64], following: npt.NDArray[np.float64], camera: Camera
 ) -> GroundTruth:
     """Return the ground truth of an instant: all vertices (V, 3) [m] then, and at the next frame."""
-    here = projected(camera, points)
-    seen = see(here, geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
+    pinhole = camera.pinhole()
+    here = projected(pinhole, points)
+    seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
+    if pinhole is not camera:
+        seen = seen.looked_up(pinhole_places(camera))
     values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
     skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
     smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
     thing = seen.triangle >= 0
     cloth = thing & geometry.has_uv[seen.triangle]
 
-    rays, floor = _floor_depth(camera, geometry.surroundings.floor)
+    rays = camera.rays()
+    floor = _floor_depth(camera, rays, geometry.surroundings.floor)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     moved, _ = camera.project(values[..., 3:6])
     segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
@@ -66,11 +71,9 @@ def ground_truth(
     )
 
 
-def _floor_depth(camera: Camera, height: float | None) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the rays (height, width, 3), of depth 1, in camera axes, and the depth at which they meet the floor."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+def _floor_depth(camera: Camera, rays: npt.NDArray[np.float64], height: float | None) -> npt.NDArray[np.float64]:
+    """Return the depth at which rays (height, width, 3) meet the floor."""
     down = (rays @ np.asarray(camera.rotation))[..., 2]
     with np.errstate(divide="ignore"):
         depth = ((np.inf if height is None else height) - camera.position[2]) / down
-    return rays, np.where((down < 0.0) & (height is not None), depth, np.inf)
+    return np.where((down < 0.0) & (height is not None), depth, np.inf)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -66,6 +66,8 @@ class Seen:
     """Samples across a pixel."""
     triangle: Indices
     """By sample, -1 if there is none; shape (grid height, grid width)."""
+    places: Points | None = None
+    """Columns and rows of the samples [px], (height, width, 2); none: the middles of the pixels of the window."""
 
     def share_below(self, end: int) -> npt.NDArray[np.float32]:
         """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
@@ -76,8 +78,13 @@ class Seen:
         )
         return share
 
+    def looked_up(self, places: Points) -> Seen:
+        """Return what places (height, width, 2) [px] of the frame see, by the nearest sample, with a grid of 1."""
+        near = np.rint(places).astype(int) - (self.window.left, self.window.top)
+        return replace(self, triangle=self.triangle[near[..., 1], near[..., 0]], places=places)
+
     def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
-        """Interpolate values of vertices (V, k) in perspective at the pixel centres, `fill` where nothing is seen.
+        """Interpolate values of vertices (V, k) in perspective at the samples, `fill` where nothing is seen.
 
         For a grid of one sample a pixel. Returns shape (height, width, k).
         """
@@ -87,7 +94,8 @@ class Seen:
         result = np.full((*self.triangle.shape, given.shape[1]), fill)
         rows, columns = np.nonzero(self.triangle >= 0)
         corners = self.triangles[self.triangle[rows, columns]]
-        place = np.column_stack([columns + self.window.left, rows + self.window.top])
+        middles = np.column_stack([columns + self.window.left, rows + self.window.top])
+        place = middles if self.places is None else self.places[rows, columns]
         weights = barycentric(self.points[corners][..., :2], place) / self.points[corners][..., 2]
         weights /= weights.sum(axis=1, keepdims=True)
         result[rows, columns] = np.einsum("nk,nkx->nx", weights, given[corners])
