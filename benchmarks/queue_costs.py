@@ -26,8 +26,8 @@ from typing import Any
 
 import httpx
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
-from stickslip_services.access.keys import create_key
 from stickslip_services.access.asker import Scope
+from stickslip_services.access.keys import create_key
 from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.api.connections import allow_many_files
 from stickslip_services.api.sse import MOST_STREAMS
