@@ -18,7 +18,6 @@ from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import (
     CorruptArtifactError,
     DirectoryStore,
-    Span,
     Store,
     artifact_name,
     open_store,
@@ -128,14 +127,13 @@ def test_what_is_published_is_read(place: Place, data: bytes) -> None:
     assert not other.exists(digest, size=len(data) + 1)
 
 
-def test_parts_are_read_in_the_order_of_their_spans(store: Store) -> None:
+def test_parts_are_read(store: Store) -> None:
     digest = store.publish(b"0123456789")
     assert store.read(digest, offset=2, length=3) == b"234"
     assert store.read(digest, offset=7) == b"789"
     assert store.read(digest, length=2) == b"01"
-    spans = [Span(8, 2), Span(0, 1), Span(4, 0), Span(0, 10)]
-    assert store.read_many(digest, spans) == [b"89", b"0", b"", b"0123456789"]
-    assert store.read_many(digest, []) == []
+    assert store.read(digest, offset=4, length=0) == b""
+    assert store.read(digest, offset=0, length=10) == b"0123456789"
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, len(LARGE)), (100_000, 4_999_999), (5, 5)])
@@ -146,15 +144,13 @@ def test_a_stream_has_the_bytes_between_its_ends(store: Store, start: int, stop:
     assert all(0 < len(block) <= 1 << 22 for block in blocks)
 
 
-@pytest.mark.parametrize("span", [Span(1, 10), Span(10, 1), Span(1000, 1)])
-def test_what_lies_behind_the_end_is_an_error(store: Store, span: Span) -> None:
+@pytest.mark.parametrize(("offset", "length"), [(1, 10), (10, 1), (1000, 1)])
+def test_what_lies_behind_the_end_is_an_error(store: Store, offset: int, length: int) -> None:
     digest = store.publish(b"0123456789")
     with pytest.raises(CorruptArtifactError, match="ends before"):
-        store.read(digest, offset=span.offset, length=span.length)
+        store.read(digest, offset=offset, length=length)
     with pytest.raises(CorruptArtifactError, match="ends before"):
-        store.read_many(digest, [Span(0, 1), span])
-    with pytest.raises(CorruptArtifactError, match="ends before"):
-        list(store.stream(digest, span.offset, span.offset + span.length))
+        list(store.stream(digest, offset, offset + length))
 
 
 def test_what_is_not_there_is_said_so(store: Store) -> None:
@@ -164,7 +160,6 @@ def test_what_is_not_there_is_said_so(store: Store) -> None:
         store.read,
         store.size,
         lambda digest: store.read(digest, offset=1, length=1),
-        lambda digest: store.read_many(digest, [Span(0, 1), Span(2, 1)]),
         lambda digest: list(store.stream(digest, 0, 1)),
         lambda digest: store.show(digest, "ds-1", 1, "views/c/0"),
     ):

@@ -7,7 +7,7 @@ that a Zarr reader asks for: `datasets/ID/vN/PATH`.
 
 import errno
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,13 +36,6 @@ class CorruptArtifactError(OSError):
 def is_unavailable(error: OSError) -> bool:
     """Return whether an error says that a store takes no files: full, read-only, not ours, gone, or out of reach."""
     return error.errno in _UNAVAILABLE
-
-
-class Span(NamedTuple):
-    """A part of an artifact [bytes]."""
-
-    offset: int
-    length: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +96,6 @@ class Store(Protocol):
 
         A whole artifact is also checked against its digest.
         """
-
-    def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
-        """Return several parts of an artifact, in the order of `spans`; raise CorruptArtifactError as `read` does."""
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes from `start` to `stop` in blocks; raise CorruptArtifactError where it ends before."""

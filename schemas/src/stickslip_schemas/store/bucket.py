@@ -16,7 +16,7 @@ import random
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import timedelta
 from functools import partial
@@ -34,7 +34,6 @@ from stickslip_schemas.store.base import (
     VERSION,
     CorruptArtifactError,
     ShownVersion,
-    Span,
     Stored,
     artifact_name,
     shown_name,
@@ -135,19 +134,14 @@ class BucketStore:
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
         if offset != 0 or length is not None:
-            return self.read_many(digest, [Span(offset, self.size(digest) - offset if length is None else length)])[0]
+            return self._read_part(digest, offset, self.size(digest) - offset if length is None else length)
         data = self._get(artifact_name(digest))
         if sha256(data) != digest:
             raise CorruptArtifactError(f"artifact {digest} has other bytes than its name says")
         return data
 
-    def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
-        """Each part is a request: obstore's `get_ranges` panics where an object ends too early."""
-        return [self._read_span(digest, span) for span in spans]
-
-    def _read_span(self, digest: str, span: Span) -> bytes:
-        name, (start, length) = artifact_name(digest), span
-        part = b""
+    def _read_part(self, digest: str, start: int, length: int) -> bytes:
+        name, part = artifact_name(digest), b""
         with suppress(_RefusedError):  # it starts behind the end
             if length > 0:
                 part = self._tried(
@@ -164,7 +158,7 @@ class BucketStore:
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Each block is a request, so that a connection that breaks costs one block."""
         while start < stop:
-            (block,) = self.read_many(digest, [Span(start, min(BLOCK, stop - start))])
+            block = self._read_part(digest, start, min(BLOCK, stop - start))
             start += len(block)
             yield block
 
@@ -236,16 +230,12 @@ class BucketStore:
         """Return None: a bucket has no limit."""
 
     def probe(self) -> None:
-        if self._patience > PROBE_PATIENCE:
-            quick = BucketStore(self._bucket, self._prefix, patience=PROBE_PATIENCE)
-            quick._deletes_many = self._deletes_many
-            quick.probe()
-            self._deletes_many = quick._deletes_many
-            return
+        quick = BucketStore(self._bucket, self._prefix, patience=min(self._patience, PROBE_PATIENCE))
+        quick._deletes_many = self._deletes_many
         name = f".probe-{random.randbytes(8).hex()}"
-        self._put(name, b"probe", mode="overwrite")
-        self._delete([name])
-        return
+        quick._put(name, b"probe", mode="overwrite")
+        quick._delete([name])
+        self._deletes_many = quick._deletes_many
 
     def _head(self, name: str) -> Any:
         return self._tried(lambda: obstore.head(self._objects, name))

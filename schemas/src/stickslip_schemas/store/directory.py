@@ -8,7 +8,7 @@ import hashlib
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from stickslip_schemas.store.base import (
     CorruptArtifactError,
     Room,
     ShownVersion,
-    Span,
     Stored,
     artifact_name,
     shown_name,
@@ -67,21 +66,14 @@ class DirectoryStore:
         return digest
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
-        if offset != 0 or length is not None:
-            return self.read_many(digest, [Span(offset, self.size(digest) - offset if length is None else length)])[0]
-        data = self.path(digest).read_bytes()
-        if sha256(data) != digest:
+        with self.path(digest).open("rb") as file:
+            file.seek(offset)
+            data = file.read(-1 if length is None else length)
+        if length not in (None, len(data)):
+            raise CorruptArtifactError(f"artifact {digest} ends before {offset} + {length}")
+        if offset == 0 and length is None and sha256(data) != digest:
             raise CorruptArtifactError(f"artifact {digest} has other bytes than its name says")
         return data
-
-    def read_many(self, digest: str, spans: Sequence[Span]) -> list[bytes]:
-        parts = []
-        with self.path(digest).open("rb") as file:
-            for offset, length in spans:
-                parts.append(os.pread(file.fileno(), length, offset))
-                if len(parts[-1]) != length:
-                    raise CorruptArtifactError(f"artifact {digest} ends before {offset} + {length}")
-        return parts
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
         with self.path(digest).open("rb") as file:
