@@ -1,18 +1,4 @@
-"""Errors of the client.
-
-ClientError
-├── ProblemError        the coordinator answered with a problem document
-├── UnreachableError    the coordinator did not answer
-├── UnexpectedError     the answer is not one of a coordinator of this version
-├── UnsafePathError     a manifest names a file outside its dataset
-├── ForeignFilesError   the target directory holds files of something else
-├── DamagedError        received bytes differ from the manifest
-├── UnsignedError       the dataset has no signature
-├── ChangedError        the signature is not that of the dataset
-├── UnknownSignerError  no allowed signer made the signature
-├── SelectionError      the dataset has no such array or label
-└── MissingExtraError   packages of an extra are not installed
-"""
+"""Errors of the client: a `ClientError` of a class of its own for each case that callers tell apart."""
 
 import httpx
 from pydantic import ValidationError

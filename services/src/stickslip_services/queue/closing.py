@@ -21,6 +21,7 @@ from stickslip_services.queue.ledger import (
     JOB_COUNTS,
     JOB_GROUPS,
     OVER,
+    READY,
     RUNNABLE,
     TASK_COUNTS,
     Ending,
@@ -36,15 +37,12 @@ from stickslip_services.queue.ledger import (
 _OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")
 _OPEN_JOBS = Prepared(
     "SELECT seq, state, (SELECT SUM(count) FROM job_counts WHERE job = jobs.seq AND state = 'failed') FROM jobs "
-    "WHERE jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"
+    f"WHERE {_OPEN.text}"
 )
 _NOT_STARTED = Prepared(
     f"SELECT seq, state FROM jobs WHERE {_OPEN.text} AND (jobs.state = 'queued' "
     "OR (jobs.state = 'planning' AND jobs.started_at IS NULL))"
 )
-_READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # likewise
-
-
 _PLANNED = frozenset(RUNNABLE) - {JobState.planning}
 _ADD_TO_JOB_STAGES = Prepared(
     "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + :b_count, "
@@ -106,7 +104,7 @@ def _blocked_jobs(connection: Connection, quarantined: list[int]) -> list[int]:
         .group_by(counts.job)
         .having(func.sum(counts.count).filter(counts.state.in_(busy)) == 0)
     ).all()
-    ready = select(tasks.c.seq).join(job_tasks, job_tasks.c.task == tasks.c.seq).where(_READY)
+    ready = select(tasks.c.seq).join(job_tasks, job_tasks.c.task == tasks.c.seq).where(READY)
     return [job for job in idle if connection.scalar(ready.where(job_tasks.c.job == job).limit(1)) is None]
 
 

@@ -11,22 +11,19 @@ import heapq
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, func, select, text, update
+from sqlalchemy import Connection, bindparam, func, select, update
 from stickslip_schemas.base.states import Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
 from stickslip_services.queue.compose import StoredTask, reserve_version
 from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
-from stickslip_services.queue.ledger import LIVE, RUNNABLE, Ledger
+from stickslip_services.queue.ledger import LIVE, READY, RUNNABLE, Ledger
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
 
-_READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")  # in the words of the partial index
-
-
 _OF_GROUP = (
-    _READY,
+    READY,
     tasks.c.stage == bindparam("b_stage"),
     tasks.c.build == bindparam("b_build"),
     tasks.c.kind == bindparam("b_kind"),

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from sqlalchemy import Column, Connection, Row, bindparam, case, select, update
+from sqlalchemy import Column, Connection, Row, bindparam, case, select, text, update
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
 
@@ -30,6 +30,9 @@ PIECE_TASKS = 250
 """Tasks of a cancelled job that one transaction gives up: it takes 10 to 30 ms, for which other writers wait."""
 
 _WAITING = (TaskState.pending, TaskState.soft_failed)
+
+READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")
+"""The condition of tasks that can be leased, in the words of the partial index."""
 
 OVER = tuple(state for state in TaskState if state.is_over)
 """States of a finished task."""
