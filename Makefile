@@ -10,7 +10,7 @@ SOURCES = $(addsuffix /src,schemas services testing training workers workers/ble
 # One by one: test modules of different components have the same names. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml VERSION
-CORE_SOURCES = $(shell find sim_core/src sim_core/cmake -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
+CORE_SOURCES = $(shell find sim_core/src sim_core/cmake sim_core/tests/core -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
   $(addprefix workers/blender/,CMakeLists.txt pyproject.toml)
 # reconstruction.py calls render_rod_set.py with Blender's interpreter, reader.py needs a dataset, cloth_contact.py takes half an
@@ -18,7 +18,7 @@ RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
   reader.py),$(wildcard benchmarks/*.py))
 DISTRIBUTIONS = schemas sim_core services training workers workers/blender
-CPP_FILES = $(shell find sim_core/src workers/blender/raster -name "*.[ch]pp")
+CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
 .PHONY: setup demo test-fast test test-slow test-main test-blender check size docs bench wheels release-wheels constraints clean
 

@@ -1,8 +1,8 @@
 """The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python layer."""
 
-from stickslip_sim_core._sim_core import BuildInfo, build_info, self_intersections
+from stickslip_sim_core._sim_core import BuildInfo, PairForces, build_info, self_intersections
 from stickslip_sim_core.cloth.bodies import Body, box, capsule, cylinder, plane, sphere
-from stickslip_sim_core.cloth.contact import PairForces, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth

@@ -1,5 +1,4 @@
-#include "bindings/cloth.hpp"
-
+// The Python face of the cloth solver.
 #include <nanobind/eigen/dense.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/function.h>
@@ -9,7 +8,6 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
 #include <functional>
 #include <map>
 #include <tuple>
@@ -25,10 +23,9 @@ using namespace nb::literals;
 
 namespace {
 
-using Table = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
 using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d, Eigen::Matrix3d>;
 
-using FabricTuple = std::tuple<double, Table, Eigen::Matrix3d, double>;
+using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
 using MotionCallback =
     std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
@@ -56,11 +53,7 @@ void bind_cloth(nb::module_& m) {
       "triangles"_a,
       "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
   m.def(
-      "sheet_count",
-      [](const Points2& rest, const Triangles& triangles) {
-        const std::vector<int> sheets = ClothMesh(rest, triangles).sheets();
-        return 1 + *std::max_element(sheets.begin(), sheets.end());
-      },
+      "sheet_count", [](const Points2& rest, const Triangles& triangles) { return ClothMesh(rest, triangles).sheets; },
       "rest"_a, "triangles"_a, "Internal: number of pieces of a mesh that hang together.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
@@ -94,6 +87,16 @@ void bind_cloth(nb::module_& m) {
               "Distance of what drives the cloth from an even motion within a step of the controller [m].")
       .def_ro("least_distance", &StepReport::least_distance,
               "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
+  using PairForces = ClothSolver::PairForces;
+  nb::class_<PairForces>(
+      m, "PairForces", "Forces of cloth on cloth, surfaces and the skeletons of bodies, at P pairs of closest points.")
+      .def_ro("vertices", &PairForces::vertices,
+              "(P, 4); those of surfaces and then of skeletons come after those of the cloth.")
+      .def_ro("weights", &PairForces::weights, "(P, 4): the force acts on each vertex by its weight.")
+      .def_ro("forces", &PairForces::forces, "(P, 3) [N]")
+      .def_ro("distance", &PairForces::distance, "(P,) [m]")
+      .def_ro("sliding", &PairForces::sliding, "(P,)")
+      .def_ro("body", &PairForces::body, "(P,): number of the body, or -1.");
   nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
       .def(
           "__init__",
@@ -108,7 +111,7 @@ void bind_cloth(nb::module_& m) {
             const Constants constants(changed);
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
-              list.push_back({density, {stretching}, rigidity, damping});
+              list.push_back({density, stretching, rigidity, damping});
             }
             new (self) ClothSolver(
                 rest, triangles, list, held,
@@ -163,19 +166,9 @@ void bind_cloth(nb::module_& m) {
       .def("contacts", &ClothSolver::contacts)
       .def("sliding", &ClothSolver::sliding)
       .def("surface_forces", &ClothSolver::surface_forces)
-      .def("pair_forces",
-           [](const ClothSolver& self) {
-             const ClothSolver::PairForces p = self.pair_forces();
-             return std::make_tuple(p.vertices, p.weights, p.forces, p.distance, p.sliding, p.body);
-           })
+      .def("pair_forces", &ClothSolver::pair_forces)
       .def("masses", &ClothSolver::masses)
-      .def(
-          "energies",
-          [](ClothSolver& self, const Points3& positions) {
-            const ClothSolver::Energies e = self.energies(positions);
-            return std::make_tuple(e.membrane, e.bending, e.gradient);
-          },
-          "positions"_a)
+      .def("energies", &ClothSolver::energies, "positions"_a)
       .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "v"_a)
       .def("softest", &ClothSolver::softest, "positions"_a)
       .def("phases",

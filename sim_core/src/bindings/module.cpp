@@ -2,6 +2,7 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -13,17 +14,16 @@
 #include <tuple>
 #include <vector>
 
-#include "bindings/cloth.hpp"
-#include "bindings/contact.hpp"
 #include "build_info.hpp"
 #include "rods/chain.hpp"
-#include "rods/derivatives.hpp"
-#include "rods/general_rods.hpp"
-#include "rods/relax.hpp"
 #include "rods/rods.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
+
+namespace sim_core {
+void bind_cloth(nb::module_& m);
+}  // namespace sim_core
 
 namespace {
 
@@ -52,35 +52,17 @@ using Counts = Output<std::int32_t, nb::shape<-1>>;
 using Truths = Output<bool, nb::shape<-1>>;
 using Solution = std::tuple<Vectors, Vectors, Frames, Numbers, Truths, Truths, Counts, Numbers, Numbers>;
 
-sim_core::RodKernelChoice kernel_named(const std::string& name) {
-  if (name.empty()) return sim_core::best_rod_kernel();
-  for (const auto& kernel : sim_core::rod_kernels()) {
-    if (kernel.name == name && kernel.supported) return kernel;
-  }
-  throw std::invalid_argument("kernel: must be one that this build has and this processor runs, got '" + name + "'");
-}
-
 // Rods between two looks at pending signals: a few milliseconds of work.
 constexpr std::int64_t rods_between_signals = 256;
 
 // The arrays of a solution, and where a kernel writes.
 struct RodArrays {
-  Vectors centerline, curvature;
-  Frames frame;
-  Numbers energy, residual, refinement;
-  Truths converged, stable;
-  Counts iterations;
-
-  RodArrays(std::size_t n, std::size_t points)
-      : centerline(allocate<Vectors>({n, points, 3})),
-        curvature(allocate<Vectors>({n, points, 3})),
-        frame(allocate<Frames>({n, points, 3, 3})),
-        energy(allocate<Numbers>({n})),
-        residual(allocate<Numbers>({n})),
-        refinement(allocate<Numbers>({n})),
-        converged(allocate<Truths>({n})),
-        stable(allocate<Truths>({n})),
-        iterations(allocate<Counts>({n})) {}
+  std::size_t n, points;
+  Vectors centerline = allocate<Vectors>({n, points, 3}), curvature = allocate<Vectors>({n, points, 3});
+  Frames frame = allocate<Frames>({n, points, 3, 3});
+  Numbers energy = allocate<Numbers>({n}), residual = allocate<Numbers>({n}), refinement = allocate<Numbers>({n});
+  Truths converged = allocate<Truths>({n}), stable = allocate<Truths>({n});
+  Counts iterations = allocate<Counts>({n});
 
   sim_core::RodOutput output() {
     return {centerline.data(), curvature.data(),  frame.data(),     energy.data(), residual.data(),
@@ -107,79 +89,44 @@ void solve_in_parts(Kernel solve, const Batch& batch, const sim_core::RodSetting
 }
 
 Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness, int elements, int points,
-                    int start_level, const std::string& kernel_name) {
+                    int start_level, const std::string& kernel) {
   const std::size_t n = gamma.size(), p = static_cast<std::size_t>(points);
   if (phi0.size() != n || phi1.size() != n) throw std::invalid_argument("gamma, phi0, phi1: lengths must be equal");
   const sim_core::RodSettings settings{twist_stiffness, elements,
                                        start_level < 0 ? sim_core::default_start_level(elements) : start_level};
   sim_core::check_rods(settings, points, phi0.data(), phi1.data(), static_cast<std::int64_t>(n));
-  const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
-  RodArrays arrays(n, p);
+  const sim_core::RodKernels kernels = sim_core::rod_kernels_named(kernel);
+  RodArrays arrays{n, p};
   const sim_core::RodBatch batch{gamma.data(), phi0.data(), phi1.data(), arrays.output()};
-  solve_in_parts(kernel.solve, batch, settings, points, n);
+  solve_in_parts(kernels.solve, batch, settings, points, n);
   return arrays.solution();
 }
 
 Solution solve_general_rods(Input gamma, InputRows<3> stiffness, InputRows<4> clamp, InputVectors natural,
                             InputVectors start, InputVectors slope, InputVectors natural_at_points, int elements,
-                            double curvature_max, int start_level, const std::string& kernel_name) {
+                            double curvature_max, const std::string& kernel) {
   const std::size_t n = gamma.size(), p = natural_at_points.shape(1), N = static_cast<std::size_t>(elements);
   const int points = static_cast<int>(p);
-  const sim_core::RodSettings settings{0.0, elements,
-                                       start_level < 0 ? sim_core::default_start_level(elements) : start_level};
+  const sim_core::RodSettings settings{0.0, elements, sim_core::default_start_level(elements)};
   sim_core::check_settings(settings, points, curvature_max);
   if (stiffness.shape(0) != n || clamp.shape(0) != n || natural.shape(0) != n || start.shape(0) != n ||
       slope.shape(0) != n || natural_at_points.shape(0) != n || natural.shape(1) != 2 * N + 1 ||
       start.shape(1) != 2 * N + 1 || slope.shape(1) != N / 2 + 1) {
     throw std::invalid_argument("solve_general_rods: shapes disagree");
   }
-  const sim_core::RodKernelChoice kernel = kernel_named(kernel_name);
-  RodArrays arrays(n, p);
+  const sim_core::RodKernels kernels = sim_core::rod_kernels_named(kernel);
+  RodArrays arrays{n, p};
   const sim_core::GeneralRodBatch batch{
       gamma.data(), stiffness.data(),         clamp.data(),   natural.data(), start.data(),
       slope.data(), natural_at_points.data(), arrays.output()};
-  solve_in_parts(kernel.solve_general, batch, settings, points, n);
+  solve_in_parts(kernels.solve_general, batch, settings, points, n);
   return arrays.solution();
 }
 
 std::vector<std::string> rod_kernels() {
   std::vector<std::string> names;
-  for (const auto& kernel : sim_core::rod_kernels()) {
-    if (kernel.supported) names.emplace_back(kernel.name);
-  }
+  for (const auto& kernels : sim_core::rod_kernels()) names.emplace_back(kernels.name);
   return names;
-}
-
-using sim_core::Quaternions;
-
-std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
-                                                                     double twist_stiffness,
-                                                                     const nb::DRef<const Quaternions>& quaternions) {
-  const Quaternions chain = quaternions;
-  auto result = sim_core::rod_derivatives(gamma, phi0, phi1, twist_stiffness, chain);
-  return {result.energy, std::move(result.gradient), std::move(result.hessian)};
-}
-
-std::tuple<Quaternions, double, bool, bool, int, double> relax_rod(double gamma, double phi0, double phi1,
-                                                                   double twist_stiffness,
-                                                                   const nb::DRef<const Quaternions>& quaternions) {
-  const Quaternions chain = quaternions;
-  sim_core::RelaxedRod rod = sim_core::relax_rod(gamma, phi0, phi1, twist_stiffness, chain);
-  return {std::move(rod.quaternions), rod.energy, rod.stable, rod.converged, rod.iterations, rod.residual};
-}
-
-std::tuple<sim_core::Rows4, double, bool, bool> relax_chain(double gamma, const Eigen::Vector3d& stiffness,
-                                                            const sim_core::Rows3& natural,
-                                                            const sim_core::Rows4& quaternions) {
-  nb::gil_scoped_release unlocked;
-  auto chain = sim_core::relax_chain({gamma, stiffness, natural}, quaternions);
-  return {std::move(chain.quaternions), chain.energy, chain.converged, chain.stable};
-}
-
-sim_core::RowMajor chain_jacobian(double gamma, const Eigen::Vector3d& stiffness, const sim_core::Rows3& natural,
-                                  const sim_core::Rows4& quaternions, const sim_core::RowMajor& basis, int stride) {
-  nb::gil_scoped_release unlocked;
-  return sim_core::chain_jacobian({gamma, stiffness, natural}, quaternions, basis, stride);
 }
 
 }  // namespace
@@ -203,32 +150,27 @@ NB_MODULE(_sim_core, m) {
               "Vectors of the rod solver on this processor; its bits are the same for all.")
       .def_ro("cloth_kernel", &sim_core::BuildInfo::cloth_kernel,
               "Level of the cloth kernels: the widest of this processor, or STICKSLIP_CLOTH_KERNEL. Levels differ in "
-              "the last "
-              "digits.")
+              "the last digits.")
       .def_ro("eigen", &sim_core::BuildInfo::eigen, "Version.");
   m.def("build_info", &sim_core::build_info, "Tell what the C++ core was built from.");
   m.def("solve_rods", &solve_rods, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "elements"_a, "points"_a,
         "start_level"_a = -1, "kernel"_a = "",
         "Internal: see stickslip_sim_core.solve_rods. Level -1 and kernel '' leave the choice to the solver.");
   m.def("solve_general_rods", &solve_general_rods, "gamma"_a, "stiffness"_a, "clamp"_a, "natural"_a, "start"_a,
-        "slope"_a, "natural_at_points"_a, "elements"_a, "curvature_max"_a, "start_level"_a = -1, "kernel"_a = "",
-        "Internal: see stickslip_sim_core.solve_general_rods; arrays as in rods/general_rods.hpp.");
-  m.def("relax_chain", &relax_chain, "gamma"_a, "stiffness"_a, "natural"_a, "quaternions"_a,
-        "Internal: equilibrium of one chain: quaternions (N + 1, 4), energy, converged, stable. See rods/chain.hpp.");
+        "slope"_a, "natural_at_points"_a, "elements"_a, "curvature_max"_a, "kernel"_a = "",
+        "Internal: see stickslip_sim_core.solve_general_rods; arrays as in rods/rods.hpp.");
+  m.def("relax_chain", &sim_core::relax_chain, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
+        "natural"_a, "quaternions"_a,
+        "Internal: equilibrium of one chain: quaternions (N + 1, 4), and whether it is stable. See rods/chain.hpp.");
   m.def("chain_frames", &sim_core::chain_frames, "curvature"_a, "clamp"_a,
         "Internal: quaternions (N + 1, 4) of the chain with curvature (N, 3) in its elements.");
   m.def("chain_centerline", &sim_core::chain_centerline, "quaternions"_a,
         "Internal: positions (N + 1, 3) of the nodes of a chain, L.");
-  m.def("chain_jacobian", &chain_jacobian, "gamma"_a, "stiffness"_a, "natural"_a, "quaternions"_a, "basis"_a,
-        "stride"_a, "Internal: derivatives of nodal positions by gamma and natural curvature. See rods/chain.hpp.");
+  m.def("chain_jacobian", &sim_core::chain_jacobian, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
+        "natural"_a, "quaternions"_a, "basis"_a, "stride"_a,
+        "Internal: derivatives of nodal positions by gamma and natural curvature. See rods/chain.hpp.");
   m.def("rod_kernels", &rod_kernels, "Internal: rod kernels this processor can run, narrowest first.");
-  m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
-        "Internal: energy, gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by "
-        "world rotations of nodes 1 ... N.");
-  m.def(
-      "relax_rod", &relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
-      "Internal: relax a chain of N + 1 unit quaternions (w, x, y, z) with the rod solver's Newton method on this one "
-      "level; the first, the clamp, stays. Returns quaternions, energy, stable, converged, iterations, residual.");
+  m.def("relax_rod", &sim_core::relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
+        "Internal: as relax_chain, of a uniform round rod.");
   sim_core::bind_cloth(m);
-  sim_core::bind_contact(m);
 }

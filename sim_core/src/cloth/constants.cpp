@@ -7,10 +7,10 @@
 namespace sim_core {
 namespace {
 
-template <class Any, class Call>
-void each(Any& constants, const Call& call) {
+template <class Call>
+void each(Constants& constants, const Call& call) {
   const auto group = [&](const std::string& name, auto& settings) {
-    settings.each(settings, [&](const char* field, auto& value) { call(name + "." + field, value); });
+    settings.each([&](const std::string& field, auto& value) { call(name + "." + field, value); });
   };
   group("contact", constants.contact);
   group("node", constants.node);
@@ -50,8 +50,9 @@ Constants::Constants(const std::map<std::string, double>& changed) {
 }
 
 std::map<std::string, double> Constants::by_name() const {
+  Constants own = *this;
   std::map<std::string, double> out;
-  each(*this, [&](const std::string& name, const auto& value) { out[name] = value; });
+  each(own, [&](const std::string& name, auto& value) { out[name] = value; });
   return out;
 }
 

@@ -19,7 +19,7 @@ void append(const Triangles& triangles, const int* node, Triples& out) {
   }
 }
 
-void check_thickness(const ClothMesh& mesh, const std::vector<int>& sheets, const ContactMaterials& materials) {
+void check_thickness(const ClothMesh& mesh, const ContactMaterials& materials) {
   Buffer<double> rest(4L * mesh.rest.rows(), 0.0);
   for (Eigen::Index i = 0; i < mesh.rest.rows(); ++i) at_node(rest, i).head<2>() = mesh.rest.row(i).transpose();
   std::vector<int> vertices(mesh.rest.rows());
@@ -31,9 +31,9 @@ void check_thickness(const ClothMesh& mesh, const std::vector<int>& sheets, cons
       CollisionMask::Constant(count, count, false);  // sheets lie somewhere at rest, not on each other
   for (Eigen::Index s = 0; s < count; ++s) collides(s, s) = materials.mu(s, s) >= 0.0;
   const double reach = *std::max_element(materials.thickness.begin(), materials.thickness.end());
-  for (const Candidate& pair : candidates(Surface(triangles, sheets, collides), rest, reach)) {
+  for (const Candidate& pair : candidates(Surface(triangles, mesh.sheet_of_vertex, collides), rest, reach)) {
     const FourPoints at = points_of(pair, rest);
-    const double thickness = materials.thickness[sheets[pair.node[0]]];
+    const double thickness = materials.thickness[mesh.sheet_of_vertex[pair.node[0]]];
     if (between_closest(closest_weights(pair.kind, at), at).norm() > thickness) continue;
     refuse(text("thickness: must be less than the distance at rest of vertices and edges that do not meet, and vertex ",
                 pair.node[0], " is nearer to one than ", thickness, " m"));
@@ -55,13 +55,11 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
 // Sheets, and after them surfaces and skeletons.
 std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces,
                                  const std::vector<Skeleton>& skeletons) {
-  const std::vector<int> sheets = mesh.sheets();
-  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
   std::vector<int> out(numbering.nodes, -1);
-  for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = sheets[i];
+  for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = mesh.sheet_of_vertex[i];
   const int* others = numbering.node.data() + numbering.vertices;
-  for (int i = 0; i < numbering.others; ++i) out[others[i]] = count + surfaces.surface_of_vertex[i];
-  int next = numbering.nodes - numbering.bones, sheet = count + static_cast<int>(surfaces.crease.size());
+  for (int i = 0; i < numbering.others; ++i) out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
+  int next = numbering.nodes - numbering.bones, sheet = mesh.sheets + static_cast<int>(surfaces.crease.size());
   for (const Skeleton& skeleton : skeletons) {
     for (std::size_t p = 0; p < skeleton.points.size(); ++p) out[next++] = sheet;
     ++sheet;
@@ -86,15 +84,14 @@ Bones bones_of(const Numbering& numbering, const std::vector<Skeleton>& skeleton
 }  // namespace
 
 double cell_of(const ClothMesh& mesh) {
-  const std::vector<int> sheets = mesh.sheets();
-  const int count = 1 + *std::max_element(sheets.begin(), sheets.end());
-  std::vector<double> area(count, 0.0), triangles(count, 0.0);
+  std::vector<double> area(mesh.sheets, 0.0), triangles(mesh.sheets, 0.0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
-    area[sheets[mesh.triangles(t, 0)]] += mesh.area[t];
-    triangles[sheets[mesh.triangles(t, 0)]] += 1.0;
+    const int sheet = mesh.sheet_of_vertex[mesh.triangles(t, 0)];
+    area[sheet] += mesh.area[t];
+    triangles[sheet] += 1.0;
   }
   double out = 0.0;
-  for (int s = 0; s < count; ++s) out = std::max(out, std::sqrt(2.0 * area[s] / triangles[s]));
+  for (int s = 0; s < mesh.sheets; ++s) out = std::max(out, std::sqrt(2.0 * area[s] / triangles[s]));
   return out;
 }
 
@@ -118,7 +115,7 @@ ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Sk
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials, const SurfaceMeshes& surfaces,
                                            const std::vector<Skeleton>& skeletons, const Constants& constants) {
-  check_thickness(mesh, mesh.sheets(), materials);
+  check_thickness(mesh, materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
   append(surfaces.triangles, numbering.node.data() + numbering.vertices, triangles);

@@ -1,6 +1,8 @@
 // Constants of the choice of step sizes.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct ControlSettings {
@@ -32,12 +34,8 @@ struct ControlSettings {
   // Times in the longest step at which bodies and holders are looked at: one in each of the shortest of `certified`.
   int looks = 64;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("reject_at", s.reject_at), call("grow_at", s.grow_at), call("factor_work", s.factor_work),
-        call("newton_work", s.newton_work), call("rejected_work", s.rejected_work), call("dearer", s.dearer),
-        call("forgiven", s.forgiven), call("novelty", s.novelty), call("halvings", s.halvings), call("looks", s.looks);
-  }
+  SIM_CORE_NAMED(reject_at, grow_at, factor_work, newton_work, rejected_work, dearer, forgiven, novelty, halvings,
+                 looks)
 };
 
 }  // namespace sim_core

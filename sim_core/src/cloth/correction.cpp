@@ -28,9 +28,9 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, St
       const Stopwatch watch(phases_.factorization);
       report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
     }
-    const KrylovResult solved = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
-    factor.spent(solved.iterations);
-    report.krylov += solved.iterations;
+    const int iterations = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
+    factor.spent(iterations);
+    report.krylov += iterations;
   } else {
     solve_with_pairs(*pairs, x, dt, report);
   }
@@ -53,13 +53,13 @@ void Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, do
   assembly_.matrix.pairs = &pair_rows_;
   const double tolerance = pairs.smoothing > 0.0 ? constants_.smooth_tolerance
                                                  : std::min(settings_.krylov_tolerance, constants_.pairs_tolerance);
-  const KrylovResult solved = solve_linear(&pairs, pair_factor_.view(), tolerance);
+  const int iterations = solve_linear(&pairs, pair_factor_.view(), tolerance);
   assembly_.matrix.pairs = nullptr;
-  pair_factor_.spent(solved.iterations);
-  report.krylov += solved.iterations;
+  pair_factor_.spent(iterations);
+  report.krylov += iterations;
 }
 
-KrylovResult Correction::solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance) {
+int Correction::solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance) {
   const Stopwatch watch(phases_.krylov);
   subtract_corrections(pairs);
   double size = 0.0;
@@ -67,11 +67,11 @@ KrylovResult Correction::solve_linear(const ContactSet* pairs, const Factor& fac
   size = std::sqrt(size);
   const double tolerance =
       std::max(krylov_tolerance, constants_.linear_share * settings_.tolerance / std::max(size, 1e-300));
-  const KrylovResult solved =
+  const int iterations =
       assembly_.kernel.krylov(assembly_.matrix, factor, contact_.rows(), contact_.force.data(), change.data(),
                               work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));
   for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) change[i] += contact_.correction[i];
-  return solved;
+  return iterations;
 }
 
 // What contact prescribes, `correction`, goes to the right-hand side, and the forces of pairs that do not depend on the

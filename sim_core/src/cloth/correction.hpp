@@ -27,7 +27,8 @@ class Correction {
 
  private:
   void solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt, StepReport& report);
-  KrylovResult solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance);
+  // Returns the iterations of GMRES.
+  int solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance);
   void subtract_corrections(const ContactSet* pairs);
 
   Assembly& assembly_;

@@ -1,5 +1,6 @@
 #include "cloth/course.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 
@@ -19,12 +20,9 @@ struct Around {
 
 Around around(const Stepper& stepper) {
   const Numbering& numbering = stepper.numbering();
-  Vector3d low = at_node(stepper.x, numbering.node[0]), high = low;
-  for (int i = 0; i < numbering.vertices; ++i) {
-    const Vector3d p = at_node(stepper.x, numbering.node[i]);
-    low = low.cwiseMin(p), high = high.cwiseMax(p);
-  }
-  return {0.5 * (low + high), 0.5 * (high - low).norm()};
+  Eigen::AlignedBox3d box;
+  for (int i = 0; i < numbering.vertices; ++i) box.extend(at_node(stepper.x, numbering.node[i]));
+  return {0.5 * (box.min() + box.max()), 0.5 * box.diagonal().norm()};
 }
 
 // Distance of a body's material points near the cloth from where they are taken to be: that of their middle, and what

@@ -1,6 +1,8 @@
 // Constants of stale factors.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct FactorSettings {
@@ -25,12 +27,7 @@ struct FactorSettings {
   // 0.02 take up to 12 and 15 % more.
   double fold_smallest = 0.01;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("changed_share", s.changed_share), call("missing_share", s.missing_share), call("hold_change", s.hold_change),
-        call("hold_least", s.hold_least), call("pool", s.pool), call("stiffening_change", s.stiffening_change),
-        call("fold_smallest", s.fold_smallest);
-  }
+  SIM_CORE_NAMED(changed_share, missing_share, hold_change, hold_least, pool, stiffening_change, fold_smallest)
 };
 
 }  // namespace sim_core

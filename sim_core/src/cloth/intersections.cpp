@@ -31,15 +31,11 @@ bool crosses(const Vector3d& p, const Vector3d& q, const Vector3d& a, const Vect
 
 int self_intersections(const Points3& positions, const Triangles& triangles) {
   const int count = static_cast<int>(triangles.rows());
-  std::vector<Vector3d> low(count), high(count);
+  std::vector<Eigen::AlignedBox3d> box(count);
   double size = 0.0;
   for (int t = 0; t < count; ++t) {
-    low[t] = high[t] = positions.row(triangles(t, 0)).transpose();
-    for (int c = 1; c < 3; ++c) {
-      low[t] = low[t].cwiseMin(positions.row(triangles(t, c)).transpose());
-      high[t] = high[t].cwiseMax(positions.row(triangles(t, c)).transpose());
-    }
-    size += (high[t] - low[t]).maxCoeff() / count;
+    for (int c = 0; c < 3; ++c) box[t].extend(positions.row(triangles(t, c)).transpose());
+    size += box[t].sizes().maxCoeff() / count;
   }
   if (!(size > 0.0) || !std::isfinite(size)) return 0;
   // A hash of cells about as large as a triangle.
@@ -50,7 +46,7 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
   int found = 0;
   std::vector<int> seen(count, -1);
   for (int t = 0; t < count; ++t) {
-    const Eigen::Array3d from = (low[t] / size).array().floor(), to = (high[t] / size).array().floor();
+    const Eigen::Array3d from = (box[t].min() / size).array().floor(), to = (box[t].max() / size).array().floor();
     for (double x = from[0]; x <= to[0]; ++x) {
       for (double y = from[1]; y <= to[1]; ++y) {
         for (double z = from[2]; z <= to[2]; ++z) {
@@ -58,7 +54,7 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
           for (int other : cell) {
             if (seen[other] == t) continue;
             seen[other] = t;
-            if ((low[t].array() > high[other].array()).any() || (low[other].array() > high[t].array()).any()) continue;
+            if (!box[t].intersects(box[other])) continue;
             bool common = false;
             for (int i = 0; i < 3; ++i) {
               for (int j = 0; j < 3; ++j) common = common || triangles(t, i) == triangles(other, j);

@@ -72,13 +72,13 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
   const Eigen::Matrix<double, 5, 5> powers = powers_of_rows();
   for (const ClothProperties& fabric : fabrics.list) {
     const StretchTable& table = fabric.stretching;
-    const Eigen::RowVector4d none = combined(table.k.row(0));
+    const Eigen::RowVector4d none = combined(table.row(0));
     Eigen::Matrix<double, 5, 4> more;
-    for (int r = 0; r < 5; ++r) more.row(r) = combined(table.k.row(1 + r) - table.k.row(0));
+    for (int r = 0; r < 5; ++r) more.row(r) = combined(table.row(1 + r) - table.row(0));
     const Eigen::Matrix<double, 5, 4> in_y = powers * more;
     law_.insert(law_.end(), none.data(), none.data() + 4);
     law_.insert(law_.end(), in_y.data(), in_y.data() + 20);  // column by column
-    tabulated_.push_back(!table.constant());
+    tabulated_.push_back(table.bottomRows<5>() != table.row(0).replicate<5, 1>());
   }
   data_ = {groups,      nodes_.data(),     shape_.data(), area_.data(), fabric_.data(),
            law_.data(), tabulated_.data(), slots_.data(), nullptr};

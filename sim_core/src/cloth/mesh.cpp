@@ -54,10 +54,11 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
   for (Eigen::Index v = 0; v < rest.rows(); ++v) {
     if (!used[v]) refuse(text("rest: every vertex must belong to a triangle, and ", v, " does not"));
   }
+  find_sheets();
 }
 
-std::vector<int> ClothMesh::sheets() const {
-  std::vector<int> root(rest.rows()), sheet(rest.rows());
+void ClothMesh::find_sheets() {
+  std::vector<int> root(rest.rows());
   std::iota(root.begin(), root.end(), 0);
   const auto find = [&](int i) {
     while (root[i] != i) i = root[i] = root[root[i]];
@@ -67,9 +68,9 @@ std::vector<int> ClothMesh::sheets() const {
     const int a = find(edge.a), b = find(edge.b);
     root[std::max(a, b)] = std::min(a, b);
   }
-  int count = 0;
-  for (int i = 0; i < static_cast<int>(sheet.size()); ++i) sheet[i] = find(i) == i ? count++ : sheet[find(i)];
-  return sheet;
+  for (int i = 0; i < static_cast<int>(root.size()); ++i) {
+    sheet_of_vertex.push_back(find(i) == i ? sheets++ : sheet_of_vertex[find(i)]);
+  }
 }
 
 }  // namespace sim_core

@@ -25,12 +25,14 @@ struct ClothMesh {
   std::vector<Edge> edges;
   std::vector<std::array<int, 3>> triangle_edges;  // opposite corner 0, 1, 2
   Eigen::VectorXd area;
+  std::vector<int> sheet_of_vertex;  // pieces that hang together, in the order of their first vertices
+  int sheets = 0;
 
   // Throws std::invalid_argument, naming the field, unless this is a triangulation of a surface with positive areas.
   ClothMesh(Points2 rest, Triangles triangles);
 
-  // Sheet of each vertex: pieces that hang together, in the order of their first vertices.
-  std::vector<int> sheets() const;
+ private:
+  void find_sheets();
 };
 
 }  // namespace sim_core

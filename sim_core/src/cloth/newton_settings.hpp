@@ -1,6 +1,8 @@
 // Constants of Newton's method.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct NewtonSettings {
@@ -52,15 +54,9 @@ struct NewtonSettings {
   // 0.05 and 0.2 take 20 and 8 % more in a crumple.
   double common_least = 0.1;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("reversals_from", s.reversals_from), call("rounds_max", s.rounds_max),
-        call("pairs_tolerance", s.pairs_tolerance), call("linear_share", s.linear_share), call("window", s.window),
-        call("cuts_max", s.cuts_max), call("smoothing_ratio", s.smoothing_ratio), call("smooth_near", s.smooth_near),
-        call("smooth_tolerance", s.smooth_tolerance), call("smooth_hops", s.smooth_hops), call("hops", s.hops),
-        call("slow", s.slow), call("nearly", s.nearly), call("halving_iterations", s.halving_iterations),
-        call("longest", s.longest), call("common_least", s.common_least);
-  }
+  SIM_CORE_NAMED(reversals_from, rounds_max, pairs_tolerance, linear_share, window, cuts_max, smoothing_ratio,
+                 smooth_near, smooth_tolerance, smooth_hops, hops, slow, nearly, halving_iterations, longest,
+                 common_least)
 };
 
 }  // namespace sim_core

@@ -256,7 +256,7 @@ void PairFactor::make(const Assembly& assembly) {
     });
   }
   for (std::size_t i = 0; i < place_.size(); ++i) std::copy_n(held_[i].data(), 6, &added_[6L * place_[i]]);
-  assembly.kernel.factor(view_, matrix_, {added_.data()});
+  assembly.kernel.factor(view_, matrix_, added_.data());
   for (auto b = before.rbegin(); b != before.rend(); ++b) std::copy_n(b->second.data(), 12, &blocks_[12L * b->first]);
 }
 

@@ -140,16 +140,6 @@ struct Factor {
   float* ordered;    // a vector in that order
 };
 
-// A node keeps its own stiffness, and in contact some more: the factor need not be exact.
-struct FactorDiagonal {
-  const float* added;  // (nodes, 6): xx xy xz yy yz zz, N/m
-};
-
-struct KrylovResult {
-  int iterations;
-  double residual;  // over that of the right-hand side
-};
-
 struct ClothKernel {
   const char* name;
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
@@ -158,10 +148,16 @@ struct ClothKernel {
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);
-  void (*factor)(const Factor&, const ClothMatrix&, const FactorDiagonal&);
+  // `added`: (nodes, 6), xx xy xz yy yz zz, N/m. A node keeps its own stiffness, and in contact some more: the factor
+  // need not be exact.
+  void (*factor)(const Factor&, const ClothMatrix&, const float* added);
   void (*solve)(const Factor&, int nodes, const float* b, float* x);
-  KrylovResult (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x, float* work,
-                         int iterations, double tolerance);
+  // Returns the iterations.
+  int (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x, float* work,
+                int iterations, double tolerance);
 };
+
+// One for each instruction set that they are compiled for; kernels/kernel.hpp is the code of all of them.
+extern const ClothKernel cloth_baseline, cloth_x86_64_v3, cloth_x86_64_v4;
 
 }  // namespace sim_core

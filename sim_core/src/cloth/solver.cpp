@@ -35,9 +35,8 @@ struct ClothSolver::Impl {
         controller(stepper, control, constants.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
-    const std::vector<int> sheets = mesh.sheets();
-    stepper.sheets = 1 + *std::max_element(sheets.begin(), sheets.end());
-    for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = sheets[numbering.vertex[i]];
+    stepper.sheets = mesh.sheets;
+    for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
     if ((materials.mu.array() >= 0.0).any()) {
       newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, skeletons, constants);
     }
@@ -218,20 +217,21 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     }
   }
   const auto count = static_cast<Eigen::Index>(some.size());
-  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), {}, {}};
+  PairForces out{
+      {count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), Truths(count), Eigen::VectorXi(count)};
   for (Eigen::Index p = 0; p < count; ++p) {
     for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->who.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
     out.forces.row(p) = some[p]->at.force.transpose();
     out.distance[p] = some[p]->at.gap + some[p]->thickness;
-    out.sliding.push_back(some[p]->row.mode == contact_slip);
+    out.sliding[p] = some[p]->row.mode == contact_slip;
     const Bone* bone = impl_->newton.pairs->bone_of(*some[p]);
-    out.body.push_back(bone ? bone->body : -1);
+    out.body[p] = bone ? bone->body : -1;
   }
   return out;
 }
 
-ClothSolver::Energies ClothSolver::energies(const Points3& positions) {
+std::tuple<double, double, Points3> ClothSolver::energies(const Points3& positions) {
   impl_->newton.evaluate(impl_->at(positions), false);
   const Assembly& assembly = impl_->assembly;
   return {assembly.membrane_energy, assembly.bending_energy, impl_->unload(assembly.gradient)};

@@ -7,6 +7,7 @@
 #include <functional>
 #include <memory>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -59,20 +60,19 @@ class ClothSolver {
 
   // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices of surfaces and
   // points of skeletons come after those of the cloth.
+  using Truths = Eigen::Matrix<bool, Eigen::Dynamic, 1>;
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
     Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> weights;
-    Points3 forces;                           // N: on sum w_i x_i
-    Eigen::VectorXd distance;                 // m
-    std::vector<std::int32_t> sliding, body;  // -1: of no body
+    Points3 forces;            // N: on sum w_i x_i
+    Eigen::VectorXd distance;  // m
+    Truths sliding;
+    Eigen::VectorXi body;  // -1: of no body
   };
   PairForces pair_forces() const;
 
-  struct Energies {
-    double membrane, bending;
-    Points3 gradient;
-  };
-  Energies energies(const Points3& positions);
+  // Of membrane and bending, J, and the gradient of their sum, N.
+  std::tuple<double, double, Points3> energies(const Points3& positions);
   // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
   Points3 stiffness_times(const Points3& positions, const Points3& v);
   // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.

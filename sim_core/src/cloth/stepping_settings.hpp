@@ -1,6 +1,8 @@
 // Constants of steps that are halved.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct SteppingSettings {
@@ -28,12 +30,7 @@ struct SteppingSettings {
   // halved: what begins a step before a body must not be predicted behind its middle.
   double sweep = 0.5;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("inside", s.inside), call("lag", s.lag), call("easy", s.easy), call("near_patience", s.near_patience),
-        call("strained_soon", s.strained_soon), call("strained_long", s.strained_long),
-        call("smooth_iterations", s.smooth_iterations), call("sweep", s.sweep);
-  }
+  SIM_CORE_NAMED(inside, lag, easy, near_patience, strained_soon, strained_long, smooth_iterations, sweep)
 };
 
 }  // namespace sim_core

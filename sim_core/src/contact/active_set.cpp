@@ -1,14 +1,14 @@
-#include "contact/active_set.hpp"
+#include "contact/contact_set.hpp"
 
 namespace sim_core {
 
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-bool resume(std::vector<Pair>& pairs, const ContactSettings& settings) {
+bool ContactSet::resume() {
   bool any = false;
-  for (Pair& pair : pairs) {
-    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings.closing_gap * pair.scale) continue;
+  for (Pair& pair : pairs_) {
+    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings_.closing_gap * pair.scale) continue;
     PairKinematics touching = pair.at;
     touching.gap = 0.0;
     const PairLinearization row = linearize(touching);
@@ -20,11 +20,11 @@ bool resume(std::vector<Pair>& pairs, const ContactSettings& settings) {
   return any;
 }
 
-bool activate(std::vector<Pair>& pairs, const Buffer<float>& change, int free_nodes, const ContactSettings& settings) {
+bool ContactSet::activate(const Buffer<float>& change) {
   bool changed = false;
-  for (Pair& pair : pairs) {
+  for (Pair& pair : pairs_) {
     if (!pair.added) continue;
-    const Vector3d force = pair.at.force + pair.force_change(change, free_nodes);
+    const Vector3d force = pair.at.force + pair.force_change(change, free_nodes_);
     if (force.dot(pair.at.normal) >= 0.0) continue;
     pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.at.force};
     pair.turning.setZero();
@@ -34,10 +34,10 @@ bool activate(std::vector<Pair>& pairs, const Buffer<float>& change, int free_no
   }
   for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
     bool any = false;
-    for (Pair& pair : pairs) {
+    for (Pair& pair : pairs_) {
       if (pair.who.kind != kind || pair.active() || pair.released) continue;
-      const Vector3d motion = pair.motion(change, free_nodes);
-      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings.closing_gap * pair.scale)) continue;
+      const Vector3d motion = pair.motion(change, free_nodes_);
+      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings_.closing_gap * pair.scale)) continue;
       pair.row = linearize_closing(pair.at, motion);
       pair.added = any = true;
     }

@@ -4,8 +4,6 @@
 #include <limits>
 #include <utility>
 
-#include "contact/matching.hpp"
-
 namespace sim_core {
 
 using Eigen::Matrix3d;
@@ -39,9 +37,9 @@ void ContactSet::keep() {
 
 void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& residual) {
   detection_.find(x, smoothing, stiff, pairs_);
-  transfer(pairs_, base_, share, smoothing == 0.0, settings_);
-  merge(pairs_, detection_.near.surface, detection_.materials, settings_);
-  linearize(pairs_, x);
+  transfer(share);
+  merge();
+  linearize_at(x);
   for (const Pair& pair : pairs_) {
     if (pair.at.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.at.force;
@@ -73,11 +71,6 @@ bool ContactSet::relevant() const {
     const int last = std::max(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
     return pair.active() || last < detection_.materials.sheets;
   });
-}
-
-const Bone* ContactSet::bone_of(const Pair& pair) const {
-  const std::vector<int>& sheet_of_node = detection_.near.surface.sheet_of_node;
-  return materials().bone_of(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
 }
 
 double ContactSet::sharpest() const {

@@ -1,13 +1,11 @@
-// Contacts of cloth with itself and with other cloth: the pairs of closest points, their forces from step to step, and
-// their rows of Newton's system.
+// Contacts of cloth with itself and with other cloth: the pairs of closest points, their forces from step to step
+// (matching.cpp), which of them are active (active_set.cpp), and their rows of Newton's system (linearization.cpp).
 #pragma once
 
 #include <Eigen/Core>
 #include <vector>
 
-#include "contact/active_set.hpp"
 #include "contact/detection.hpp"
-#include "contact/linearization.hpp"
 #include "contact/state.hpp"
 
 namespace sim_core {
@@ -37,16 +35,22 @@ class ContactSet {
   // Finds and linearizes the pairs at x, with a share of the forces' last changes, and subtracts their forces from the
   // residual.
   void update(const Buffer<double>& x, double share, Buffer<double>& residual);
-  bool resume() { return sim_core::resume(pairs_, settings_); }
-  bool activate(const Buffer<float>& change) { return sim_core::activate(pairs_, change, free_nodes_, settings_); }
+  // After the first look of a step: activates pairs that have a force and are open by no more than what a prediction on
+  // straight lines opens over curved cloth. Returns whether there are any.
+  bool resume();
+  // After a linear problem: releases added pairs that would pull, and adds pairs that would come too near, vertices
+  // before edges. Returns whether the active set has changed.
+  bool activate(const Buffer<float>& change);
   // Takes over the changes of the forces from the solution of the linear problem.
   void solved(const Buffer<float>& change);
   // Marks the pairs at hand as the best; returns to them, without changes.
   void mark_best() { best_.assign(pairs_.begin(), pairs_.end()); }
   void return_to_best();
 
-  PairData rows() { return rows_.assemble(pairs_, free_nodes_); }
-  void subtract_right_side(Buffer<float>& force) const { sim_core::subtract_right_side(pairs_, free_nodes_, force); }
+  // Rows of the active pairs, for products with the matrix, second derivatives of the distance included.
+  PairData rows();
+  // Subtracts from nodal forces what the pairs contribute to the right-hand side.
+  void subtract_right_side(Buffer<float>& force) const;
   // Adds a share of the stiffness by which pairs hold the free nodes, N/m.
   void add_stiffness(double share, std::vector<double>& stiffness) const;
   // Counts the forces by which the law is missed, where this stiffness [N/m] turns gaps and slips into forces.
@@ -56,7 +60,7 @@ class ContactSet {
   bool relevant() const;
   const ContactMaterials& materials() const { return detection_.materials; }
   // The skeleton of a pair, or null.
-  const Bone* bone_of(const Pair& pair) const;
+  const Bone* bone_of(const Pair& pair) const { return detection_.bone_of(pair.who); }
   // Least radius over the side of a cell of a skeleton that bears; infinite where none does.
   double sharpest() const;
   // Whether there is a force or an active pair.
@@ -66,12 +70,17 @@ class ContactSet {
   double least_distance() const { return detection_.least_distance(); }
 
  private:
+  void transfer(double share);
+  void merge();
+  void linearize_at(const Buffer<double>& x);
+
   ContactSettings settings_;
   int free_nodes_;
   PairDetection detection_;
   std::vector<Pair> pairs_;                   // sorted by kind, first, feature
   std::vector<PairPast> base_, kept_, best_;  // likewise
-  PairRows rows_;
+  std::vector<int> nodes_;                    // of `rows`
+  Buffer<float> weights_, stiffness_;
 };
 
 }  // namespace sim_core

@@ -92,14 +92,12 @@ Core core_of(const Body& body) {
 }
 
 bool passes(const Core& core, const Corners& start, const Corners& end) {
-  Vector3d low = start[0], high = low;
+  Eigen::AlignedBox3d way;
   for (const Corners* at : {&start, &end}) {
-    for (const Vector3d& p : *at) low = low.cwiseMin(p), high = high.cwiseMax(p);
+    for (const Vector3d& p : *at) way.extend(p);
   }
-  if (low.z() > 0.0 || high.z() < 0.0) return false;
-  for (int a = 0; a < 2; ++a) {
-    if (low[a] > core.half[a] || high[a] < -core.half[a]) return false;
-  }
+  const Vector3d half(core.half.x(), core.half.y(), 0.0);
+  if (!way.intersects({-half, half})) return false;
   const bool wide = core.half.y() > 0.0, thin = !(core.half.x() > 0.0) && !wide;
   if (thin) return passes_point(start, end, Vector3d::Zero());
   const auto corners = [&] {

@@ -222,14 +222,14 @@ Vector3d PairDetection::slip(const Candidate& who, const Vector4d& weights, cons
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
   Matrix3d turn = Matrix3d::Zero();
-  if (materials.bone_of(a, b)) {
+  if (bone_of(who)) {
     turn = bone_turns_[std::max(a, b) - materials.first_bone()];
-    return rho - turn * between_closest(weights, points_of(who, *start_));
-  }
-  for (int c = 0; c < 4; ++c) {
-    const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
-    const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
-    if (share * weights[c] != 0.0) turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+  } else {
+    for (int c = 0; c < 4; ++c) {
+      const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
+      const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+      if (share * weights[c] != 0.0) turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+    }
   }
   return rho - turn * between_closest(weights, points_of(who, *start_));
 }

@@ -26,11 +26,12 @@ class PairDetection {
   // Replaces `pairs` by those at x, sorted by kind, first and feature, without forces. `smoothing` [m] and `stiff`: see
   // ContactSet.
   void find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs);
+  // The skeleton of a pair, or null.
+  const Bone* bone_of(const Candidate& pair) const;
   // Least distance of any two pieces without a common node at the last search, m; infinite where none is near.
   double least_distance() const { return least_distance_; }
 
  private:
-  const Bone* bone_of(const Candidate& pair) const;
   void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
                      std::vector<Pair>& pairs);
   void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x, std::vector<Pair>& pairs);

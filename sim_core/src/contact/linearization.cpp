@@ -1,7 +1,7 @@
-#include "contact/linearization.hpp"
-
 #include <Eigen/Geometry>
 #include <Eigen/LU>
+
+#include "contact/contact_set.hpp"
 
 namespace sim_core {
 namespace {
@@ -42,21 +42,21 @@ void turn(Pair& pair, const Buffer<double>& x) {
 
 }  // namespace
 
-void linearize(std::vector<Pair>& pairs, const Buffer<double>& x) {
-  for (Pair& pair : pairs) {
+void ContactSet::linearize_at(const Buffer<double>& x) {
+  for (Pair& pair : pairs_) {
     pair.row = linearize(pair.at);
     turn(pair, x);
   }
 }
 
-PairData PairRows::assemble(const std::vector<Pair>& pairs, int free_nodes) {
+PairData ContactSet::rows() {
   nodes_.clear();
   weights_.clear();
   stiffness_.clear();
-  for (const Pair& pair : pairs) {
+  for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
     for (int c = 0; c < 4; ++c) {
-      nodes_.push_back(pair.who.node[c] < free_nodes ? pair.who.node[c] : -1);
+      nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
     }
     for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
       for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
@@ -72,13 +72,13 @@ PairData PairRows::assemble(const std::vector<Pair>& pairs, int free_nodes) {
   return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
 }
 
-void subtract_right_side(const std::vector<Pair>& pairs, int free_nodes, Buffer<float>& force) {
-  for (const Pair& pair : pairs) {
+void ContactSet::subtract_right_side(Buffer<float>& force) const {
+  for (const Pair& pair : pairs_) {
     PairMotions change = -pair.stiffness() * pair.given;
     change.head<3>() += pair.row.force;
     if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] >= free_nodes) continue;
+      if (pair.who.node[c] >= free_nodes_) continue;
       at_node(force, pair.who.node[c]) -=
           (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) +
            pair.along_second[c] * change.segment<3>(6))

@@ -1,10 +1,10 @@
-#include "contact/matching.hpp"
-
 #include <algorithm>
 #include <cmath>
 #include <numeric>
 #include <tuple>
 #include <utility>
+
+#include "contact/contact_set.hpp"
 
 namespace sim_core {
 namespace {
@@ -18,90 +18,93 @@ auto key(const Any& pair) {
 
 }  // namespace
 
-void transfer(std::vector<Pair>& pairs, const std::vector<PairPast>& before, double share, bool exact,
-              const ContactSettings& settings) {
+// Transfers the forces of earlier pairs, with a share of their last changes, to the pairs at hand, both sorted by kind,
+// first and feature. The force of a pair that is gone goes to the new pair of the same vertex, or of one of its edges,
+// whose normal is most alike: the closest feature has changed; else to the nearest pair. Under the exact law the
+// proximal stiffness of pairs that stall grows.
+void ContactSet::transfer(double share) {
   std::vector<const PairPast*> orphans;
   std::vector<std::size_t> fresh;
   std::size_t o = 0;
-  for (std::size_t i = 0; i < pairs.size(); ++i) {
-    for (; o < before.size() && key(before[o]) < key(pairs[i]); ++o) orphans.push_back(&before[o]);
-    if (o < before.size() && key(before[o]) == key(pairs[i])) {
-      pairs[i].at.force = before[o].force + share * before[o].change;
-      pairs[i].penalty_scale = before[o].penalty_scale;
-      const int mode = before[o].mode;
-      const double last = before[o].missed, now = violation(pairs[i].at, mode);
-      if (exact && share == 1.0 && mode != contact_open && last > settings.length_tolerance &&
-          last < settings.stall_up_to * pairs[i].scale && now > settings.stall_ratio * last) {
-        pairs[i].penalty_scale = std::min(settings.penalty_growth * before[o].penalty_scale, settings.penalty_max);
+  for (std::size_t i = 0; i < pairs_.size(); ++i) {
+    for (; o < base_.size() && key(base_[o]) < key(pairs_[i]); ++o) orphans.push_back(&base_[o]);
+    if (o < base_.size() && key(base_[o]) == key(pairs_[i])) {
+      pairs_[i].at.force = base_[o].force + share * base_[o].change;
+      pairs_[i].penalty_scale = base_[o].penalty_scale;
+      const int mode = base_[o].mode;
+      const double last = base_[o].missed, now = violation(pairs_[i].at, mode);
+      if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > settings_.length_tolerance &&
+          last < settings_.stall_up_to * pairs_[i].scale && now > settings_.stall_ratio * last) {
+        pairs_[i].penalty_scale = std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
       }
-      pairs[i].at.along *= pairs[i].penalty_scale;
-      pairs[i].at.across *= pairs[i].penalty_scale;
+      pairs_[i].at.along *= pairs_[i].penalty_scale;
+      pairs_[i].at.across *= pairs_[i].penalty_scale;
       ++o;
     } else {
       fresh.push_back(i);
     }
   }
-  for (; o < before.size(); ++o) orphans.push_back(&before[o]);
+  for (; o < base_.size(); ++o) orphans.push_back(&base_[o]);
   for (const PairPast* orphan : orphans) {
     const Vector3d force = orphan->force + share * orphan->change;
     if (force.isZero(0.0)) continue;
-    std::size_t match = pairs.size();
-    double best = settings.match_cosine;
+    std::size_t match = pairs_.size();
+    double best = settings_.match_cosine;
     for (std::size_t i : fresh) {
-      const Candidate &a = pairs[i].who, &b = orphan->who;
+      const Candidate &a = pairs_[i].who, &b = orphan->who;
       if (a.kind != b.kind) continue;
       const bool common = a.kind == PairKind::vertex_triangle ? a.first == b.first
                                                               : a.first == b.first || a.second == b.second ||
                                                                     a.first == b.second || a.second == b.first;
       if (!common) continue;
-      const double alike = pairs[i].at.normal.dot(orphan->normal);
+      const double alike = pairs_[i].at.normal.dot(orphan->normal);
       if (alike > best) best = alike, match = i;
     }
-    if (match < pairs.size()) {
-      pairs[match].at.force += force;
+    if (match < pairs_.size()) {
+      pairs_[match].at.force += force;
       continue;
     }
-    best = settings.transfer_radius * orphan->scale;
-    for (std::size_t i = 0; i < pairs.size(); ++i) {
-      const double far = (pairs[i].middle - orphan->middle).norm();
-      const double alike = pairs[i].at.normal.dot(orphan->normal);
-      if (far < best && std::abs(alike) > settings.match_cosine) best = far, match = i;
+    best = settings_.transfer_radius * orphan->scale;
+    for (std::size_t i = 0; i < pairs_.size(); ++i) {
+      const double far = (pairs_[i].middle - orphan->middle).norm();
+      const double alike = pairs_[i].at.normal.dot(orphan->normal);
+      if (far < best && std::abs(alike) > settings_.match_cosine) best = far, match = i;
     }
-    if (match < pairs.size()) {
-      pairs[match].at.force += pairs[match].at.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
+    if (match < pairs_.size()) {
+      pairs_[match].at.force += pairs_[match].at.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
     }
   }
 }
 
-void merge(std::vector<Pair>& pairs, const Surface& surface, const ContactMaterials& materials,
-           const ContactSettings& settings) {
-  const std::size_t count = pairs.size();
+// Merges pairs at nearly the same place, as where a vertex lies on a vertex: their rows differ by rounding only and
+// would contradict each other. The pair that stays has the larger distance to keep, then a force, then the smaller gap;
+// it takes the forces of the others.
+void ContactSet::merge() {
+  const std::size_t count = pairs_.size();
   const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
   std::vector<std::pair<double, std::size_t>> line(count);
-  for (std::size_t i = 0; i < count; ++i) line[i] = {across.dot(pairs[i].middle), i};
+  for (std::size_t i = 0; i < count; ++i) line[i] = {across.dot(pairs_[i].middle), i};
   std::sort(line.begin(), line.end());
   std::vector<std::size_t> place(count), order(count);
   for (std::size_t l = 0; l < count; ++l) place[line[l].second] = l;
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::vector<std::tuple<bool, bool, double>> rank(count);  // whether it keeps less apart, has no force; its gap
   for (std::size_t i = 0; i < count; ++i) {
-    const auto sheet = [&](int c) { return surface.sheet_of_node[pairs[i].who.node[c]]; };
-    rank[i] = {pairs[i].thickness < materials.apart(sheet(0), sheet(3)), pairs[i].at.force.isZero(0.0),
-               pairs[i].at.gap};
+    const auto sheet = [&](int c) { return detection_.near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
+    rank[i] = {pairs_[i].thickness < materials().apart(sheet(0), sheet(3)), pairs_[i].at.force.isZero(0.0),
+               pairs_[i].at.gap};
   }
   std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
-    const double radius = settings.merge_radius * pairs[i].scale;
-    const auto body = [&](std::size_t j) {
-      const auto& node = pairs[j].who.node;
-      return materials.bone_of(surface.sheet_of_node[node[0]], surface.sheet_of_node[node[3]]);
-    };
+    const double radius = settings_.merge_radius * pairs_[i].scale;
     const auto take = [&](std::size_t j) {
-      if (gone[j] || body(j) != body(i) || (pairs[j].middle - pairs[i].middle).squaredNorm() > radius * radius) return;
-      const Vector3d& force = pairs[j].at.force;
-      pairs[i].at.force += pairs[i].at.normal.dot(pairs[j].at.normal) > 0.0 ? force : Vector3d(-force);
+      if (gone[j] || bone_of(pairs_[j]) != bone_of(pairs_[i]) ||
+          (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
+        return;
+      const Vector3d& force = pairs_[j].at.force;
+      pairs_[i].at.force += pairs_[i].at.normal.dot(pairs_[j].at.normal) > 0.0 ? force : Vector3d(-force);
       gone[j] = 1;
     };
     const double reach = 1.01 * radius;
@@ -109,13 +112,8 @@ void merge(std::vector<Pair>& pairs, const Surface& surface, const ContactMateri
     for (std::size_t l = place[i] + 1; l < count && line[l].first - line[place[i]].first < reach; ++l)
       take(line[l].second);
   }
-  std::size_t kept = 0;
-  for (std::size_t i = 0; i < count; ++i) {
-    if (gone[i]) continue;
-    if (kept != i) pairs[kept] = pairs[i];
-    ++kept;
-  }
-  pairs.erase(pairs.begin() + static_cast<std::ptrdiff_t>(kept), pairs.end());
+  std::size_t i = 0;
+  std::erase_if(pairs_, [&](const Pair&) { return gone[i++] != 0; });
 }
 
 }  // namespace sim_core

@@ -1,7 +1,6 @@
 #include "contact/nearest.hpp"
 
 #include <algorithm>
-#include <cmath>
 #include <numeric>
 #include <utility>
 
@@ -10,7 +9,6 @@
 namespace sim_core {
 namespace {
 
-using Eigen::Array3d;
 using Eigen::Vector3d;
 
 // Triangles in a leaf. Results are the same for any number.
@@ -29,15 +27,12 @@ TriangleTree::TriangleTree(std::vector<std::array<int, 3>> triangles, const Buff
 
 int TriangleTree::build(int begin, int end, const std::vector<Vector3d>& middles) {
   const int own = static_cast<int>(boxes_.size());
-  boxes_.push_back({Array3d::Zero(), Array3d::Zero(), begin, end, 0});
+  boxes_.push_back({{}, begin, end, 0});
   if (end - begin <= leaf_max) return own;
-  Array3d low = middles[order_[begin]].array(), high = low;
-  for (int i = begin; i < end; ++i) {
-    low = low.min(middles[order_[i]].array());
-    high = high.max(middles[order_[i]].array());
-  }
+  Eigen::AlignedBox3d around;
+  for (int i = begin; i < end; ++i) around.extend(middles[order_[i]]);
   int axis = 0;
-  (high - low).maxCoeff(&axis);
+  around.diagonal().maxCoeff(&axis);
   const int middle = (begin + end) / 2;
   std::nth_element(order_.begin() + begin, order_.begin() + middle, order_.begin() + end, [&](int a, int b) {
     return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
@@ -54,16 +49,12 @@ void TriangleTree::fit(const Buffer<double>& x) {
   for (std::size_t b = boxes_.size(); b-- > 0;) {
     Box& box = boxes_[b];
     if (box.right != 0) {
-      box.low = boxes_[b + 1].low.min(boxes_[box.right].low);
-      box.high = boxes_[b + 1].high.max(boxes_[box.right].high);
+      box.around = boxes_[b + 1].around.merged(boxes_[box.right].around);
       continue;
     }
-    box.low = box.high = corners_[order_[box.begin]][0].array();
+    box.around.setEmpty();
     for (int i = box.begin; i < box.end; ++i) {
-      for (const Vector3d& corner : corners_[order_[i]]) {
-        box.low = box.low.min(corner.array());
-        box.high = box.high.max(corner.array());
-      }
+      for (const Vector3d& corner : corners_[order_[i]]) box.around.extend(corner);
     }
   }
 }
@@ -72,8 +63,8 @@ Nearest TriangleTree::nearest(const Vector3d& p, double reach, const std::functi
   Nearest out;
   double best = reach * reach;
   const auto away = [&](int b) {
-    const Box& box = boxes_[b];
-    return (box.low - p.array()).max(p.array() - box.high).max(0.0).matrix().squaredNorm();
+    const Eigen::AlignedBox3d& box = boxes_[b].around;
+    return (box.min() - p).cwiseMax(p - box.max()).cwiseMax(0.0).squaredNorm();
   };
   std::vector<std::pair<int, double>> open;
   if (!boxes_.empty()) open.push_back({0, away(0)});
@@ -96,7 +87,7 @@ Nearest TriangleTree::nearest(const Vector3d& p, double reach, const std::functi
       const double squared = (p - weights[0] * a - weights[1] * c - weights[2] * d).squaredNorm();
       if (squared < best || (squared == best && (out.triangle < 0 || t < out.triangle))) {
         best = squared;
-        out = {t, weights, std::sqrt(squared)};
+        out = {t, weights};
       }
     }
   }

@@ -1,7 +1,7 @@
 // The triangle that is nearest to a point, by a tree of boxes.
 #pragma once
 
-#include <Eigen/Core>
+#include <Eigen/Geometry>
 #include <array>
 #include <functional>
 #include <vector>
@@ -13,7 +13,6 @@ namespace sim_core {
 struct Nearest {
   int triangle = -1;        // none is within reach
   Eigen::Vector3d weights;  // barycentric, of its closest point
-  double distance = 0.0;    // m
 };
 
 class TriangleTree {
@@ -27,7 +26,7 @@ class TriangleTree {
 
  private:
   struct Box {
-    Eigen::Array3d low, high;
+    Eigen::AlignedBox3d around;
     int begin, end;  // of order_
     int right;       // the second child; the first follows its parent. 0: a leaf
   };

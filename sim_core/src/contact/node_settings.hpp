@@ -1,6 +1,8 @@
 // Constants of contact of nodes with bodies.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct NodeSettings {
@@ -13,10 +15,7 @@ struct NodeSettings {
   // less in a crumple between walls on a floor.
   double body_first = 1e-3;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("penalty", s.penalty), call("body_first", s.body_first);
-  }
+  SIM_CORE_NAMED(penalty, body_first)
 };
 
 }  // namespace sim_core

@@ -1,22 +1,18 @@
 #include "contact/path.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
-#include <limits>
 #include <utility>
 
 namespace sim_core {
 namespace {
 
-using Eigen::Array3d;
+using Eigen::AlignedBox3d;
 
-std::pair<Array3d, Array3d> box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
-  Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
-  for (int i : surface.vertices) {
-    const Array3d way = (at_node(to, i) - at_node(from, i)).array();
-    low = low.min(way);
-    high = high.max(way);
-  }
-  return {low, high};
+AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
+  AlignedBox3d out;
+  for (int i : surface.vertices) out.extend(at_node(to, i) - at_node(from, i));
+  return out;
 }
 
 // No distance of a point of the first from one of the second changes by more, if nodes go `ways`.
@@ -55,21 +51,18 @@ Leaves Neighbourhood::leaves(const Candidate& pair) const {
 
 // Half of the diagonal of the box of the motions, which bounds them but for a common one.
 double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const {
-  const auto [low, high] = box_of_ways(surface, from, to);
-  return 0.5 * (high - low).matrix().norm();
+  return 0.5 * box_of_ways(surface, from, to).diagonal().norm();
 }
 
 // The same if each node goes to one of two places, or between them.
 double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const {
-  const auto [low, high] = box_of_ways(surface, from, to);
-  const auto [low_or, high_or] = box_of_ways(surface, from, or_to);
-  return 0.5 * (high.max(high_or) - low.min(low_or)).matrix().norm();
+  return 0.5 * box_of_ways(surface, from, to).merged(box_of_ways(surface, from, or_to)).diagonal().norm();
 }
 
 Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<double>& to,
                                        std::vector<double>& ways) const {
-  const auto [low, high] = box_of_ways(surface, from, to);
-  const Eigen::Vector3d common = 0.5 * (low + high).matrix();
+  const AlignedBox3d box = box_of_ways(surface, from, to);
+  const Eigen::Vector3d common = 0.5 * (box.min() + box.max());
   for (int i : surface.vertices) ways[i] = (at_node(to, i) - at_node(from, i) - common).norm();
   return common;
 }
@@ -77,7 +70,6 @@ Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<
 void Neighbourhood::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
   pairs_ = candidates(surface, x, thickness + 2.0 * margin_, farther_);
-  ++rebuilds;
 }
 
 std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {

@@ -34,7 +34,6 @@ class Neighbourhood {
   double common_share(const Buffer<double>& from, const Buffer<double>& to);
 
   double margin() const { return margin_; }
-  int rebuilds = 0;
 
   // What bounds all ways from there, but for a common one, m.
   double moved(const Buffer<double>& from, const Buffer<double>& to) const;

@@ -1,6 +1,8 @@
 // Constants of motion without crossings.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct PathSettings {
@@ -19,11 +21,7 @@ struct PathSettings {
   // Rounds in which nodes are stopped one by one; after them all are stopped by the same share. Sweep: nothing changes.
   int rounds_max = 8;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("keep", s.keep), call("floor", s.floor), call("rest", s.rest), call("margin", s.margin),
-        call("rounds_max", s.rounds_max);
-  }
+  SIM_CORE_NAMED(keep, floor, rest, margin, rounds_max)
 };
 
 }  // namespace sim_core

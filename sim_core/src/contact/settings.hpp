@@ -6,6 +6,8 @@
 // constants.json): percentages are iterations of Newton's method.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct ContactSettings {
@@ -72,18 +74,9 @@ struct ContactSettings {
   // in a pile and a fold.
   double turn_max = 0.05;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("law_stiffness", s.law_stiffness), call("proximal", s.proximal), call("smooth_proximal", s.smooth_proximal),
-        call("mean_share", s.mean_share), call("stiff_mean_share", s.stiff_mean_share),
-        call("closing_gap", s.closing_gap), call("crossing_least", s.crossing_least), call("end_share", s.end_share),
-        call("match_cosine", s.match_cosine), call("stall_ratio", s.stall_ratio),
-        call("length_tolerance", s.length_tolerance), call("stall_up_to", s.stall_up_to),
-        call("penalty_growth", s.penalty_growth), call("penalty_max", s.penalty_max),
-        call("merge_radius", s.merge_radius), call("transfer_radius", s.transfer_radius),
-        call("detection_range", s.detection_range), call("surface_share", s.surface_share),
-        call("turn_max", s.turn_max);
-  }
+  SIM_CORE_NAMED(law_stiffness, proximal, smooth_proximal, mean_share, stiff_mean_share, closing_gap, crossing_least,
+                 end_share, match_cosine, stall_ratio, length_tolerance, stall_up_to, penalty_growth, penalty_max,
+                 merge_radius, transfer_radius, detection_range, surface_share, turn_max)
 };
 
 }  // namespace sim_core

@@ -1,6 +1,8 @@
 // Constants of skeletons.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct SkeletonSettings {
@@ -13,10 +15,7 @@ struct SkeletonSettings {
   // Distance over the diameter of the cloth at rest by which an endless body reaches beyond the cloth.
   double beyond = 2.0;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("radius_max", s.radius_max), call("thickness_max", s.thickness_max), call("beyond", s.beyond);
-  }
+  SIM_CORE_NAMED(radius_max, thickness_max, beyond)
 };
 
 }  // namespace sim_core

@@ -1,7 +1,7 @@
 #include "contact/smooth.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
-#include <limits>
 #include <utility>
 
 #include "cloth/problem.hpp"
@@ -9,7 +9,6 @@
 namespace sim_core {
 namespace {
 
-using Eigen::Array3d;
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
@@ -66,16 +65,12 @@ void SmoothContact::take_shapes(const Buffer<double>& start, const Buffer<double
 void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess) {
   take_shapes(start, ends);
   // The largest of the box of motions of surfaces: middle and half diagonal.
-  Array3d low = Array3d::Constant(std::numeric_limits<double>::infinity()), high = -low;
+  Eigen::AlignedBox3d ways;
   for (const auto& corners : patches_.triangles()) {
-    for (int node : corners) {
-      const Array3d way = (at_node(ends, node) - at_node(start, node)).array();
-      low = low.min(way);
-      high = high.max(way);
-    }
+    for (int node : corners) ways.extend(at_node(ends, node) - at_node(start, node));
   }
-  const Vector3d common = 0.5 * (low + high).matrix();
-  const double spread = 0.5 * (high - low).matrix().norm();
+  const Vector3d common = 0.5 * (ways.min() + ways.max());
+  const double spread = 0.5 * ways.diagonal().norm();
   const double thickness = *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
   track_ = kept_;
   for (int i = 0; i < free_nodes_; ++i) {

@@ -1,6 +1,8 @@
 // Constants of contact with smooth surfaces.
 #pragma once
 
+#include "math/named.hpp"
+
 namespace sim_core {
 
 struct SmoothSettings {
@@ -22,11 +24,7 @@ struct SmoothSettings {
   // of curvature. Sweep: nothing changes.
   double fold_over = 0.1;
 
-  template <class Self, class Call>
-  static void each(Self& s, const Call& call) {
-    call("reach", s.reach), call("curvature_max", s.curvature_max), call("same_normal", s.same_normal),
-        call("beyond_edge", s.beyond_edge), call("between", s.between), call("fold_over", s.fold_over);
-  }
+  SIM_CORE_NAMED(reach, curvature_max, same_normal, beyond_edge, between, fold_over)
 };
 
 }  // namespace sim_core

@@ -38,17 +38,13 @@ struct CacheAligned {
 template <class T>
 using Buffer = std::vector<T, CacheAligned<T>>;
 
-inline Eigen::Map<Eigen::Vector3d> at_node(Buffer<double>& buffer, int node) {
-  return Eigen::Map<Eigen::Vector3d>(&buffer[4L * node]);
+template <class T>
+Eigen::Map<Eigen::Matrix<T, 3, 1>> at_node(Buffer<T>& buffer, int node) {
+  return Eigen::Map<Eigen::Matrix<T, 3, 1>>(&buffer[4L * node]);
 }
-inline Eigen::Map<const Eigen::Vector3d> at_node(const Buffer<double>& buffer, int node) {
-  return Eigen::Map<const Eigen::Vector3d>(&buffer[4L * node]);
-}
-inline Eigen::Map<Eigen::Vector3f> at_node(Buffer<float>& buffer, int node) {
-  return Eigen::Map<Eigen::Vector3f>(&buffer[4L * node]);
-}
-inline Eigen::Map<const Eigen::Vector3f> at_node(const Buffer<float>& buffer, int node) {
-  return Eigen::Map<const Eigen::Vector3f>(&buffer[4L * node]);
+template <class T>
+Eigen::Map<const Eigen::Matrix<T, 3, 1>> at_node(const Buffer<T>& buffer, int node) {
+  return Eigen::Map<const Eigen::Matrix<T, 3, 1>>(&buffer[4L * node]);
 }
 
 }  // namespace sim_core

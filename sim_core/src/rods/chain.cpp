@@ -42,24 +42,40 @@ void check_rows(const char* name, Eigen::Index rows, Eigen::Index asked) {
   }
 }
 
-}  // namespace
-
-ChainEquilibrium relax_chain(const RodChain& chain, const Rows4& quaternions) {
-  const int n = static_cast<int>(chain.natural.rows());
-  check_rows("quaternions", quaternions.rows(), n + 1);
-  // A chain reads the middles of its elements only: every second value of the grid.
-  std::vector<Vec3<T>> natural(2 * n + 1, Vec3<T>{T(0.0), T(0.0), T(0.0)});
-  for (int i = 0; i < n; ++i) natural[2 * i + 1] = lanes(chain.natural.row(i));
-  Level<1> level{n, std::vector<Quat<T>>(n + 1), std::vector<Vec3<T>>(n + 1)};
+// `again`: from the equilibrium, too. The certificate is that of the frames before the last step.
+template <class AnyRod>
+std::pair<Rows4, bool> relaxed(const AnyRod& rod, const Rows4& quaternions, bool again) {
+  const int n = static_cast<int>(quaternions.rows()) - 1;
+  Level<1> level{n, std::vector<Quat<T>>(n + 1), {}};
   for (int i = 0; i <= n; ++i) level.frame[i] = frame(quaternions, i);
-  const GeneralRod<T> rod{chain.gamma, lanes(chain.stiffness), level.frame[0], 2 * n, natural.data(), nullptr, nullptr,
-                          nullptr};
   NewtonWorkspace<1> work(n);
   minimise(rod, level, work, chain_tolerance);
-  balance(rod, level);
-  ChainEquilibrium result{Rows4(n + 1, 4), level.energy.v[0], level.converged.v[0] != 0, level.stable.v[0] != 0};
-  for (int i = 0; i <= n; ++i) set_frame(result.quaternions, i, level.frame[i]);
-  return result;
+  if (again && level.converged.v[0] != 0) minimise(rod, level, work, chain_tolerance);
+  Rows4 found(n + 1, 4);
+  for (int i = 0; i <= n; ++i) set_frame(found, i, level.frame[i]);
+  return {found, level.stable.v[0] != 0};
+}
+
+}  // namespace
+
+std::pair<Rows4, bool> relax_rod(double gamma, double phi0, double phi1, double twist_stiffness,
+                                 const Rows4& quaternions) {
+  if (quaternions.rows() < 2) {
+    throw std::invalid_argument("quaternions: must have at least 2 rows, got " + std::to_string(quaternions.rows()));
+  }
+  return relaxed(Rod<T>{gamma, phi0, phi1, twist_stiffness}, quaternions, true);
+}
+
+std::pair<Rows4, bool> relax_chain(double gamma, const Eigen::Vector3d& stiffness, const Rows3& natural,
+                                   const Rows4& quaternions) {
+  const int n = static_cast<int>(natural.rows());
+  check_rows("quaternions", quaternions.rows(), n + 1);
+  // A chain reads the middles of its elements only: every second value of the grid.
+  std::vector<Vec3<T>> grid(2 * n + 1, Vec3<T>{T(0.0), T(0.0), T(0.0)});
+  for (int i = 0; i < n; ++i) grid[2 * i + 1] = lanes(natural.row(i));
+  const GeneralRod<T> rod{gamma,   lanes(stiffness), frame(quaternions, 0), 2 * n, grid.data(), nullptr,
+                          nullptr, nullptr};
+  return relaxed(rod, quaternions, false);
 }
 
 Rows4 chain_frames(const Rows3& curvature, const Eigen::Vector4d& clamp) {
@@ -86,8 +102,9 @@ Rows3 chain_centerline(const Rows4& quaternions) {
   return r;
 }
 
-RowMajor chain_jacobian(const RodChain& chain, const Rows4& quaternions, const RowMajor& basis, int stride) {
-  const int n = static_cast<int>(chain.natural.rows());
+RowMajor chain_jacobian(double gamma, const Eigen::Vector3d& stiffness, const Rows3& natural, const Rows4& quaternions,
+                        const RowMajor& basis, int stride) {
+  const int n = static_cast<int>(natural.rows());
   check_rows("quaternions", quaternions.rows(), n + 1);
   check_rows("basis", basis.rows(), n);
   const Eigen::Index columns = 1 + 3 * basis.cols();
@@ -96,20 +113,20 @@ RowMajor chain_jacobian(const RodChain& chain, const Rows4& quaternions, const R
   RowMajor turn = RowMajor::Zero(3 * (n + 1), columns);  // -dg/dp, then omega'; the clamp's rows are dropped
   for (int i = 0; i < n; ++i) {
     const Quat<T> a = frame(quaternions, i), b = frame(quaternions, i + 1);
-    const GeneralSection<T> here{lanes(chain.natural.row(i)), lanes(chain.stiffness), {}};
+    const GeneralSection<T> here{lanes(natural.row(i)), lanes(stiffness), {}};
     const auto moment = element_moment(here, a, b, T(h), T(double(n)));
     const Element<T> e = element(here, moment, T(double(n)));
     const Vec3<T> t = direction1(a);
     const T load((1.0 - i * h) * h);
     const Eigen::Matrix3d S = dense(e.stiffness);
-    diagonal[i] += S + dense(weight_stiffness(T(chain.gamma) * load, t));
+    diagonal[i] += S + dense(weight_stiffness(T(gamma) * load, t));
     diagonal[i + 1] += S;
     upper[i] = -S + 0.5 * cross_matrix(dense(e.force));
     turn.block<3, 1>(3 * i, 0) -= dense(weight_torque(load, t));
     // f = J^T R K (theta / h - kappa_bar): its derivative by component c is -K_c J^T d_c.
     const Vec3<T> directions[3] = {direction1(b), direction2(b), direction3(b)};
     for (int c = 0; c < 3; ++c) {
-      const Eigen::Vector3d f = chain.stiffness[c] * dense(jacobian_transposed(moment.log, directions[c]));
+      const Eigen::Vector3d f = stiffness[c] * dense(jacobian_transposed(moment.log, directions[c]));
       const auto part = f * basis.row(i);
       turn.block(3 * i, 1 + c * basis.cols(), 3, basis.cols()) -= part;
       turn.block(3 * i + 3, 1 + c * basis.cols(), 3, basis.cols()) += part;

@@ -1,11 +1,14 @@
-// One chain of a general rod on its own, for fits: equilibrium from given frames, nodal positions, and their exact
-// derivatives by weight and natural curvature.
+// One chain of a rod on its own, for protocols and fits: equilibrium from given frames, nodal positions, and
+// derivatives.
 //
 // At equilibrium g(omega, p) = 0, so that omega' = -H^{-1} dg/dp with the Hessian that Newton's method factors anyway.
 // A fit has more residuals (3 per point) than parameters, so these forward sensitivities are cheaper than adjoints.
+//
+// Quaternions are (N + 1, 4), rows (w, x, y, z), unit, without jumps of sign; the first, the clamp, stays.
 #pragma once
 
 #include <Eigen/Core>
+#include <utility>
 
 namespace sim_core {
 
@@ -13,20 +16,14 @@ using Rows3 = Eigen::Matrix<double, -1, 3, Eigen::RowMajor>;
 using Rows4 = Eigen::Matrix<double, -1, 4, Eigen::RowMajor>;
 using RowMajor = Eigen::Matrix<double, -1, -1, Eigen::RowMajor>;
 
-struct RodChain {
-  double gamma;               // rho A g L^3 / EI
-  Eigen::Vector3d stiffness;  // EI
-  Rows3 natural;              // (N, 3): natural curvature at the middle of each element, 1/L
-};
-
-struct ChainEquilibrium {
-  Rows4 quaternions;  // (N + 1, 4)
-  double energy;      // EI/L
-  bool converged, stable;
-};
-
-// Minimise from `quaternions`: (N + 1, 4), rows (w, x, y, z), unit, without jumps of sign; the clamp first.
-ChainEquilibrium relax_chain(const RodChain& chain, const Rows4& quaternions);
+// The equilibrium next to `quaternions`, and whether it is one with a positive definite Hessian. relax_rod: of a
+// uniform round rod, whose certificate is that of the frames it returns. relax_chain: with the natural curvature (N, 3)
+// in the middle of each element [1/L] and the stiffness K [EI]; its certificate is that of the frames before the last
+// step.
+std::pair<Rows4, bool> relax_rod(double gamma, double phi0, double phi1, double twist_stiffness,
+                                 const Rows4& quaternions);
+std::pair<Rows4, bool> relax_chain(double gamma, const Eigen::Vector3d& stiffness, const Rows3& natural,
+                                   const Rows4& quaternions);
 
 // Frames of the chain with this curvature in its elements: (N + 1, 4) from (N, 3).
 Rows4 chain_frames(const Rows3& curvature, const Eigen::Vector4d& clamp);
@@ -37,6 +34,7 @@ Rows3 chain_centerline(const Rows4& quaternions);
 // Derivatives of the positions of every `stride`-th node: (3 (N / stride + 1), 1 + 3 B), rows point-major. Column 0 is
 // by gamma; column 1 + c B + b by the coefficient b of component c of the natural curvature, whose values in the
 // elements are basis (N, B) times the coefficients. The chain must be at a stable equilibrium.
-RowMajor chain_jacobian(const RodChain& chain, const Rows4& quaternions, const RowMajor& basis, int stride);
+RowMajor chain_jacobian(double gamma, const Eigen::Vector3d& stiffness, const Rows3& natural, const Rows4& quaternions,
+                        const RowMajor& basis, int stride);
 
 }  // namespace sim_core

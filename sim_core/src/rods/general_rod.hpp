@@ -1,5 +1,5 @@
 // A rod whose natural curvature varies along it, with three stiffnesses and any clamp: the functions of a rod and its
-// sections that rod_energy.hpp and rod_levels.hpp ask for.
+// sections that energy.hpp and levels.hpp ask for.
 //
 //   E = \int_0^1 1/2 (kappa - kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds,  K = diag(K0, K1,
 //   K2)
@@ -9,7 +9,6 @@
 
 #include <vector>
 
-#include "rods/general_rods.hpp"
 #include "rods/levels.hpp"
 
 namespace sim_core {

@@ -182,5 +182,10 @@ void solve_range(const Batch& batch, const RodSettings& settings, const std::vec
   }
 }
 
+template <int W>
+constexpr RodKernels kernels_of(const char* name) {
+  return {name, solve_range<W, RodReader>, solve_range<W, GeneralRodReader>};
+}
+
 }  // namespace
 }  // namespace sim_core

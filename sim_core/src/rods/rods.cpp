@@ -6,8 +6,6 @@
 #include <stdexcept>
 #include <string>
 
-#include "rods/kernels.hpp"
-
 namespace sim_core {
 namespace {
 
@@ -15,25 +13,23 @@ constexpr int start_elements_min = 24;
 
 }  // namespace
 
-std::vector<RodKernelChoice> rod_kernels() {
-  std::vector<RodKernelChoice> kernels{{"scalar", solve_rods_scalar, solve_general_rods_scalar, true},
-                                       {"baseline", solve_rods_baseline, solve_general_rods_baseline, true}};
+std::vector<RodKernels> rod_kernels() {
+  std::vector<RodKernels> kernels{rods_scalar, rods_baseline};
 #ifdef SIM_CORE_X86_64_KERNELS
   __builtin_cpu_init();
-  kernels.push_back(
-      {"x86-64-v3", solve_rods_x86_64_v3, solve_general_rods_x86_64_v3, __builtin_cpu_supports("x86-64-v3") != 0});
-  kernels.push_back(
-      {"x86-64-v4", solve_rods_x86_64_v4, solve_general_rods_x86_64_v4, __builtin_cpu_supports("x86-64-v4") != 0});
+  if (__builtin_cpu_supports("x86-64-v3")) kernels.push_back(rods_x86_64_v3);
+  if (__builtin_cpu_supports("x86-64-v4")) kernels.push_back(rods_x86_64_v4);
 #endif
   return kernels;
 }
 
-RodKernelChoice best_rod_kernel() {
-  RodKernelChoice best{};
-  for (const RodKernelChoice& kernel : rod_kernels()) {
-    if (kernel.supported) best = kernel;
+RodKernels rod_kernels_named(const std::string& name) {
+  const std::vector<RodKernels> all = rod_kernels();
+  if (name.empty()) return all.back();
+  for (const RodKernels& kernels : all) {
+    if (kernels.name == name) return kernels;
   }
-  return best;
+  throw std::invalid_argument("kernel: must be one that this build has and this processor runs, got '" + name + "'");
 }
 
 int default_start_level(int elements) {

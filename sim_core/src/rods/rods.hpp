@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <string>
 #include <vector>
 
 namespace sim_core {
@@ -19,7 +20,7 @@ struct SamplePoint {
   double weight[6];  // of y, y', y'' at node, then at node + 1
 };
 
-// What is computed of n rods, row-major; see rods.py for the conventions.
+// What is computed of n rods, row-major; see solve.py for the conventions.
 struct RodOutput {
   double* centerline;        // (n, points, 3), L
   double* curvature;         // (n, points, 3), 1/L
@@ -37,26 +38,37 @@ struct RodBatch {
   RodOutput output;
 };
 
-// A solver of the rods [begin, end) of a batch.
-using RodKernel = void (*)(const RodBatch&, const RodSettings&, const std::vector<SamplePoint>&, std::int64_t begin,
-                           std::int64_t end);
-
-struct GeneralRodBatch;  // general_rods.hpp
-using GeneralRodKernel = void (*)(const GeneralRodBatch&, const RodSettings&, const std::vector<SamplePoint>&,
-                                  std::int64_t begin, std::int64_t end);
-
-// A kernel compiled for one instruction set. All of them return the same bits.
-struct RodKernelChoice {
-  const char* name;
-  RodKernel solve;
-  GeneralRodKernel solve_general;
-  bool supported;  // by this processor
+// n rods of varying natural curvature; N = elements of the finest level, P = output points. See general.py.
+struct GeneralRodBatch {
+  const double* gamma;              // (n)
+  const double* stiffness;          // (n, 3), EI
+  const double* clamp;              // (n, 4): unit quaternions (w, x, y, z)
+  const double* natural;            // (n, 2 N + 1, 3), 1/L: natural curvature at uniform arc length
+  const double* start;              // (n, 2 N + 1, 3), 1/L: curvature of the shape that the search starts from
+  const double* slope;              // (n, N / 2 + 1, 3), 1/L^2: derivative of the natural curvature
+  const double* natural_at_points;  // (n, P, 3), 1/L
+  RodOutput output;
 };
 
-// Narrowest first; the last supported one is the one to use.
-std::vector<RodKernelChoice> rod_kernels();
+// Solves the rods [begin, end) of a batch.
+template <class Batch>
+using RodKernel = void (*)(const Batch&, const RodSettings&, const std::vector<SamplePoint>&, std::int64_t begin,
+                           std::int64_t end);
 
-RodKernelChoice best_rod_kernel();
+// What is compiled for one instruction set: kernel.hpp is the code of all of them, and all return the same bits. They
+// are constants, so that no code for wider vectors runs where they are listed.
+struct RodKernels {
+  const char* name;
+  RodKernel<RodBatch> solve;
+  RodKernel<GeneralRodBatch> solve_general;
+};
+extern const RodKernels rods_scalar, rods_baseline, rods_x86_64_v3, rods_x86_64_v4;
+
+// Those that this processor runs, narrowest first.
+std::vector<RodKernels> rod_kernels();
+
+// That of this name, or, where it is empty, the widest. Throws std::invalid_argument, naming `kernel`.
+RodKernels rod_kernels_named(const std::string& name);
 
 // The coarsest level on which the search from the natural shape is reliable. Measured over gamma 100 ... 1300,
 // phi0 0.2 ... 12, phi1 6 ... 20: 16 elements fail in 0.4 % of the rods, 24 in none.

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import _sim_core as core
+from stickslip_sim_core import _testing as core
 from stickslip_sim_core import self_intersections
 from stickslip_sim_core.cloth import meshes
 

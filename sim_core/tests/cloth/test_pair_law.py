@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import _sim_core as core
+from stickslip_sim_core import _testing as core
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stickslip_testing.spheres import icosphere
 
 from stickslip_sim_core import Cloth, Surface, isotropic, plane, preset_named, self_intersections, sphere
-from stickslip_sim_core import _sim_core as core
+from stickslip_sim_core import _testing as core
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import CREASE, THICKNESS
 from stickslip_sim_core.cloth.solver import GRAVITY

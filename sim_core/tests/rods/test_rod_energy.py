@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stickslip_sim_core import _sim_core
+from stickslip_sim_core import _testing
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def derivatives(
     """Energy, gradient and Hessian with nodes 1 ... N turned by omega, shape (3 N,), in world axes."""
     turns = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), omega.reshape(-1, 3)]))
     gamma, phi0, phi1, C = rod
-    return _sim_core.rod_derivatives(gamma, phi0, phi1, C, continuous_quaternions(turns * frames))
+    return _testing.rod_derivatives(gamma, phi0, phi1, C, continuous_quaternions(turns * frames))
 
 
 ROD = (700.0, 3.0, 12.0, 2.0 / 3.0)  # gamma, phi0, phi1, C
@@ -82,7 +82,7 @@ def test_hessian_is_symmetric_and_banded() -> None:
 def test_natural_shape_has_no_elastic_energy() -> None:
     n = 20
     natural = CLAMP * Rotation.from_rotvec(np.linspace(0, 1, n + 1)[:, None] * np.array([3.0, 0.0, 12.0]))
-    energy, gradient, _ = _sim_core.rod_derivatives(0.0, 3.0, 12.0, 2.0 / 3.0, continuous_quaternions(natural))
+    energy, gradient, _ = _testing.rod_derivatives(0.0, 3.0, 12.0, 2.0 / 3.0, continuous_quaternions(natural))
     assert energy == pytest.approx(0.0, abs=1e-26)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-12)
 
@@ -90,5 +90,5 @@ def test_natural_shape_has_no_elastic_energy() -> None:
 def test_weight_of_a_straight_rod() -> None:
     n = 10
     straight = np.tile([0.5, 0.5, 0.5, -0.5], (n + 1, 1))
-    energy, _, _ = _sim_core.rod_derivatives(100.0, 0.0, 0.0, 1.0, straight)
+    energy, _, _ = _testing.rod_derivatives(100.0, 0.0, 0.0, 1.0, straight)
     assert energy == pytest.approx(-50.0)  # gamma times the height -1/2 of its middle

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import MU_MAX
@@ -145,26 +145,3 @@ class Surface:
         if not np.isfinite(found).all():
             raise ValueError(f"positions: must be finite, and are not at {time:g} s")
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class PairForces:
-    """Forces of cloth on cloth, surfaces and the skeletons of bodies, at P pairs of closest points."""
-
-    vertices: NDArray[np.int32]
-    """(P, 4); those of surfaces and then of skeletons come after those of the cloth."""
-
-    weights: Floats
-    """(P, 4): the force acts on each vertex by its weight."""
-
-    forces: Floats
-    """(P, 3) [N]"""
-
-    distance: Floats
-    """(P,) [m]"""
-
-    sliding: NDArray[np.bool_]
-    """(P,)"""
-
-    body: NDArray[np.int32]
-    """(P,): number of the body, or -1."""

@@ -7,10 +7,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, Observed, StepReport, check_mesh, cloth_kernels, sheet_count
+from stickslip_sim_core._sim_core import (
+    ClothSolver,
+    Observed,
+    PairForces,
+    StepReport,
+    check_mesh,
+    cloth_kernels,
+    sheet_count,
+)
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import Body, BodyTuple
-from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, PairForces, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
@@ -199,10 +207,7 @@ class Cloth:
     def pair_forces(self) -> PairForces:
         """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of surfaces, at the end of
         the last step."""
-        vertices, weights, forces, distance, sliding, body = self._solver.pair_forces()
-        return PairForces(
-            vertices, weights, forces, distance, np.asarray(sliding, dtype=bool), np.asarray(body, dtype=np.int32)
-        )
+        return self._solver.pair_forces()
 
     @property
     def surface_forces(self) -> list[Floats]:

@@ -41,8 +41,7 @@ def round_rod(phi: float, poisson: float) -> Relax:
     """Relax chains of a round rod with natural bend phi / L by the rod solver's Newton method."""
 
     def relax(gamma: float, frames: Floats) -> Equilibrium:
-        at_rest, _, stable, *_ = _sim_core.relax_rod(gamma, 0.0, phi, 1.0 / (1.0 + poisson), frames)
-        return Equilibrium(gamma, at_rest, stable)
+        return Equilibrium(gamma, *_sim_core.relax_rod(gamma, 0.0, phi, 1.0 / (1.0 + poisson), frames))
 
     return relax
 
@@ -241,7 +240,6 @@ def strip_chain(twist_stiffness: float, stiffness_ratio: float, elements: int) -
     straight = np.zeros((elements, 3))
 
     def relax(gamma: float, frames: Floats) -> Equilibrium:
-        at_rest, _, _, stable = _sim_core.relax_chain(gamma, stiffness, straight, frames)
-        return Equilibrium(gamma, at_rest, stable)
+        return Equilibrium(gamma, *_sim_core.relax_chain(gamma, stiffness, straight, frames))
 
     return relax

@@ -2,7 +2,7 @@
 
 Both move the natural rod until the *hung* rod, as the forward solver finds it, meets the centreline. The model is exact
 in its derivatives: two chains whose nodes include the P points, extrapolated (4 r_h - r_2h) / 3 with an error O(h^4),
-each differentiated through its equilibrium (rod_chain.hpp).
+each differentiated through its equilibrium (rods/chain.hpp).
 """
 
 from dataclasses import dataclass
@@ -256,7 +256,7 @@ class _Model:
         """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
         hung, curves = [], []
         for k, basis, start in zip(self.strides, self.bases, frames, strict=True):
-            q, _, _, stable = _sim_core.relax_chain(gamma, self.stiffness, basis @ coefficients, start)
+            q, stable = _sim_core.relax_chain(gamma, self.stiffness, basis @ coefficients, start)
             if not stable:
                 return None
             hung.append(q)

@@ -1,17 +1,16 @@
 #include "cloth/kernels/choice.hpp"
 
-#include "cloth/kernels/levels.hpp"
 #include "cloth/refusal.hpp"
 
 namespace sim_core {
 namespace {
 
 std::vector<ClothKernel> runnable() {
-  std::vector<ClothKernel> out{cloth_kernel_baseline()};
+  std::vector<ClothKernel> out{cloth_baseline};
 #ifdef SIM_CORE_X86_64_KERNELS
   __builtin_cpu_init();
-  if (__builtin_cpu_supports("x86-64-v3")) out.push_back(cloth_kernel_x86_64_v3());
-  if (__builtin_cpu_supports("x86-64-v4")) out.push_back(cloth_kernel_x86_64_v4());
+  if (__builtin_cpu_supports("x86-64-v3")) out.push_back(cloth_x86_64_v3);
+  if (__builtin_cpu_supports("x86-64-v4")) out.push_back(cloth_x86_64_v4);
 #endif
   return out;
 }

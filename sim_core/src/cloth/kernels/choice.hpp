@@ -1,4 +1,4 @@
-// One entry per instruction set that the cloth kernels are compiled for; kernel.hpp is the code of all of them.
+// Which kernels of the cloth run.
 #pragma once
 
 #include <string>

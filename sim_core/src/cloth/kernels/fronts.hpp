@@ -82,7 +82,7 @@ inline void add_update(const Factor& factor, int child, const FrontSize& size, b
   }
 }
 
-void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagonal& diagonal) {
+void factor(const Factor& factor, const ClothMatrix& matrix, const float* added) {
   const FlushTiny flush;
   for (int front = 0; front < factor.fronts; ++front) {
     if (!factor.due[front]) continue;
@@ -93,7 +93,7 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const FactorDiagona
     __builtin_memset(panel, 0, sizeof(float) * size.ld * size.columns);
     const int pivot0 = factor.pivot_begin[front];
     for (int i = 0; i < size.pivots; ++i) {
-      const float* own = diagonal.added + 6L * (pivot0 + i);
+      const float* own = added + 6L * (pivot0 + i);
       const float mass = matrix.diagonal[pivot0 + i];
       float* at = panel + 3L * i * size.ld + 3L * i;
       at[0] += own[0] + mass;

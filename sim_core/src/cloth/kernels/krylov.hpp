@@ -29,8 +29,8 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
 }
 
 // Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `work`: 2 krylov_max + 1 vectors.
-KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b,
-                    float* x, float* work, int iterations, double tolerance) {
+int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b, float* x,
+           float* work, int iterations, double tolerance) {
   const FlushTiny flush;
   const long count = 4L * matrix.nodes;
   float* basis = work;
@@ -40,7 +40,7 @@ KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const Conta
   for (long i = 0; i < count; ++i) basis[i] = b[i];
   admit(contact, matrix.nodes, basis);
   const double size = __builtin_sqrt(product(basis, basis, count));
-  if (!(size > 0.0)) return {0, 0.0};
+  if (!(size > 0.0)) return 0;
   for (long i = 0; i < count; ++i) basis[i] = float(basis[i] / size);
   g[0] = size;
   if (iterations > krylov_max) iterations = krylov_max;
@@ -82,7 +82,7 @@ KrylovResult krylov(const ClothMatrix& matrix, const Factor& factor, const Conta
     y[i] /= h[i][i];
   }
   for (int j = 0; j < k; ++j) add_multiple(x, float(y[j]), images + j * count, count);
-  return {k, __builtin_fabs(g[k]) / size};
+  return k;
 }
 
 }  // namespace

@@ -75,6 +75,15 @@ inline void backward(const float* tile, float* y, int below) {
   for (int q = 0; q < width; ++q) y[q] = sum_of(sum[q]);
 }
 
+// Calls with the width of a block, that of one to four nodes, as a constant.
+template <class Call>
+inline void with_width(int width, const Call& call) {
+  if (width == 12) return call.template operator()<12>();
+  if (width == 9) return call.template operator()<9>();
+  if (width == 6) return call.template operator()<6>();
+  call.template operator()<3>();
+}
+
 // In the factor's own order of nodes.
 void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
   if (x != b) __builtin_memcpy(x, b, 16L * nodes);
@@ -92,20 +101,7 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
     for (int j = 0; j < size.columns; j += tile_columns) {
       const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
       const int below = height - j - width;
-      switch (width) {
-        case 3:
-          forward<3>(tile, y + j, below);
-          break;
-        case 6:
-          forward<6>(tile, y + j, below);
-          break;
-        case 9:
-          forward<9>(tile, y + j, below);
-          break;
-        default:
-          forward<12>(tile, y + j, below);
-          break;
-      }
+      with_width(width, [&]<int w>() { forward<w>(tile, y + j, below); });
       tile += tile_floats(width, below);
     }
     for (int i = 0; i < size.pivots; ++i) {
@@ -134,20 +130,7 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
       const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
       const int below = height - j - width;
       tile -= tile_floats(width, below);
-      switch (width) {
-        case 3:
-          backward<3>(tile, y + j, below);
-          break;
-        case 6:
-          backward<6>(tile, y + j, below);
-          break;
-        case 9:
-          backward<9>(tile, y + j, below);
-          break;
-        default:
-          backward<12>(tile, y + j, below);
-          break;
-      }
+      with_width(width, [&]<int w>() { backward<w>(tile, y + j, below); });
     }
     for (int i = 0; i < size.pivots; ++i) {
       for (int c = 0; c < 3; ++c) own[4 * i + c] = y[3 * i + c];

@@ -1,6 +1,6 @@
-#include "bindings/contact.hpp"
-
+// What tests ask of the core that nobody else does: geometry and law of contact, and the derivatives of a rod's energy.
 #include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -14,12 +14,13 @@
 #include "contact/pair_law.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
-
-namespace sim_core {
+#include "math/lanes.hpp"
+#include "rods/energy.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
+namespace sim_core {
 namespace {
 
 using Four = Eigen::Matrix<double, 4, 3, Eigen::RowMajor>;
@@ -46,18 +47,75 @@ Buffer<double> buffer_of(const Points3& x) {
   return out;
 }
 
-}  // namespace
+using T = Lanes<1>;
+using Rows4 = Eigen::Matrix<double, -1, 4, Eigen::RowMajor>;
 
-void bind_contact(nb::module_& m) {
+Eigen::Vector3d dense(Vec3<T> a) { return {a.x.v[0], a.y.v[0], a.z.v[0]}; }
+
+Eigen::Matrix3d dense(Sym3<T> a) {
+  Eigen::Matrix3d m;
+  m << a.xx.v[0], a.xy.v[0], a.xz.v[0], a.xy.v[0], a.yy.v[0], a.yz.v[0], a.xz.v[0], a.yz.v[0], a.zz.v[0];
+  return m;
+}
+
+Eigen::Matrix3d cross_matrix(const Eigen::Vector3d& a) {
+  Eigen::Matrix3d m;
+  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
+  return m;
+}
+
+std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
+                                                                     double twist_stiffness, const Rows4& quaternions) {
+  const int n = static_cast<int>(quaternions.rows()) - 1;
+  const double h = 1.0 / n;
+  const Rod<T> rod{gamma, phi0, phi1, twist_stiffness};
+  const auto frame = [&](int i) -> Quat<T> {
+    return {quaternions(i, 0), {quaternions(i, 1), quaternions(i, 2), quaternions(i, 3)}};
+  };
+  // The clamp's rows and columns are kept until the end, to assemble without exceptions.
+  Eigen::VectorXd gradient = Eigen::VectorXd::Zero(3 * (n + 1));
+  Eigen::MatrixXd hessian = Eigen::MatrixXd::Zero(3 * (n + 1), 3 * (n + 1));
+  double energy = 0.0;
+  for (int i = 0; i < n; ++i) {
+    const Quat<T> a = frame(i), b = frame(i + 1);
+    const Element<T> e = element(rod, element_moment(rod, a, b, T(h), T(double(n))), T(double(n)));
+    const Eigen::Vector3d f = dense(e.force);
+    const Eigen::Matrix3d S = dense(e.stiffness), O = -S + 0.5 * cross_matrix(f);
+    energy += e.energy.v[0];
+    gradient.segment<3>(3 * i) -= f;
+    gradient.segment<3>(3 * i + 3) += f;
+    hessian.block<3, 3>(3 * i, 3 * i) += S;
+    hessian.block<3, 3>(3 * i + 3, 3 * i + 3) += S;
+    hessian.block<3, 3>(3 * i, 3 * i + 3) += O;
+    hessian.block<3, 3>(3 * i + 3, 3 * i) += O.transpose();
+
+    const double weight = gamma * (1.0 - i * h) * h;
+    const Vec3<T> t = direction1(a);
+    energy += (i == 0 ? 0.5 : 1.0) * weight * t.z.v[0];
+    gradient.segment<3>(3 * i) += dense(weight_torque(T(weight), t));
+    hessian.block<3, 3>(3 * i, 3 * i) += dense(weight_stiffness(T(weight), t));
+  }
+  return {energy, gradient.tail(3 * n), hessian.bottomRightCorner(3 * n, 3 * n)};
+}
+
+}  // namespace
+}  // namespace sim_core
+
+NB_MODULE(_testing, m) {
+  using namespace sim_core;
+  m.doc() = "For tests of stickslip_sim_core, in editable installs only.";
+  m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
+        "Energy [EI/L], gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by world "
+        "rotations of nodes 1 ... N.");
   m.def(
       "closest_weights", [](bool edges, const Four& x) { return closest_weights(kind_of(edges), four(x)); }, "edges"_a,
-      "x"_a, "Internal: see contact/closest.hpp.");
+      "x"_a, "See contact/closest.hpp.");
   m.def(
       "safe_share",
       [](bool edges, const Four& x, const Four& to, double keep, double most, double floor) {
         return safe_share(kind_of(edges), four(x), four(to), {keep, most, floor});
       },
-      "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "Internal: see contact/closest.hpp.");
+      "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "See contact/closest.hpp.");
   m.def(
       "contact_candidates",
       [](const Triangles& triangles, const Points3& x, double reach) {
@@ -67,7 +125,7 @@ void bind_contact(nb::module_& m) {
         }
         return out;
       },
-      "triangles"_a, "x"_a, "reach"_a, "Internal: kind (0: vertex and triangle, 1: edges) and vertices of near pairs.");
+      "triangles"_a, "x"_a, "reach"_a, "kind (0: vertex and triangle, 1: edges) and vertices of near pairs.");
   m.def(
       "cap_motion",
       [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness, double margin) {
@@ -78,7 +136,7 @@ void bind_contact(nb::module_& m) {
         for (int i = 0; i < to.rows(); ++i) out.row(i) = at_node(end, i).transpose();
         return out;
       },
-      "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "Internal: see contact/path.hpp.");
+      "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "See contact/path.hpp.");
   m.def(
       "feet",
       [](const Triangles& triangles, const Points3& x, double crease, const Points3& points) {
@@ -103,7 +161,7 @@ void bind_contact(nb::module_& m) {
         return std::make_tuple(height, normal, point, triangle);
       },
       "triangles"_a, "x"_a, "crease"_a, "points"_a,
-      "Internal: height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
+      "height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
       "contact/pn_triangles.hpp.");
   m.def(
       "pair_law",
@@ -114,7 +172,5 @@ void bind_contact(nb::module_& m) {
         return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(at));
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a, "smoothing"_a = 0.0,
-      "Internal: mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");
+      "mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");
 }
-
-}  // namespace sim_core
