@@ -295,13 +295,13 @@ def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator
 
 
 def _work(task: Path, store: Path, delay: float) -> dict[str, Any]:
-    from stickslip_workers.stages import publish as stage
+    from stickslip_workers.stages.publish import publish
 
     slow = SlowStore(store)
     slow.delay = delay
     result: dict[str, Any] = {}
     given = PublishTask.model_validate_json(task.read_bytes())
-    (done,) = _timed(result, "publish", lambda: stage.run([given], slow))
+    done = _timed(result, "publish", lambda: publish(given, slow))
     result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
     return result | {"output": done.model_dump(mode="json")}
 

@@ -1,3 +1,4 @@
+import json
 import os
 import pickle
 import re
@@ -383,6 +384,18 @@ def test_metadata_must_be_those_of_the_contract(clips, tmp_path, old, new, messa
     assert old in text
     made.rewrite("zarr.json", text.replace(old, new).encode())
     with pytest.raises(InvalidDatasetError, match=message):
+        DatasetReader(made.root)
+
+
+def test_metadata_must_say_the_order_of_bytes_of_a_number(clips, tmp_path):
+    made = clips.copy(tmp_path / "v1")
+    group = json.loads((made.root / "zarr.json").read_text())
+    (order,) = [
+        codec for codec in group["consolidated_metadata"]["metadata"]["texture"]["codecs"] if "bytes" in codec.values()
+    ]
+    del order["configuration"]["endian"]
+    made.rewrite("zarr.json", json.dumps(group).encode())
+    with pytest.raises(InvalidDatasetError, match="array texture: codecs must be"):
         DatasetReader(made.root)
 
 

@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from stickslip_schemas.format.codecs import axes_order, packing
 from stickslip_schemas.spec.arrays import ArrayLayout
 
@@ -54,10 +55,11 @@ def check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples
         "fill_value": "NaN" if array.fill != array.fill else array.fill,
         "storage_transformers": [],
     }
+    defaults = _DEFAULTS | ({"bytes": {"endian": "little"}} if np.dtype(array.dtype).itemsize == 1 else {})
     found = {
         **metadata,
-        "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding")),
-        "codecs": _all_normalised(metadata.get("codecs")),
+        "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding"), defaults),
+        "codecs": _all_normalised(metadata.get("codecs"), defaults),
         "storage_transformers": metadata.get("storage_transformers") or [],
     }
     for field, rule in expected.items():
@@ -87,25 +89,22 @@ def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
     return [{"name": "sharding_indexed", "configuration": configuration}]
 
 
-_DEFAULTS = {
-    "default": {"separator": "/"},
-    "bytes": {"endian": "little"},
-    "sharding_indexed": {"index_location": "end"},
-}
-"""Configurations that the metadata may leave out."""
+_DEFAULTS = {"default": {"separator": "/"}, "sharding_indexed": {"index_location": "end"}}
+"""Configurations that the metadata may leave out; for values of one byte, the order of bytes, too."""
 
 
-def _normalised(named: Any) -> Any:
+def _normalised(named: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
     """Give a codec or an encoding its configuration, but for what a reader need not know: the level of zstd, all of
     blosc's."""
     named = {"name": named} if isinstance(named, str) else named
     if not isinstance(named, dict):
         return named
     name = named.get("name")
-    configuration = _DEFAULTS.get(str(name), {}) | (named.get("configuration") or {})
-    inner = {key: _all_normalised(configuration[key]) for key in ("codecs", "index_codecs") if key in configuration}
+    configuration = defaults.get(str(name), {}) | (named.get("configuration") or {})
+    nested = [key for key in ("codecs", "index_codecs") if key in configuration]
+    inner = {key: _all_normalised(configuration[key], defaults) for key in nested}
     return {"name": name, "configuration": {} if name in ("zstd", "blosc") else configuration | inner}
 
 
-def _all_normalised(codecs: Any) -> Any:
-    return [_normalised(codec) for codec in codecs] if isinstance(codecs, list) else codecs
+def _all_normalised(codecs: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
+    return [_normalised(codec, defaults) for codec in codecs] if isinstance(codecs, list) else codecs
