@@ -26,7 +26,7 @@ from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.lens import bent
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
-from stickslip_blender.cloth.quality import HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
+from stickslip_blender.cloth.quality import BAND, HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene, Shot
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
@@ -136,13 +136,14 @@ class ClipRenderer:
         picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
         for frame in instants(len(self.shots), share, self.sampling.usual, (self.seed, *draw)):
             shot = self.shots[frame]
-            window = self.scene.window(shot)
+            window = self.scene.window(shot, BAND + 1)
             light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
+            factor = self.scene.composer.floor_factor(shot.points, self.pinhole, self.floor, FINE)[..., 1:2]
             for half in range(2):
                 sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1, skipped=HALF_SAMPLES)
-                light[half][window.slices] = self.scene.direct(shot, picture, sampling, window)
-            factor = self.scene.composer.floor_factor(shot.points, self.pinhole, self.floor)
-            light *= factor[..., 1:2]
+                parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
+                boxes = parts.reshape(-1, FINE, window.right - window.left, FINE, 3)
+                light[half][window.slices] = boxes.mean(axis=(1, 3))
             yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.pinhole))
 
     def _grained(self, texture: Clip) -> Clip:

@@ -25,13 +25,14 @@ from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.fabrics import Texture
 
 from stickslip_blender.cloth.geometry import Geometry
+from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
-HALF_SAMPLES = 12
-"""Paths per pixel of each of the two direct renderings, without the first ones: at the edges of a print, the path
-through the middle of each pixel is an error that both have."""
-_FIXED = 33  # what else a frame of a shading costs [paths per pixel of its window]
-_SET_UP = 6  # the same of the two renderings
+HALF_SAMPLES = 4
+"""Paths per pixel of a shading of each of the two direct renderings, after as many: at edges of a print, the first path
+through the middle of a pixel is an error that both have. A power of two has the least noise."""
+_FIXED = 46  # what else a frame of a shading costs [paths per pixel of its window]
+_SET_UP = 2  # the same of the two renderings
 _TRIOS = 3  # that eight textures make
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
@@ -84,7 +85,7 @@ def instants(frames: int, share: float, samples: int, seed: Sequence[int]) -> li
 
     To measure eight textures costs a share of their shading, which has so many samples per pixel.
     """
-    cost = _TRIOS * (2 * HALF_SAMPLES + _SET_UP) / (samples + _FIXED)
+    cost = _TRIOS * (2 * HALF_SAMPLES * FINE**2 + _SET_UP) / (samples + _FIXED)
     count = min(max(1, round(share * frames / cost)), frames)
     draws = np.random.Generator(np.random.PCG64(seed)).random(count)
     return [int((k + draw) / count * frames) for k, draw in enumerate(draws)]

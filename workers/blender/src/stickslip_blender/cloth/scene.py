@@ -117,13 +117,13 @@ class ClothScene:
         return light
 
     def direct(
-        self, shot: Shot, picture: npt.NDArray[np.uint8], sampling: Sampling, window: Window | None = None
+        self, shot: Shot, image: npt.NDArray[np.uint8], sampling: Sampling, window: Window | None = None, fine: int = 1
     ) -> npt.NDArray[np.float16]:
-        """Render one instant, or a window of it, with a texture on the cloth, the slow way: linear light (h, w, 3)."""
-        self._fabric.set_picture(picture)
+        """Render an instant, or a window of it, with a texture on the cloth: linear light (fine h, fine w, 3)."""
+        self._fabric.set_picture(image)
         self._place(shot)
         set_sampling(self._scene, sampling)
-        return self._reader.read_light(window)
+        return self._reader.read_light(window, fine)
 
     def window(self, shot: Shot, margin: int = _WINDOW_MARGIN) -> Window:
         """Return the part of the frame that shows the cloth."""

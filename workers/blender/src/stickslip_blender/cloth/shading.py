@@ -78,7 +78,7 @@ class Composer:
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
         8-bit sRGB, chosen as in raster/composition.hpp, shape (textures, height, width, 3).
         """
-        window, parts = self._window(points, camera).times(FINE), _finer(camera)
+        window, parts = self._window(points, camera).times(FINE), _finer(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
@@ -87,7 +87,7 @@ class Composer:
             reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
         _raster.compose(
             np.ascontiguousarray(shading).view(np.uint16),
-            (SHOWN[1], ELSEWHERE[1], ELSEWHERE[2]),
+            (SHOWN[1], *ELSEWHERE[1:]),
             sight.overall.ravel(),
             sight.coverage,
             sight.mean.reshape(*sight.coverage.shape, colors),
@@ -101,15 +101,14 @@ class Composer:
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return Sight(float(sight.coverage.sum()) / frame, float(min(visible, 1.0)))
 
-    def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats) -> Floats:
-        """Return the factor (height, width, 3) of marks and colours for a frame that is rendered directly."""
-        window = self._window(points, camera)
-        seen = see(projected(camera, points), self._geometry.triangles, window)
-        cover = np.zeros((camera.height, camera.width), dtype=np.float32)
+    def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1) -> Floats:
+        """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is rendered directly."""
+        window, parts = self._window(points, camera).times(fine), _finer(camera, fine)
+        seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
+        cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marks = self._tinted(floor, points, camera) - 1.0
-        factor: Floats = np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
-        return factor
+        marks = (self._tinted(floor, points, camera) - 1.0).repeat(fine, axis=0).repeat(fine, axis=1)
+        return np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
 
     def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
         """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the prop before it."""
@@ -175,10 +174,10 @@ class Composer:
         return (mean + known * (color - mean)).astype(np.float32), window
 
 
-def _finer(camera: Camera) -> Camera:
-    """Return a camera with FINE x FINE pixels in each."""
-    numbers = {name: FINE * getattr(camera, name) for name in ("width", "height", "fx", "fy")}
-    centre = {name: FINE * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
+def _finer(camera: Camera, fine: int) -> Camera:
+    """Return a camera with fine x fine pixels in each."""
+    numbers = {name: fine * getattr(camera, name) for name in ("width", "height", "fx", "fy")}
+    centre = {name: fine * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
     return camera.model_copy(update=numbers | centre)
 
 

@@ -63,7 +63,7 @@ SAMPLING = {
 CLOTH_SAMPLING = {
     Quality.preview: ClothSampling(1, 1, 0.0, 4, (24.0, 20.0, 21.0)),
     Quality.draft: ClothSampling(2, 3, 0.0, 12, (30.0, 27.0, 25.0)),
-    Quality.standard: ClothSampling(2, 10, 0.0, 40, (34.0, 30.0, 28.0)),
+    Quality.standard: ClothSampling(2, 8, 0.0, 32, (34.0, 30.0, 28.0)),
     Quality.high: ClothSampling(8, 128, 0.03, 100, (35.0, 31.0, 29.0)),
 }
 _FEWEST = 8  # paths of a pixel before its noise is estimated
