@@ -12,6 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import GROUND, Holders
 from stickslip_blender.cloth.textures import texture_image
@@ -55,7 +56,9 @@ def main() -> None:
         object.__setattr__(clip, "floor", np.ones_like(clip.floor))
         (video,), _ = clip.clips(clip.shading(), [picture])
         segments = clip.ground_truth(["segmentation"])["segmentation"]
-        sides: dict[str, list[list[np.ndarray]]] = {name: [[], []] for name in ("left", "right", "above", "below")}
+        sides: dict[str, list[list[npt.NDArray[np.float64]]]] = {
+            name: [[], []] for name in ("left", "right", "above", "below")
+        }
         for shot, frame, codes in zip(clip.shots, video, segments, strict=True):
             direct = clip.scene.direct(shot, picture, Sampling(PATHS, "plain", seed + 1000))
             off = frame[..., 1].astype(float) - encode(direct.astype(np.float32))[..., 1]
