@@ -139,11 +139,10 @@ class ClipRenderer:
             window = self.scene.window(shot, BAND + 1)
             light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
             factor = self.scene.composer.floor_factor(shot.points, self.pinhole, self.floor, FINE)[..., 1:2]
-            for half in range(2):
-                sampling = Sampling(HALF_SAMPLES, "none", self.seed + half + 1, skipped=HALF_SAMPLES)
+            for number, half in enumerate(light, 1):
+                sampling = Sampling(HALF_SAMPLES, "none", self.seed + number, skipped=HALF_SAMPLES)
                 parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
-                boxes = parts.reshape(-1, FINE, window.right - window.left, FINE, 3)
-                light[half][window.slices] = boxes.mean(axis=(1, 3))
+                half[window.slices] = parts.reshape(-1, FINE, window.right - window.left, FINE, 3).mean(axis=(1, 3))
             yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.pinhole))
 
     def _grained(self, texture: Clip) -> Clip:
