@@ -92,6 +92,7 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
     monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", raising=False)  # other tests want loopback: no pod does
     monkeypatch.setenv("RAY_AUTH_MODE", cluster["spec"]["authOptions"]["mode"])
     monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: other tests beside would starve the nodes
     container = dispatcher["spec"]["template"]["spec"]["containers"][0]
     script = re.sub(r"--url=\S+", f"--url={URL}", container["args"][0])
     script = script.replace("/etc/stickslip/worker-key", str(tmp_path / "worker-key"))
