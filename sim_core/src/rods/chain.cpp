@@ -17,20 +17,6 @@ constexpr double chain_tolerance = 1e-6;  // on the last Newton step [rad]; the 
 
 Vec3<T> lanes(const Eigen::Vector3d& a) { return {a.x(), a.y(), a.z()}; }
 
-Eigen::Vector3d dense(Vec3<T> a) { return {a.x.v[0], a.y.v[0], a.z.v[0]}; }
-
-Eigen::Matrix3d dense(Sym3<T> a) {
-  Eigen::Matrix3d m;
-  m << a.xx.v[0], a.xy.v[0], a.xz.v[0], a.xy.v[0], a.yy.v[0], a.yz.v[0], a.xz.v[0], a.yz.v[0], a.zz.v[0];
-  return m;
-}
-
-Eigen::Matrix3d cross_matrix(const Eigen::Vector3d& a) {
-  Eigen::Matrix3d m;
-  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
-  return m;
-}
-
 Quat<T> frame(const Rows4& q, Eigen::Index i) { return {q(i, 0), {q(i, 1), q(i, 2), q(i, 3)}}; }
 
 void set_frame(Rows4& rows, Eigen::Index i, Quat<T> q) { rows.row(i) << q.w.v[0], q.v.x.v[0], q.v.y.v[0], q.v.z.v[0]; }

@@ -10,6 +10,8 @@
 #include <Eigen/Core>
 #include <utility>
 
+#include "math/so3.hpp"
+
 namespace sim_core {
 
 using Rows3 = Eigen::Matrix<double, -1, 3, Eigen::RowMajor>;
@@ -36,5 +38,20 @@ Rows3 chain_centerline(const Rows4& quaternions);
 // elements are basis (N, B) times the coefficients. The chain must be at a stable equilibrium.
 RowMajor chain_jacobian(double gamma, const Eigen::Vector3d& stiffness, const Rows3& natural, const Rows4& quaternions,
                         const RowMajor& basis, int stride);
+
+// Derivatives of an energy, of one lane, as matrices.
+inline Eigen::Vector3d dense(Vec3<Lanes<1>> a) { return {a.x.v[0], a.y.v[0], a.z.v[0]}; }
+
+inline Eigen::Matrix3d dense(Sym3<Lanes<1>> a) {
+  Eigen::Matrix3d m;
+  m << a.xx.v[0], a.xy.v[0], a.xz.v[0], a.xy.v[0], a.yy.v[0], a.yz.v[0], a.xz.v[0], a.yz.v[0], a.zz.v[0];
+  return m;
+}
+
+inline Eigen::Matrix3d cross_matrix(const Eigen::Vector3d& a) {
+  Eigen::Matrix3d m;
+  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
+  return m;
+}
 
 }  // namespace sim_core

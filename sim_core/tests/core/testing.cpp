@@ -14,7 +14,7 @@
 #include "contact/pair_law.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
-#include "math/lanes.hpp"
+#include "rods/chain.hpp"
 #include "rods/energy.hpp"
 
 namespace nb = nanobind;
@@ -48,21 +48,6 @@ Buffer<double> buffer_of(const Points3& x) {
 }
 
 using T = Lanes<1>;
-using Rows4 = Eigen::Matrix<double, -1, 4, Eigen::RowMajor>;
-
-Eigen::Vector3d dense(Vec3<T> a) { return {a.x.v[0], a.y.v[0], a.z.v[0]}; }
-
-Eigen::Matrix3d dense(Sym3<T> a) {
-  Eigen::Matrix3d m;
-  m << a.xx.v[0], a.xy.v[0], a.xz.v[0], a.xy.v[0], a.yy.v[0], a.yz.v[0], a.xz.v[0], a.yz.v[0], a.zz.v[0];
-  return m;
-}
-
-Eigen::Matrix3d cross_matrix(const Eigen::Vector3d& a) {
-  Eigen::Matrix3d m;
-  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
-  return m;
-}
 
 std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
                                                                      double twist_stiffness, const Rows4& quaternions) {
