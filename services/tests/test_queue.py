@@ -6,7 +6,7 @@ import pytest
 from sqlalchemy import event, select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
-from stickslip_schemas.documents.tasks import PackTask, PublishSection, PublishTask, RenderTask
+from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishSection, PublishTask, RenderTask
 from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.datasets import find_dataset
@@ -14,7 +14,7 @@ from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
 from stickslip_services.queue.closing import held_tasks
-from stickslip_services.queue.compose import AnyTask, find_task
+from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job
 from stickslip_services.queue.jobs import find_job, list_samples

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, bindparam, select
 from sqlalchemy.exc import NoResultFound
 from stickslip_schemas.base.keys import Sha256, content_key
 from stickslip_schemas.base.states import Stage, TaskState
-from stickslip_schemas.documents.tasks import PackTask, PublishTask, RenderTask, SimulateTask, task_adapter
+from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishTask, RenderTask, task_adapter
 from stickslip_schemas.format.manifest import section_samples
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.plan.points import pack_key, publish_key
@@ -26,8 +26,6 @@ from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundE
 from stickslip_services.queue.ids import task_id, task_key
 from stickslip_services.queue.ledger import KeyedTask
 from stickslip_services.queue.recompute import check_results, check_samples, read_plan
-
-AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 
 UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError, TypeError)
 """Errors that damaged rows cause."""

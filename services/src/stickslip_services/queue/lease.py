@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, select, text, update
 from stickslip_schemas.base.states import Reason, TaskState
-from stickslip_schemas.documents.tasks import PublishTask
+from stickslip_schemas.documents.tasks import AnyTask, PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -25,7 +25,7 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
-from stickslip_services.queue.compose import UNSOUND, AnyTask, Publish, StoredTask, compose_tasks
+from stickslip_services.queue.compose import UNSOUND, Publish, StoredTask, compose_tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.grants import grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key

@@ -146,7 +146,7 @@ def get_picture(
     opened: OpenedDep,
     slot: Slot,
     array: str,
-    index: Slot,
+    index: Annotated[int, Path(ge=0)],
     request: Request,
     step: Annotated[int, Query(ge=1, le=8)] = 1,
 ) -> Response:
