@@ -187,3 +187,10 @@ def test_a_lens_has_none_four_or_five_numbers() -> None:
     assert Camera.model_validate(numbers | {"distortion": [1, 2, 3, 4]}).distortion == (1.0, 2.0, 3.0, 4.0, 0.0)
     with pytest.raises(ValidationError, match="distortion"):
         Camera.model_validate(numbers | {"distortion": [0.1]})
+
+
+def test_what_a_lens_folds_into_its_picture_is_out_of_the_frame() -> None:
+    camera = LEVEL.model_copy(update={"distortion": (-0.3, 0.0, 0.0, 0.0, 0.0)})
+    pixels, _ = camera.project([[0.0, 5.4, 0.0]])  # 61 degrees off the axis
+    assert 0.0 < pixels[0, 0] < 200.0
+    assert camera.overflow([[0.0, 5.4, 0.0]]) > 200.0

@@ -55,6 +55,8 @@ def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
 
 def undistorted(u: Any, v: Any, lens: Lens) -> tuple[Any, Any]:
     """Return the places that a lens shows at (u, v), by fixed-point steps; numbers or arrays."""
+    if not any(lens):
+        return u, v
     x, y = u, v
     k1, k2, p1, p2, k3 = lens
     for _ in range(_INVERSIONS):
@@ -144,17 +146,10 @@ class Camera(Document):
 
     def border(self) -> list[tuple[float, float]]:
         """Return the places of the plane at depth 1 that the lens shows along the border of the picture."""
-        sides = [(k / _BORDER - 0.5, side) for k in range(_BORDER + 1) for side in (-0.5, 0.5)]
-        places = [*sides, *((b, a) for a, b in sides)]
-        middle = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
-        return [
-            undistorted(
-                (middle[0] + a * self.width - self.cx) / self.fx,
-                (middle[1] + b * self.height - self.cy) / self.fy,
-                self.distortion,
-            )
-            for a, b in places
-        ]
+        along = [k / _BORDER for k in range(_BORDER + 1)]
+        places = [(a, b) for a in along for b in (0.0, 1.0)] + [(a, b) for a in (0.0, 1.0) for b in along]
+        pixels = ((a * self.width - 0.5, b * self.height - 0.5) for a, b in places)
+        return [undistorted((u - self.cx) / self.fx, (v - self.cy) / self.fy, self.distortion) for u, v in pixels]
 
     def pinhole(self) -> Camera:
         """Return the camera without distortion, of the same focal lengths, that sees all that this one does."""
@@ -175,10 +170,13 @@ class Camera(Document):
         """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame [px].
 
         The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's image is taken as a
-        disc, which is right to first order in its angular size. Infinite if a ball reaches behind the camera.
+        disc, which is right to first order in its angular size. Infinite if a ball reaches behind the camera. What a
+        lens does not see it may fold into its picture: the pinhole camera says how far out that is.
         """
         import numpy as np
 
+        if any(self.distortion) and (outside := self.pinhole().overflow(points, radius, margin)) > 0.0:
+            return outside
         pixels, depth = self.project(points)
         if not bool(np.all(depth > radius)):
             return float("inf")

@@ -199,7 +199,7 @@ def render_clips(
         lambda: ClothRenderer(triangles, rest, make),
     )
     camera = look.camera or (frame(renderer.geometry) if frame else rig_camera(look))
-    if unfit := why_unfit("cloth", track, 0.0, (camera.pinhole(),)) or why_unfit("cloth", track, 0.0, (camera,)):
+    if unfit := why_unfit("cloth", track, 0.0, (camera,)):
         return unfit
     clip = renderer.clip(look, camera, track[list(look.instants)])
     known = {name: workshop.chunk(values) for name, values in clip.ground_truth(look.ground_truth).items()}

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import BACKGROUND, Geometry
-from stickslip_blender.cloth.lens import pinhole_places
+from stickslip_blender.cloth.lens import traced
 from stickslip_blender.raster import Window, _raster, projected, see
 
 Floats = npt.NDArray[np.float32]
@@ -40,18 +40,17 @@ def ground_truth(
     geometry: Geometry, points: npt.NDArray[np.float64], following: npt.NDArray[np.float64], camera: Camera
 ) -> GroundTruth:
     """Return the ground truth of an instant: all vertices (V, 3) [m] then, and at the next frame."""
-    pinhole = camera.pinhole()
+    pinhole, rays, places = traced(camera)
     here = projected(pinhole, points)
     seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
     if pinhole is not camera:
-        seen = seen.looked_up(pinhole_places(camera))
+        seen = seen.looked_up(places)
     values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
     skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
     smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
     thing = seen.triangle >= 0
     cloth = thing & geometry.has_uv[seen.triangle]
 
-    rays = camera.rays()
     floor = _floor_depth(camera, rays, geometry.surroundings.floor)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     moved, _ = camera.project(values[..., 3:6])

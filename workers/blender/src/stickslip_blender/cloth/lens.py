@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
@@ -17,7 +19,7 @@ def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     """
     if not any(camera.distortion):
         return video
-    places = pinhole_places(camera)
+    _, _, places = traced(camera)
     corner = np.floor(places).astype(int)
     share = (places - corner)[..., None].astype(np.float32)
     column, row = corner[..., 0], corner[..., 1]
@@ -30,7 +32,8 @@ def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     return result
 
 
-def pinhole_places(camera: Camera) -> npt.NDArray[np.float64]:
-    """Return where the rays of a camera's pixels land in the frame of its `pinhole` [px], (height, width, 2)."""
+@lru_cache(maxsize=4)  # every frame and every texture asks
+def traced(camera: Camera) -> tuple[Camera, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return a camera's pinhole, its rays (height, width, 3), and where in the pinhole's frame they land [px]."""
     pinhole, rays = camera.pinhole(), camera.rays()
-    return rays[..., :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+    return pinhole, rays, rays[..., :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
