@@ -89,14 +89,21 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
     specs = [{"gamma": [1.0 + number, 2.0 + number, 3.0 + number]} for number in range(4)]  # they share tasks
     jobs: list[str] = []
     is_over = threading.Event()
+    lost = Counter[str]()  # leases that expired before the report, as where the disk takes so long
 
     def submit_all(which: int) -> None:
         jobs.extend(pair.submit(which, **spec) for spec in specs)
 
     def work(worker: PretendWorker) -> None:
         while not is_over.wait(0.1):
+            asked = time.monotonic()
             if leases := worker.lease(simulate=3, render=3, pack=1, publish=1):
-                worker.finish(*leases)
+                verdicts = worker.finish(*leases)
+                if time.monotonic() - asked > pair.settings.lease_seconds:
+                    stale = [
+                        lease.task_id for lease, verdict in zip(leases, verdicts, strict=True) if verdict == "stale"
+                    ]
+                    lost.update(stale)
 
     def states() -> set[str]:
         return {job["state"] for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]}
@@ -117,7 +124,7 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
         count = connection.scalar(select(func.count()).select_from(tasks))
         attempts = set(connection.scalars(select(tasks.c.attempts)))
     database.close()
-    ran = Counter(name for worker in workers for name in worker.ran)
+    ran = Counter(name for worker in workers for name in worker.ran) - lost
     assert (len(ran), set(ran.values()), attempts) == (count, {1}, {1})
     assert sum(bool(worker.ran) for worker in workers) > 1
     for server in pair.servers:
