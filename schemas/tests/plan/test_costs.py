@@ -7,6 +7,7 @@ from stickslip_schemas.base.states import Stage
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import Estimate, Interval, estimated
 from stickslip_schemas.plan.grid import count
+from stickslip_schemas.spec.fabrics import Texture
 
 
 def estimate(slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any) -> Estimate:
@@ -29,11 +30,13 @@ def clips(*textures: str, mu: Any = 0.3, **more: Any) -> dict[str, Any]:
     [
         (rods(24, "high"), Stage.render, 16.9),
         (rods(20, "draft"), Stage.render, 2.1),
-        (clips("dots", frames=10), Stage.render, 9.1),
-        (clips("dots", "plaid", "floral", "checker", frames=10), Stage.render, 11.9),
-        (clips("dots", frames=10, quality="high"), Stage.render, 18.3),
-        (clips("dots", "checker", mu=[0.2, 0.6], frames=30, quality="draft"), Stage.render, 51.0),
-        (clips("dots", "checker", mu=[0.2, 0.6], mesh=21, preset="fast"), Stage.simulate, 6.0),
+        (clips("checker", frames=30), Stage.render, 50.0),
+        (clips("stripes", frames=6), Stage.render, 8.6),
+        (clips(*list(Texture)[:8], frames=30), Stage.render, 68.0),
+        (clips("dots", frames=24, quality="high"), Stage.render, 105.8),
+        (clips("plaid", "dots", "gingham", frames=6, quality="high"), Stage.render, 35.7),
+        (clips("checker", frames=30, quality="draft"), Stage.render, 38.3),
+        (clips("dots", "checker", mu=[0.2, 0.6], mesh=21, preset="fast"), Stage.simulate, 10.8),
         (clips("dots", mesh=41), Stage.simulate, 31.0),
     ],
 )

@@ -17,8 +17,6 @@ _PRAGMAS = (
     "foreign_keys=ON",
     "journal_size_limit=67108864",  # the log of a big plan does not stay that big
 )
-_WRITER_CACHE = "cache_size=-65536"
-"""64 MiB: the index of 200,000 task keys fits. Readers drop their cache with each write, so theirs stays small."""
 
 
 class SqliteDatabase(Database):
@@ -32,10 +30,9 @@ class SqliteDatabase(Database):
         url = URL.create("sqlite+pysqlite", database=str(path))
         reader = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
         writer = create_engine(url, connect_args={"timeout": 30}, pool_size=1, max_overflow=0)
-        event.listen(reader, "connect", partial(_prepare, pragmas))
-        event.listen(writer, "connect", partial(_prepare, (*pragmas, _WRITER_CACHE)))
-        event.listen(reader, "begin", partial(_begin, "BEGIN"))
-        event.listen(writer, "begin", partial(_begin, "BEGIN IMMEDIATE"))
+        for engine, begin in ((reader, "BEGIN"), (writer, "BEGIN IMMEDIATE")):
+            event.listen(engine, "connect", partial(_prepare, pragmas))
+            event.listen(engine, "begin", partial(_begin, begin))
         super().__init__(reader, writer)
 
     @contextmanager

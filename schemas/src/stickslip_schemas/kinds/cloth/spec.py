@@ -150,8 +150,8 @@ class ClipSpec(NamingSpec):
         default=Quality.standard,
         description="quality of the pictures",
         json_schema_extra={
-            "x-cost": "CPU time of a frame and texture, if eight textures share a shading: preview 0.06 s, "
-            "draft 0.09 s, standard 0.14 s, high 0.35 s; a texture alone at standard 1.1 s"
+            "x-cost": "CPU time of a frame and texture, if eight textures share a shading, without measuring: preview "
+            "0.1 s, draft 0.15 s, standard 0.2 s, high 0.5 s; a texture alone at standard 1.6 s"
         },
     )
     ground_truth: tuple[GroundTruth, ...] = Field(
@@ -163,12 +163,12 @@ class ClipSpec(NamingSpec):
         },
     )
     measured: Float = Field(
-        default=0.25,
+        default=0.5,
         ge=0,
         le=10,
         description="cost of measuring how good the clips of eight textures are, over that of rendering them; at "
         "least one frame of each clip is measured, and none at 0",
-        json_schema_extra={"x-cost": "at 0.25, 20 to 35 % of the CPU time of 30 frames, and more of fewer frames"},
+        json_schema_extra={"x-cost": "at 0.5, half of the CPU time of rendering 30 frames, and more of fewer frames"},
     )
     creases: Float = Field(
         default=0.0,
@@ -192,10 +192,10 @@ class ClipSpec(NamingSpec):
         }
 
     def clip_costs(self, simulate: float, unsure: float) -> Costs:
-        """Return usual CPU times; those of a clip grow with its frames."""
-        shade = {"preview": 0.3, "draft": 0.45, "standard": 0.45, "high": 1.1}[self.quality] * self.frames
-        render = {"preview": 0.04, "draft": 0.06, "standard": 0.09, "high": 0.25}[self.quality] * self.frames
-        return Costs(simulate, render, shade, start=4.0, unsure=unsure)
+        """Return usual CPU times; those of a clip grow with its frames, and by what measuring it costs."""
+        shade = {"preview": 0.8, "draft": 1.15, "standard": 1.55, "high": 4.0}[self.quality] * self.frames
+        render = 0.01 * self.frames + self.measured * shade / 8
+        return Costs(simulate, render, shade, start=2.0, unsure=unsure)
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         """Return what the cost of a sample hangs on."""
@@ -248,9 +248,9 @@ class ClothSpec(ClipSpec):
 
     @property
     def usual_costs(self) -> Costs:
-        """Usual CPU times; a drag takes 5 s at mesh 21, as vertices^1.37, and by fabric 0.3 to 3 times as much."""
-        preset = {PresetName.fast: 0.6, PresetName.fine: 1.7}.get(self.preset, 1.0)
-        return self.clip_costs(5.0 * preset * (self.mesh / 21) ** 2.74, unsure=3.0)
+        """Usual CPU times; a drag takes 8 s at mesh 21, as vertices^1.15, and by fabric 0.3 to 3 times as much."""
+        preset = {PresetName.fast: 0.7, PresetName.fine: 1.7}.get(self.preset, 1.0)
+        return self.clip_costs(8.0 * preset * (self.mesh / 21) ** 2.3, unsure=3.0)
 
     @property
     def certified_preset(self) -> str:

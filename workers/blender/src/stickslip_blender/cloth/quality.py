@@ -31,7 +31,7 @@ from stickslip_blender.raster import Window, decoded, projected, see
 HALF_SAMPLES = 4
 """Paths per pixel of a shading of each of the two direct renderings, after as many: at edges of a print, the first path
 through the middle of a pixel is an error that both have. A power of two has the least noise."""
-_FIXED = 46  # what else a frame of a shading costs [paths per pixel of its window]
+_FIXED = 22  # what else a frame of a shading costs [paths per pixel of its window]
 _SET_UP = 2  # the same of the two renderings
 _TRIOS = 3  # that eight textures make
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]

@@ -36,9 +36,9 @@ _LAMP_DISTANCE = 1.2  # [m]
 _LAMP_POWER = 24.0  # [W]
 _FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED, _RAMP = 2, 8  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
+_DISCARDED, _RAMP = 2, 4  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
-_MIRROR_PATHS = 4  # times as many paths for the frame then
+_MIRROR_PATHS = 2  # times as many paths for the frame then
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class ClothScene:
         self._fabric.set_color(SHOWN, ELSEWHERE)
         self._place(shot)
         paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
-        set_sampling(self._scene, Sampling(paths, "plain", seed))
+        set_sampling(self._scene, Sampling(paths, "quick", seed))
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
         part = self.window(shot, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed, noise=sampling.noise))
