@@ -251,7 +251,7 @@ PINNED: dict[str, object] = {
     "spec": "473d8dc6dc2024b5e3f18fbc9953dca6f325c8f53e87629de6d8277bf2b4c8db",
     "cloth_simulation": "789307b6d058b495f6cb68d128e117725f930fd1eeb607576e3139c9ab7a18e8",
     "cloth_through_itself": "cd4fa25293c36d85fe5571770462b8652db024c0f2440f95bd8cdbc7d335d872",
-    "cloth_render": "e1de01d4b277fff7d788e1c27fdb4cfd341d641604affcf643015147b0e45bf0",
+    "cloth_render": "a5b309ef092106b9a0a655c0601937fab842d5b74ddfce33e99e65f78f221455",
 }
 
 
