@@ -192,7 +192,7 @@ class ClipSpec(NamingSpec):
         }
 
     def clip_costs(self, simulate: float, unsure: float) -> Costs:
-        """Return usual CPU times; those of a clip grow with its frames, and by what measuring it costs."""
+        """Return usual CPU times; measuring the clips of eight textures costs the share `measured` of their shading."""
         shade = {"preview": 0.8, "draft": 1.15, "standard": 1.55, "high": 4.0}[self.quality] * self.frames
         render = 0.01 * self.frames + self.measured * shade / 8
         return Costs(simulate, render, shade, start=2.0, unsure=unsure)
