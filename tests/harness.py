@@ -21,6 +21,11 @@ T = TypeVar("T")
 STICKSLIP = Path(sys.executable).with_name("stickslip")
 
 
+PATIENCE = 5.0
+"""How many times as long as on a quiet machine something may take beside other tests, whose load nobody knows. The
+times themselves are printed; `benchmarks/results/faults.json` has those of quiet machines."""
+
+
 def wait_for(what: str, probe: Callable[[], T | None], timeout: float) -> T:
     """Poll `probe` until it returns something; fail naming `what` after `timeout` seconds."""
     deadline = time.monotonic() + timeout

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 import stickslip_workers
 import yaml
-from harness import wait_for
+from harness import PATIENCE, wait_for
 from machines import BUCKET, URL, Lab, Machine, dispatch
 
 CHART = Path(__file__).parents[1] / "deploy" / "helm" / "stickslip"
@@ -122,11 +122,10 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
             machines[name].start(command, tmp_path / f"{name}.log", is_pod=True)
 
         def expect(what: str, is_so: Callable[[], bool], limit: float) -> None:
-            """Wait; the limit [s] holds for a load of 4, as in test_chaos."""
-            seconds, load = lab.wait(what, is_so), os.getloadavg()[0]
+            """Wait; the limit [s] is that of a quiet machine."""
+            seconds = lab.wait(what, is_so, PATIENCE * limit)
             with capsys.disabled():
-                print(f"    {what:65} {seconds:5.1f} s, load {load:.1f}", flush=True)
-            assert seconds <= limit * max(1.0, load / 4), what
+                print(f"    {what:65} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
         def lose(name: str, how: Callable[[], None], what: str, limit: float) -> None:
             """Lose a node that is at work, and expect that all that the dispatcher had then is done."""
