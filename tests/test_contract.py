@@ -12,8 +12,7 @@ from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
-from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION, ClothSpec
-from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
@@ -102,8 +101,8 @@ class OtherClothSpec(ClothDragSpec):
 def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[JobSpec]) -> None:
     rods = {"gamma": 1.0, "phi0": 1.0, "phi1": 1.0}
     cloth = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
-    name = "cloth_drag" if issubclass(of, ClothSpec) else "rod_hang"
-    spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothSpec) else rods})
+    name = "cloth_drag" if issubclass(of, ClothDragSpec) else "rod_hang"
+    spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothDragSpec) else rods})
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         expand(spec, Terms(BUILDS, None))
     with pytest.raises(UnknownKindError, match="kind must be one of"):

@@ -10,7 +10,8 @@ from typing import Any
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec
+from stickslip_schemas.kinds.cloth.spec import ClipSpec
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import JobSpec
@@ -108,7 +109,7 @@ def _axes(kind: type[JobSpec]) -> Rows:
 def _keys(kind: type[JobSpec]) -> Rows:
     schema = kind.model_json_schema()
     fields = {name: field for name, field in schema["properties"].items() if name not in ("axes", "kind")}
-    if issubclass(kind, ClothSpec):
+    if issubclass(kind, ClothDragSpec):
         fields["frames"] = {**fields["frames"], "maximum": kind.instants}
     return {name: _field_row(name, field, schema) for name, field in fields.items()}
 

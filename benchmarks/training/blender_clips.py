@@ -15,8 +15,7 @@ import numpy as np
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
-from stickslip_schemas.kinds.cloth.drag_scene import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS
-from stickslip_schemas.kinds.cloth_drag import ClothDragRender
+from stickslip_schemas.kinds.cloth_drag import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS, ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.fabrics import HELD_OUT_TEXTURES, Texture
 from stickslip_schemas.spec.jobs import Quality

@@ -19,8 +19,7 @@ from stickslip_schemas.format.codecs import encode_clip, encode_sample
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
-from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
+from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS

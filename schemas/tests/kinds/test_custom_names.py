@@ -14,9 +14,7 @@ from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read_picture
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
-from stickslip_schemas.kinds.cloth.spec import ClothRender
-from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSpec, Viewpoint
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
@@ -66,7 +64,7 @@ def test_names_of_the_users_own_are_codes_after_the_built_in_ones() -> None:
 def test_documents_hold_what_is_the_users_own_and_nothing_else() -> None:
     for sample in samples(_spec(), BUILDS):
         render, point = sample.render, sample.labels
-        assert isinstance(render, ClothRender)
+        assert isinstance(render, ClothDragRender)
         assert render.image == (f"sha256:{'a' * 64}" if point["texture"] == "logo" else None)
         assert render.camera == (Calibration(**LAB).camera("lab") if point["viewpoint"] == "lab" else None)
         assert (render.lamp is None) == (point["lighting"] == "drawn")

@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
-from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.kinds.cloth_drag import Viewpoint
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import Material, Texture
 

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.kinds.cloth.spec import SELF_FRICTION
-from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec
+from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.kinds.cloth.drag_scene import Viewpoint
+from stickslip_schemas.kinds.cloth_drag import Viewpoint
 from stickslip_schemas.spec.cameras import Camera, load_rig, read_rigs, rig_digest, rig_names
 from stickslip_testing.cameras import looking_at
 

@@ -1,32 +1,80 @@
-"""A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
+"""A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3], seen by the rig `drag`."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from enum import StrEnum
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.base.document import Float
+from stickslip_schemas.base.document import Document, Float, Int
+from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.arrays import clip_arrays, forces, mesh_arrays, physical_arrays, solver_arrays
-from stickslip_schemas.kinds.cloth.drag_scene import DROP_LABELS, DragSceneSpec, LampAxis, ViewpointAxis
-from stickslip_schemas.kinds.cloth.names import Custom, SubstrateAxis, TextureAxis, definitions
-from stickslip_schemas.kinds.cloth.spec import (
-    PHYSICAL_AXES,
-    SELF_FRICTION,
-    ClothAxes,
-    ClothRender,
-    ClothSimulation,
-    seed_rules,
-)
-from stickslip_schemas.spec.appearance import FloorNumbers, Substrate
-from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.fabrics import CustomName
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, codes, fabric_arrays, over_time, solver_arrays
+from stickslip_schemas.kinds.cloth.names import VIEWPOINT, Custom, LampAxis, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
+from stickslip_schemas.spec.arrays import ArrayLayout, array
+from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, name_schema
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, SeedRule, Simulation
+
+RIG = "drag"
+"""The cameras; their names are those of the viewpoints."""
+
+SELF_FRICTION = 0.5
+"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011] measured none; this is the
+middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
 
-class ClothDragAxes(ClothAxes):
+class Viewpoint(StrEnum):
+    """Cameras of the rig `drag`; the first is calibrated on the real stage, and the last twelve are held out.
+
+    Their order gives the codes of the label `viewpoint`: add new ones at the end.
+    """
+
+    calibrated = "calibrated"
+    left = "left"
+    right = "right"
+    azimuth_minus_15 = "azimuth-minus-15"
+    azimuth_minus_10 = "azimuth-minus-10"
+    azimuth_minus_5 = "azimuth-minus-5"
+    azimuth_plus_5 = "azimuth-plus-5"
+    azimuth_plus_10 = "azimuth-plus-10"
+    azimuth_plus_15 = "azimuth-plus-15"
+    elevation_minus_15 = "elevation-minus-15"
+    elevation_minus_10 = "elevation-minus-10"
+    elevation_minus_5 = "elevation-minus-5"
+    elevation_plus_5 = "elevation-plus-5"
+    elevation_plus_10 = "elevation-plus-10"
+    elevation_plus_15 = "elevation-plus-15"
+
+
+TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
+HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
+"""`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
+
+Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
+Factor = Annotated[
+    float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
+]
+MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], TAGGED, SHORTHAND]
+FactorAxis = Annotated[
+    ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor], TAGGED, SHORTHAND
+]
+MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
+ViewpointAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]], SHORTHAND, VIEWPOINT
+]
+
+
+class ClothDragAxes(Document):
     """What a clip of dragged cloth depends on."""
 
+    material: MaterialAxis = Field(description="a measured fabric, or a custom one under `materials`")
+    mu: MuAxis = Field(description="friction coefficient between cloth and floor")
+    density: FactorAxis | None = Field(default=None, description="factor of the fabric's mass per area")
+    bending: FactorAxis | None = Field(default=None, description="factor of the fabric's bending rigidity")
+    stretching: FactorAxis | None = Field(default=None, description="factor of the fabric's stretching stiffness")
     texture: TextureAxis
     viewpoint: ViewpointAxis
     lighting: LampAxis = None
@@ -35,29 +83,76 @@ class ClothDragAxes(ClothAxes):
     )
 
 
-class ClothDragSimulation(ClothSimulation):
+PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
+"""The axes that a trajectory depends on."""
+
+
+class ClothDragSimulation(Simulation):
     """The trajectory of a dragged cloth: all that it depends on besides the build."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
+    material: str
+    fabric: FabricNumbers | None = Field(description="numbers of a custom material; null: a measured one")
+    density: float = 1.0
+    bending: float = 1.0
+    stretching: float = 1.0
+    mu: float
+    preset: PresetName
+    mesh: int
+    frames: int
+    seed: Seed
     self_friction: float | None = Field(description="null: the cloth passes through itself")
 
+    @property
+    def vertices(self) -> int:
+        """How many vertices its square has."""
+        return self.mesh**2
 
-class ClothDragRender(ClothRender):
+
+class ClothDragRender(ClipRender):
     """How a dragged cloth is seen."""
 
     kind: Literal["cloth_drag"] = "cloth_drag"
+    rig: str
+    rig_digest: Sha256
+    material: str
 
 
-class ClothDragSpec(DragSceneSpec):
+class ClothDragSpec(ClipSpec):
     """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3]."""
 
     simulation_type = ClothDragSimulation
     render_type = ClothDragRender
-    simulation_seeds, render_seeds = seed_rules(PHYSICAL_AXES, "viewpoint", "lighting", "substrate")
-    custom = DragSceneSpec.custom | {"substrate": Custom("substrates", "finish", tuple(Substrate))}
+    simulation_seeds = (SeedRule("seed", "bias", PHYSICAL_AXES),)
+    render_seeds = (
+        SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
+        SeedRule("crease_seed", "creases", PHYSICAL_AXES),
+    )
+    custom = (
+        {"material": Custom("materials", "fabric", tuple(Material))}
+        | dict(ClipSpec.custom)
+        | {"viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint))}
+    )
+    instants = 300
+    instants_per_second = 2.4
 
     kind: Literal["cloth_drag"]
     axes: ClothDragAxes
+    materials: dict[CustomName, FabricNumbers] = definitions("fabrics", "material", at_most=None)
+    preset: PresetName = Field(
+        default=PresetName.certified,
+        description="named solver settings",
+        json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
+    )
+    mesh: Int = Field(
+        default=41,
+        ge=5,
+        le=161,
+        description="vertices along a side of the square mesh",
+        json_schema_extra={
+            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
+        },
+    )
     self_friction: Float | None = Field(
         default=SELF_FRICTION,
         ge=0,
@@ -67,31 +162,72 @@ class ClothDragSpec(DragSceneSpec):
             "x-cost": "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth folds over itself"
         },
     )
-    substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
+
+    @property
+    def certified_preset(self) -> str:
+        return self.preset.value
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
         """Return the protocols of contact where self-contact is on."""
         return () if self.self_friction is None else CONTACT_PROTOCOLS
 
+    @property
+    def usual_costs(self) -> Costs:
+        """Usual CPU times; a drag takes 8 s at mesh 21, as vertices^1.15, and by fabric 0.3 to 3 times as much."""
+        preset = {PresetName.fast: 0.7, PresetName.fine: 1.7}.get(self.preset, 1.0)
+        return self.clip_costs(8.0 * preset * (self.mesh / 21) ** 2.3, unsure=3.0)
+
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return the group of samples of similar cost; self-contact raises the cost of a simulation."""
-        group = super().cost_group(stage, point)
-        return f"{group}, self-contact" if stage is Stage.simulate and self.self_friction is not None else group
+        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
+        if stage is Stage.render:
+            return super().cost_group(stage, point)
+        group = f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
+        return group if self.self_friction is None else f"{group}, self-contact"
 
     def simulation_settings(self) -> dict[str, Any]:
-        return super().simulation_settings() | {"self_friction": self.self_friction}
+        settings = {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
+        return settings | {"self_friction": self.self_friction}
+
+    def render_settings(self) -> dict[str, Any] | None:
+        return (super().render_settings() or {}) | {"rig": RIG, "rig_digest": rig_digest(RIG)}
+
+    def cameras(self) -> tuple[Camera, ...]:
+        """Return the cameras of the viewpoints, by name."""
+        return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
+        factors = (
+            array("density", "factor of the fabric's mass per area"),
+            array("bending", "factor of the fabric's rigidity against bending"),
+            array("stretching", "factor of the fabric's stiffness in its plane"),
+        )
         return (
             *clip_arrays(self),
-            *physical_arrays(self),
-            *DROP_LABELS,
+            codes("material", self.names("material")),
+            array("mu", "friction coefficient"),
+            *(factor for factor in factors if factor.name in self.named_axes),
+            *fabric_arrays(),
+            array("bias_side", "side to which gravity leaned during the drop, +1 or -1 along x", "int8", fill=0),
+            array("landed_side", "side of the holders on which the cloth landed, +1 or -1 along x", "int8", fill=0),
+            array("bias", "what broke the symmetry: horizontal over vertical gravity during the drop"),
             *solver_arrays(self),
-            *forces(
-                self,
-                contact_force="force of the floor on the cloth",
-                holder_force="force of the holders on the cloth",
-            ),
-            *mesh_arrays(self),
+            over_time(self, "contact_force", "force of the floor on the cloth [N]", of={"xyz": 3}),
+            over_time(self, "holder_force", "force of the holders on the cloth [N]", of={"xyz": 3}),
+            *(_mesh(self) if self.store_positions else ()),
         )
+
+
+def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
+    """Return the mesh and its motion.
+
+    Rest shape and triangles are the same for all samples of a dataset, and every sample has them all the same: a
+    repeated row costs some bytes, an array without the dimension `sample` would be an exception in every reader.
+    """
+    vertex, corners = {"vertex": spec.mesh**2}, {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
+    positions = "positions of the vertices [m]; the floor is z = 0"
+    return (
+        over_time(spec, "positions", positions, of=vertex | {"xyz": 3}, per_sample=True, is_trajectory=True),
+        array("rest", "the flat cloth (warp, weft) [m]", "float32", vertex | {"uv": 2}, is_recorded=True),
+        array("triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
+    )

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from itertools import combinations, product
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     BeforeValidator,
@@ -23,15 +23,14 @@ from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import Sha256, referred
 from stickslip_schemas.base.states import Stage
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, scene_segments
-from stickslip_schemas.kinds.cloth.drag_scene import LampAxis
-from stickslip_schemas.kinds.cloth.names import CUSTOM_LOOKS, VIEWPOINT, Custom, SubstrateAxis, TextureAxis, definitions
+from stickslip_schemas.kinds.cloth.names import VIEWPOINT, LampAxis, SubstrateAxis, TextureAxis
 from stickslip_schemas.kinds.cloth.scene_arrays import parameter_label, scene_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.bodies import MeshBody
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
-from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate
+from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import (
     SHORTHAND,
@@ -140,12 +139,6 @@ class ClothSceneSpec(ClipSpec):
     render_type = ClothSceneRender
     simulation_seeds = (SeedRule("seed", "bias", None),)
     render_seeds = (SeedRule("light_seed", "light", None), SeedRule("crease_seed", "creases", None))
-    custom: ClassVar[Mapping[str, Custom]] = {
-        "texture": CUSTOM_LOOKS["texture"],
-        "viewpoint": Custom("viewpoints", "camera", ()),
-        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
-        "substrate": Custom("substrates", "finish", tuple(Substrate)),
-    }
 
     kind: Literal["cloth_scene"]
     scene: Annotated[Scene, _BuiltIn(_built_in)] = Field(
@@ -155,8 +148,6 @@ class ClothSceneSpec(ClipSpec):
         default_factory=dict, max_length=64, description="other values of the scene for all samples, by path"
     )
     axes: ClothSceneAxes
-    lamps: dict[CustomName, LampNumbers] = definitions("lamps", "lighting")
-    substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
 
     # --- rules --------------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.kinds.cloth.drag_scene import DragSceneSpec
+from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.files import with_arrays
 from stickslip_schemas.spec.arrays import ArrayLayout
@@ -71,7 +71,7 @@ def _whole(track: Floats, chosen: npt.NDArray[np.int64]) -> list[list[int]]:
 def _bodies(data: SampleData, slot: int) -> list[dict[str, Any]]:
     """Return the bodies of the scene with the sample's own numbers, and their poses (instant, 3, 4)."""
     spec = data.manifest.spec
-    if isinstance(spec, DragSceneSpec):
+    if isinstance(spec, ClothDragSpec):
         return [{"type": "plane", "normal": [0, 0, 1]}]  # its floor, at z = 0
     if not isinstance(spec, ClothSceneSpec) or "body_pose" not in data.arrays:
         return []
@@ -110,7 +110,7 @@ def deformed(file: Mapping[str, Any], strength: float, times: Floats) -> Floats:
 def _holders(data: SampleData, slot: int, tracks: Mapping[str, Floats]) -> list[dict[str, Any]]:
     """Return the poses of holders (instant, 3, 4), and whether they hold (instant)."""
     spec = data.manifest.spec
-    if isinstance(spec, DragSceneSpec):  # at both corners of the upper edge
+    if isinstance(spec, ClothDragSpec):  # at both corners of the upper edge
         rest, (track,) = np.asarray(data.read("rest", slot), dtype=float), tracks.values()
         corners = [np.argmax(rest @ direction) for direction in ((-1, 1), (1, 1))]
         still = np.broadcast_to(np.eye(3), (len(track), 3, 3))

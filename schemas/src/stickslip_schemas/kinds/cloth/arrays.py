@@ -5,8 +5,8 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from stickslip_schemas.kinds.cloth.spec import ClipSpec, ClothSpec, GroundTruth
-from stickslip_schemas.spec.appearance import CLIP_SIZE, REGIONS, Lighting, Substrate
+from stickslip_schemas.kinds.cloth.spec import ClipSpec, GroundTruth
+from stickslip_schemas.spec.appearance import CLIP_SIZE, REGIONS
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
@@ -39,8 +39,8 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         *_ground_truth_arrays(spec, pixels),
         codes("texture", spec.names("texture")),
         codes("viewpoint", spec.names("viewpoint")),
-        codes("lighting", spec.names("lighting") if "lighting" in spec.custom else tuple(Lighting)),
-        codes("substrate", spec.names("substrate") if "substrate" in spec.custom else tuple(Substrate)),
+        codes("lighting", spec.names("lighting")),
+        codes("substrate", spec.names("substrate")),
         array("light_seed", "seed of the lamp, the floor and the noise", "int32"),
         array(
             "light", "azimuth and elevation of the lamp [degree], its power over the nominal", "float32", {"light": 3}
@@ -90,21 +90,6 @@ def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayL
     return tuple(replace(each, per_sample=True) for each in arrays if GroundTruth(each.name) in spec.ground_truth)
 
 
-def physical_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
-    """Return the labels of what the cloth is made of, and its friction."""
-    factors = (
-        array("density", "factor of the fabric's mass per area"),
-        array("bending", "factor of the fabric's rigidity against bending"),
-        array("stretching", "factor of the fabric's stiffness in its plane"),
-    )
-    return (
-        codes("material", spec.names("material")),
-        array("mu", "friction coefficient"),
-        *(factor for factor in factors if factor.name in spec.named_axes),
-        *fabric_arrays(),
-    )
-
-
 def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
     """Return the labels of the numbers of a fabric, whose names begin with a prefix."""
     rigidity = "plate rigidities along the warp, along the weft, and of twist [N m]"
@@ -151,34 +136,4 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
             for name, (text, limit) in CHECKS.items()
         ),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
-    )
-
-
-def forces(spec: ClipSpec, **texts: str) -> tuple[ArrayLayout, ...]:
-    """Return arrays of forces (xyz) [N] over time, by name."""
-    return tuple(over_time(spec, name, f"{text} [N]", of={"xyz": 3}) for name, text in texts.items())
-
-
-def mesh_arrays(spec: ClothSpec) -> tuple[ArrayLayout, ...]:
-    """Return the mesh and its motion; nothing where the spec does not keep it.
-
-    Rest shape and triangles are the same for all samples of a dataset, and every sample has them all the same: a
-    repeated row costs some bytes, an array without the dimension `sample` would be an exception in every reader.
-    """
-    if not spec.store_positions:
-        return ()
-    vertices, triangles = spec.mesh**2, 2 * (spec.mesh - 1) ** 2
-    return (
-        over_time(
-            spec,
-            "positions",
-            "positions of the vertices [m]; the floor is z = 0",
-            of={"vertex": vertices, "xyz": 3},
-            per_sample=True,
-            is_trajectory=True,
-        ),
-        array("rest", "the flat cloth (warp, weft) [m]", "float32", {"vertex": vertices, "uv": 2}, is_recorded=True),
-        array(
-            "triangles", "vertices of the triangles", "int32", {"triangle": triangles, "corner": 3}, is_recorded=True
-        ),
     )

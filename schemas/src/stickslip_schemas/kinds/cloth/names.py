@@ -9,19 +9,21 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import ArtifactRef, Sha256, referred
 from stickslip_schemas.scene.looks import View
-from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
+from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers, Lighting, Substrate
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, quantity
-from stickslip_schemas.spec.fabrics import CustomName, Material, Texture, did_you_mean, name_schema
+from stickslip_schemas.spec.fabrics import CustomName, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import JobSpec
 
 VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoints`")
-MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
 TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
     SHORTHAND,
     Field(description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"),
 ]
-LightingAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]], SHORTHAND]
+LampAxis = Annotated[
+    Annotated[ListAxis[Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]], SHORTHAND] | None,
+    Field(description="range of lamps, or a custom one under `lamps`; by default `drawn`"),
+]
 SubstrateAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]], SHORTHAND]
 
 
@@ -33,13 +35,6 @@ class Custom(NamedTuple):
     field: str
     """Of the document that takes it."""
     built_in: tuple[str, ...]
-
-
-CUSTOM_LOOKS = {
-    "material": Custom("materials", "fabric", tuple(Material)),
-    "texture": Custom("textures", "image", tuple(Texture)),
-}
-"""What specs of all kinds of cloth may add: see `NamingSpec.custom`."""
 
 
 def definitions(what: str, axis: str, more: str = "", *, at_most: int | None = 64) -> Any:
@@ -55,13 +50,20 @@ def definitions(what: str, axis: str, more: str = "", *, at_most: int | None = 6
 class NamingSpec(JobSpec):
     """A spec whose axes of names take custom names, which the spec defines."""
 
-    custom: ClassVar[Mapping[str, Custom]]
+    custom: ClassVar[Mapping[str, Custom]] = {
+        "texture": Custom("textures", "image", tuple(Texture)),
+        "viewpoint": Custom("viewpoints", "camera", ()),
+        "lighting": Custom("lamps", "lamp", tuple(Lighting)),
+        "substrate": Custom("substrates", "finish", tuple(Substrate)),
+    }
     """By axis of names, what the user may add to it."""
 
     textures: dict[CustomName, ArtifactRef] = definitions(
         "textures", "texture", ": `sha256:` and the digest that `stickslip upload` prints"
     )
     viewpoints: dict[CustomName, Calibration] = definitions("cameras", "viewpoint")
+    lamps: dict[CustomName, LampNumbers] = definitions("lamps", "lighting")
+    substrates: dict[CustomName, FloorNumbers] = definitions("floors", "substrate")
 
     def fields_of(self, axis: str) -> tuple[str, ...]:
         """Return the fields of documents that an axis sets: its name, and what the name means."""

@@ -2,28 +2,18 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base.document import Bool, Document, Float, Int
-from stickslip_schemas.base.keys import ArtifactRef, Sha256
+from stickslip_schemas.base.document import Bool, Float, Int
+from stickslip_schemas.base.keys import ArtifactRef
 from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.names import MaterialAxis, NamingSpec, definitions
+from stickslip_schemas.kinds.cloth.names import NamingSpec
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers, Lighting, Substrate, shown_frames
-from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
-from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers
-from stickslip_schemas.spec.jobs import Costs, PresetName, Quality, Render, SeedRule, Simulation
-
-Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
-Factor = Annotated[
-    float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
-]
-MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], TAGGED, SHORTHAND]
-FactorAxis = Annotated[
-    ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor], TAGGED, SHORTHAND
-]
+from stickslip_schemas.spec.axes import Seed
+from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.jobs import Costs, Quality, Render
 
 
 class GroundTruth(StrEnum):
@@ -36,52 +26,8 @@ class GroundTruth(StrEnum):
     flow = "flow"
 
 
-SELF_FRICTION = 0.5
-"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011] measured none; this is the
-middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
-
 SEGMENTS = ("background", "floor", "cloth", "prop")
 """Names of the codes of the array `segmentation` of a scene with one cloth: add new ones at the end."""
-
-
-class ClothAxes(Document):
-    """What the material of a cloth and its friction may be."""
-
-    material: MaterialAxis = Field(description="a measured fabric, or a custom one under `materials`")
-    mu: MuAxis = Field(description="friction coefficient between cloth and floor")
-    density: FactorAxis | None = Field(default=None, description="factor of the fabric's mass per area")
-    bending: FactorAxis | None = Field(default=None, description="factor of the fabric's bending rigidity")
-    stretching: FactorAxis | None = Field(default=None, description="factor of the fabric's stretching stiffness")
-
-
-PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
-"""The axes that a trajectory of dragged cloth depends on."""
-
-
-def seed_rules(physical: tuple[str, ...], *seen: str) -> tuple[tuple[SeedRule, ...], tuple[SeedRule, ...]]:
-    """Return the seeds of simulations and of renders, from the physical and the visual axes."""
-    light = SeedRule("light_seed", "light", (*physical, *seen))
-    return (SeedRule("seed", "bias", physical),), (light, SeedRule("crease_seed", "creases", physical))
-
-
-class ClothSimulation(Simulation):
-    """A cloth trajectory: all that it depends on besides the build."""
-
-    material: str
-    fabric: FabricNumbers | None = Field(description="numbers of a custom material; null: a measured one")
-    density: float = 1.0
-    bending: float = 1.0
-    stretching: float = 1.0
-    mu: float
-    preset: PresetName
-    mesh: int
-    frames: int
-    seed: Seed
-
-    @property
-    def vertices(self) -> int:
-        """How many vertices its square has."""
-        return self.mesh**2
 
 
 class ClipRender(Render):
@@ -114,14 +60,6 @@ class ClipRender(Render):
     def variant(self) -> str:
         """The texture, which no shading depends on: a name that is built in, or a reference to a picture."""
         return self.image or self.texture
-
-
-class ClothRender(ClipRender):
-    """How a square of cloth is seen by the cameras of a rig."""
-
-    rig: str
-    rig_digest: Sha256
-    material: str
 
 
 class ClipSpec(NamingSpec):
@@ -222,52 +160,3 @@ class ClipSpec(NamingSpec):
         if self.frames > self.instants:
             raise ValueError(f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}")
         return self
-
-
-class ClothSpec(ClipSpec):
-    """What the specs of the kinds of a square of cloth have in common."""
-
-    rig: ClassVar[str]
-    """The cameras; their names are those of the viewpoints."""
-
-    materials: dict[CustomName, FabricNumbers] = definitions("fabrics", "material", at_most=None)
-    preset: PresetName = Field(
-        default=PresetName.certified,
-        description="named solver settings",
-        json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
-    )
-    mesh: Int = Field(
-        default=41,
-        ge=5,
-        le=161,
-        description="vertices along a side of the square mesh",
-        json_schema_extra={
-            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
-        },
-    )
-
-    @property
-    def usual_costs(self) -> Costs:
-        """Usual CPU times; a drag takes 8 s at mesh 21, as vertices^1.15, and by fabric 0.3 to 3 times as much."""
-        preset = {PresetName.fast: 0.7, PresetName.fine: 1.7}.get(self.preset, 1.0)
-        return self.clip_costs(8.0 * preset * (self.mesh / 21) ** 2.3, unsure=3.0)
-
-    @property
-    def certified_preset(self) -> str:
-        return self.preset.value
-
-    def simulation_settings(self) -> dict[str, Any]:
-        return {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
-
-    def render_settings(self) -> dict[str, Any] | None:
-        return (super().render_settings() or {}) | {"rig": self.rig, "rig_digest": rig_digest(self.rig)}
-
-    def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras of the viewpoints, by name."""
-        return (*load_rig(self.rig), *(camera.camera(name) for name, camera in self.viewpoints.items()))
-
-    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
-        if stage is Stage.render:
-            return super().cost_group(stage, point)
-        return f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"

@@ -37,10 +37,10 @@ from stickslip_blender.workshop import Workshop, rejected, why_unfit
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask
-    from stickslip_schemas.kinds.cloth.spec import ClothRender
+    from stickslip_schemas.kinds.cloth_drag import ClothDragRender
     from stickslip_schemas.kinds.cloth_scene import ClothSceneRender
 
-    AnyLook = ClothRender | ClothSceneRender
+    AnyLook = ClothDragRender | ClothSceneRender
 
 _PREVIEW_SIDE = 160  # [px]
 
