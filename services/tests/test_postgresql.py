@@ -20,7 +20,6 @@ from sqlalchemy import func, select, text
 from sqlalchemy.exc import OperationalError
 from stickslip_schemas.base.states import JobState
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.app import main
 from stickslip_services.cli import app
 from stickslip_services.database.database import Role
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
 @pytest.fixture
 def settings(tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch) -> Settings:
     """Settings with a database on PostgreSQL, which processes find in their environment."""
-    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.clean())
+    monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.clean())
     return Settings(data=tmp_path / "data", durable=False)
 
 
@@ -405,7 +404,7 @@ def test_nothing_is_deleted_by_an_empty_database(
     settings: Settings, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     artifact = DirectoryStore(settings.store_place).publish(b"of a job that runs")
-    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.empty())
+    monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.empty())
     arguments = ["gc", "--data", str(settings.data), "--older-than", "0", "--delete"]
     result = CliRunner().invoke(app, arguments)
     assert (result.exit_code, "does not exist or is empty: name the --database" in result.stderr) == (1, True)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import httpx
 import pytest
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_testing.servers import wait_until
 
 if TYPE_CHECKING:
@@ -143,14 +142,14 @@ def test_a_port_that_is_taken_is_an_error(up: Up, tmp_path: Path) -> None:
 def test_only_the_coordinator_is_told_the_database(
     postgresql: "PostgresqlServer", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(DATABASE_VARIABLE, postgresql.clean())
+    monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.clean())
     up = Up(tmp_path)
     try:
         wait_until(lambda: bool(up.dispatchers()) and up.answers(), seconds=60)
         coordinator, dispatcher = (Path(f"/proc/{pid}") for pid in (up.coordinator(), *up.dispatchers()))
-        assert DATABASE_VARIABLE.encode() in (coordinator / "environ").read_bytes()
+        assert b"STICKSLIP_DATABASE" in (coordinator / "environ").read_bytes()
         assert b"postgresql" not in (coordinator / "cmdline").read_bytes()
-        assert DATABASE_VARIABLE.encode() not in (dispatcher / "environ").read_bytes()
+        assert b"STICKSLIP_DATABASE" not in (dispatcher / "environ").read_bytes()
         assert not (up.data / "coordinator.sqlite3").exists()
     finally:
         up.stop()

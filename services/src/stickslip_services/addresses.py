@@ -6,10 +6,6 @@ from ipaddress import ip_address
 
 DEFAULT_PORT = 8765
 DEFAULT_URL = f"http://127.0.0.1:{DEFAULT_PORT}"
-DATABASE_VARIABLE = "STICKSLIP_DATABASE"
-"""Environment variable with the URL of the database, which is not passed in command lines, because those are public."""
-PRIVATE_VARIABLES = (DATABASE_VARIABLE, "STICKSLIP_SECRETS_KEY")
-"""Variables with secrets that only the coordinator needs."""
 
 
 @lru_cache

@@ -7,7 +7,6 @@ The port is bound first, so that `--port 0` can print the port that it got. The 
 standard output means that requests are answered.
 """
 
-import argparse
 import asyncio
 import gc
 import json
@@ -20,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import click
 import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
@@ -28,7 +28,6 @@ from starlette.staticfiles import StaticFiles
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
-from stickslip_services.addresses import DEFAULT_PORT
 from stickslip_services.api import problems
 from stickslip_services.api.auth import KeyMiddleware, OriginMiddleware
 from stickslip_services.api.connections import PatientProtocol, allow_many_files
@@ -43,7 +42,7 @@ from stickslip_services.clock import Clock
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
-from stickslip_services.errors import DatabaseRefusedError, SettingsError
+from stickslip_services.errors import CommandError
 from stickslip_services.local.process import configure_logging, limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
@@ -52,7 +51,7 @@ from stickslip_services.queue.lease import renew_leases
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.sweep import scrub_when_idle, start, sweep
-from stickslip_services.settings import Settings
+from stickslip_services.settings import SERVER, Settings, options
 
 logger = logging.getLogger(__name__)
 
@@ -151,58 +150,42 @@ class _Server(uvicorn.Server):
             sys.stdout.flush()
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run until a signal arrives; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m stickslip_services.app", description="The coordinator.")
-    parser.add_argument("--data", type=Path, help="directory of the database and the store")
-    parser.add_argument("--store", help="directory of the store, or s3://BUCKET/PREFIX (DATA/store)")
-    parser.add_argument("--database", help="URL of a PostgreSQL database; STICKSLIP_DATABASE hides its password better")
-    parser.add_argument("--host", help="address to listen on (127.0.0.1)")
-    parser.add_argument("--port", type=int, help=f"port to listen on ({DEFAULT_PORT}; 0: any that is free)")
-    parser.add_argument("--allow-host", action="append", dest="allowed_hosts", help="name to be asked by; repeatable")
-    parser.add_argument("--require-keys", action="store_true", default=None, help="no request without a key")
-    parser.add_argument("--behind-proxy", action="store_true", default=None, help="a proxy in front speaks TLS")
-    parser.add_argument("--tls-certificate", type=Path, help="file with the certificate and its chain")
-    parser.add_argument("--tls-key", type=Path, help="file with the private key of the certificate")
-    parser.add_argument("--signing-key", type=Path, help="file with the key of OpenSSH that signs new versions")
-    parser.add_argument("--openapi", action="store_true", help="print the OpenAPI document and end")
-    parser.add_argument("--migrate", action="store_true", help="bring the database up to date, and end")
-    parser.add_argument("--fd", type=int, help="listen on this inherited socket instead")
-    chosen = vars(parser.parse_args(arguments))
-    if chosen.pop("openapi"):
+@click.command()
+@click.option("--openapi", is_flag=True, help="print the OpenAPI document and end")
+@click.option("--migrate", is_flag=True, help="bring the database up to date, and end")
+@click.option("--fd", type=int, help="listen on this inherited socket instead")
+@options(*SERVER)
+def _coordinator(settings: Settings, openapi: bool, migrate: bool, fd: int | None) -> int:
+    """Run a coordinator until a signal arrives."""
+    if openapi:
         sys.stdout.write(openapi_text())
         return 0
-    descriptor, is_migrating = chosen.pop("fd"), chosen.pop("migrate")
-    try:
-        settings = Settings.chosen(**chosen)
-        if settings.signing_key is not None:
-            sign(b"", settings.signing_key)
-    except (ClientError, SettingsError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
+    if settings.signing_key is not None:
+        sign(b"", settings.signing_key)
     configure_logging()
     limit_arenas()
+    check_database(settings, Role.visitor if migrate else Role.coordinator, with_store=True)
+    if migrate:
+        with opened(settings, Role.visitor):
+            return 0
+    # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
+    with locked(settings.data) if fd is None else nullcontext():
+        return _serve(settings, listen(settings.host, settings.port) if fd is None else socket.socket(fileno=fd))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the program; return its exit status."""
     try:
-        if is_migrating:
-            check_database(settings, Role.visitor, with_store=True)
-            with opened(settings, Role.visitor):
-                return 0
-        check_database(settings, Role.coordinator, with_store=True)
-        # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
-        with locked(settings.data) if descriptor is None else nullcontext():
-            return _serve(settings, descriptor)
-    except DatabaseRefusedError as error:
+        return int(_coordinator.main(arguments, "python -m stickslip_services.app", standalone_mode=False))
+    except click.ClickException as error:
+        error.show()
+    except (ClientError, CommandError) as error:
         sys.stderr.write(f"error: {error}\n")
-        return 2
+    return 2
 
 
-def _serve(settings: Settings, descriptor: int | None) -> int:
+def _serve(settings: Settings, listener: socket.socket) -> int:
     """Answer requests until a signal arrives; return the exit status."""
-    try:
-        listener = listen(settings.host, settings.port) if descriptor is None else socket.socket(fileno=descriptor)
-    except OSError as error:
-        sys.stderr.write(f"error: cannot listen on {settings.host}:{settings.port}: {error.strerror}\n")
-        return 2
     settings = settings.model_copy(update={"port": listener.getsockname()[1]})
     config = uvicorn.Config(
         make_app(settings),

@@ -1,9 +1,13 @@
 """Settings of the coordinator, from the environment (`STICKSLIP_...`) or the command line."""
 
+import functools
+import json
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
+import click
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
@@ -13,29 +17,35 @@ from stickslip_schemas.store import open_store, store_place
 from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
 from stickslip_services.errors import SettingsError
 
+R = TypeVar("R")
+
 
 class Settings(BaseSettings):
     """Paths, addresses, limits and times of the coordinator."""
 
-    model_config = SettingsConfigDict(env_prefix="STICKSLIP_", frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(
+        env_prefix="STICKSLIP_", frozen=True, extra="forbid", use_attribute_docstrings=True
+    )
 
     data: Path = Path("stickslip-data")
-    """Directory of the worker key, and by default of database and store."""
+    """Directory of keys and logs, and by default of database and store (stickslip-data)."""
     store: str | None = None
-    """Place of the store, a directory or `s3://BUCKET/PREFIX`; null: `data/store`."""
+    """Place of the store, a directory or `s3://BUCKET/PREFIX`; by default `store` in the data directory."""
     database: SecretStr | None = None
-    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; null: a SQLite file in `data`."""
+    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; give one with a password as STICKSLIP_DATABASE."""
     secrets_key: SecretStr | None = None
     """Key that seals secrets in the database, 32 bytes in base64; null: that of the file `data/secrets-key`."""
     host: str = "127.0.0.1"
+    """Address to listen on (127.0.0.1); off loopback only with keys, and with TLS or behind a proxy."""
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
+    """Port to listen on (8765); 0: any free one."""
 
     allowed_hosts: tuple[str, ...] = ()
-    """Accepted values of the Host header, besides loopback and `host`."""
+    """Name that the coordinator may be asked by, besides loopback names and `host`; repeatable."""
     require_keys: bool = False
-    """Whether requests on loopback need a key; others always do."""
+    """Refuse requests without a key on loopback, too."""
     behind_proxy: bool = False
-    """Whether a proxy terminates TLS in front of the coordinator. Requests then need keys."""
+    """A proxy in front of the coordinator terminates TLS; requests need keys."""
     tls_certificate: Path | None = None
     """File of the TLS certificate and its chain."""
     tls_key: Path | None = None
@@ -72,9 +82,9 @@ class Settings(BaseSettings):
 
     @classmethod
     def chosen(cls, **values: Any) -> Self:
-        """Return settings with these values, those that are None from the environment; raise SettingsError."""
+        """Return settings with these values, those that are not given from the environment; raise SettingsError."""
         try:
-            return cls(**{name: value for name, value in values.items() if value is not None})
+            return cls(**{name: value for name, value in values.items() if value not in (None, ())})
         except ValidationError as error:
             rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
             raise SettingsError("; ".join(rules)) from None
@@ -170,3 +180,47 @@ class Settings(BaseSettings):
     def url(self) -> str:
         """URL of the coordinator on this machine."""
         return http_url(reachable(self.host), self.port, tls=self.tls_certificate is not None)
+
+    @property
+    def variables(self) -> dict[str, str]:
+        """Environment variables that give another process these settings, secrets included."""
+        found = {}
+        for name in sorted(self.model_fields_set):
+            value = getattr(self, name)
+            text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
+            found[f"STICKSLIP_{name.upper()}"] = json.dumps(value) if isinstance(value, tuple) else text
+        return found
+
+
+def options(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Give a command options for some settings: it gets the settings first, those without an option as by default."""
+
+    def decorate(command: Callable[..., R]) -> Callable[..., R]:
+        @functools.wraps(command)
+        def run(**given: Any) -> R:
+            return command(Settings.chosen(**{name: given.pop(name) for name in names}), **given)
+
+        for name in reversed(names):
+            field = Settings.model_fields[name]
+            flag = "--allow-host" if name == "allowed_hosts" else f"--{name.replace('_', '-')}"
+            run = click.option(flag, name, help=field.description, **_KINDS.get(field.annotation, {}))(run)
+        return run
+
+    return decorate
+
+
+_PATH = click.Path(path_type=Path)
+_KINDS: dict[Any, dict[str, Any]] = {
+    bool: {"is_flag": True, "default": None},
+    int: {"type": click.IntRange(0, 65535)},  # the only one is a port
+    tuple[str, ...]: {"multiple": True},
+    Path: {"type": _PATH},
+    Path | None: {"type": _PATH},
+}
+"""How an option reads a setting, by its type."""
+
+SERVER = (
+    *("data", "store", "database", "host", "port", "allowed_hosts", "require_keys", "behind_proxy"),
+    *("tls_certificate", "tls_key", "signing_key"),
+)
+"""Settings that are options of a coordinator."""

@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, insert, select
@@ -52,11 +51,10 @@ def read_audit_log(connection: Connection, *, subject: str | None = None, limit:
 
 
 @contextmanager
-def visited(data: Path, database_url: str | None) -> Iterator[Connection]:
-    """Open a write transaction on the database of `data`, or at a URL, for a command on this machine.
+def visited(settings: Settings) -> Iterator[Connection]:
+    """Open a write transaction on a database for a command on this machine; raise DatabaseRefusedError.
 
-    A coordinator may run meanwhile. Raises DatabaseRefusedError or SettingsError.
+    A coordinator may run meanwhile.
     """
-    settings = Settings.chosen(data=data, database=database_url)
     with asking(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
         yield connection

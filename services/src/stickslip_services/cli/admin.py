@@ -6,7 +6,7 @@ may write the data directory may make keys.
 
 import json
 import time
-from pathlib import Path
+from collections.abc import Callable
 
 import click
 
@@ -15,10 +15,15 @@ from stickslip_services.access import keys as stored_keys
 from stickslip_services.access import projects as stored_projects
 from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.asker import Scope
-from stickslip_services.cli.common import administers, print_table, say
-from stickslip_services.settings import Settings
+from stickslip_services.cli.common import print_table, say, shows_errors
+from stickslip_services.settings import Settings, options
 
 webhook_argument = click.argument("webhook", help="id, as `stickslip webhooks list` shows it")
+
+
+def administers(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of a coordinator's database, and show its errors."""
+    return shows_errors(options("data", "database")(command))
 
 
 @click.group()
@@ -39,9 +44,9 @@ def keys() -> None:
     "--project", default="", help="project of the jobs that it submits: projects share leases, and may have quotas"
 )
 @administers
-def create_key(name: str, scope: tuple[Scope, ...], project: str, data: Path, database: str | None) -> None:
+def create_key(settings: Settings, name: str, scope: tuple[Scope, ...], project: str) -> None:
     """Make a key and print it. It is shown only once, because the database keeps only its digest."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
     say(f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
@@ -50,9 +55,9 @@ def create_key(name: str, scope: tuple[Scope, ...], project: str, data: Path, da
 
 @keys.command("list")
 @administers
-def list_keys(data: Path, database: str | None) -> None:
+def list_keys(settings: Settings) -> None:
     """List all keys, newest first, including revoked ones."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         found = stored_keys.list_keys(connection)
     rows = (
         (
@@ -71,9 +76,9 @@ def list_keys(data: Path, database: str | None) -> None:
 @keys.command("revoke")
 @click.argument("key_id", metavar="KEY", help="id of a key, as `stickslip keys list` shows it")
 @administers
-def revoke_key(key_id: str, data: Path, database: str | None) -> None:
+def revoke_key(settings: Settings, key_id: str) -> None:
     """Revoke a key. A running coordinator refuses it within a second."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         stored_keys.revoke_key(connection, key_id, time.time())
     click.echo(f"{key_id} is revoked")
 
@@ -85,9 +90,9 @@ def projects() -> None:
 
 @projects.command("list")
 @administers
-def list_projects(data: Path, database: str | None) -> None:
+def list_projects(settings: Settings) -> None:
     """List projects with their quotas, and the jobs and samples in progress that count against them."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         found = stored_projects.list_projects(connection)
     rows = []
     for project in found:
@@ -101,9 +106,9 @@ def list_projects(data: Path, database: str | None) -> None:
 @click.option("--samples", type=click.IntRange(0), help="most samples of jobs in progress; default: any number")
 @click.option("--jobs", type=click.IntRange(0), help="most jobs in progress; default: any number")
 @administers
-def set_quota(name: str, samples: int | None, jobs: int | None, data: Path, database: str | None) -> None:
+def set_quota(settings: Settings, name: str, samples: int | None, jobs: int | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
     click.echo(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
@@ -122,10 +127,10 @@ def webhooks() -> None:
 @click.argument("url", help="receiver of the events: https://..., or http:// on this machine")
 @click.option("--project", default="", help="project whose jobs it hears of; default: jobs without one")
 @administers
-def create_webhook(url: str, project: str, data: Path, database: str | None) -> None:
+def create_webhook(settings: Settings, url: str, project: str) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
-    with audit.visited(data, database) as connection:
-        sealing = stored_keys.sealer(Settings.chosen(data=data))
+    with audit.visited(settings) as connection:
+        sealing = stored_keys.sealer(settings)
         webhook_id, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
     click.echo(secret)
     say(f"{webhook_id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
@@ -133,9 +138,9 @@ def create_webhook(url: str, project: str, data: Path, database: str | None) -> 
 
 @webhooks.command("list")
 @administers
-def list_webhooks(data: Path, database: str | None) -> None:
+def list_webhooks(settings: Settings) -> None:
     """List webhooks, newest first, with their faults."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         found = stored_webhooks.list_webhooks(connection, time.time())
     rows = []
     for webhook in found:
@@ -148,9 +153,9 @@ def list_webhooks(data: Path, database: str | None) -> None:
 @webhooks.command("retry")
 @webhook_argument
 @administers
-def retry_webhook(webhook: str, data: Path, database: str | None) -> None:
+def retry_webhook(settings: Settings, webhook: str) -> None:
     """Send again at once, also after the webhook was given up. No event since then is left out."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         stored_webhooks.retry_webhook(connection, webhook, time.time())
     click.echo(f"{webhook} is tried again")
 
@@ -158,9 +163,9 @@ def retry_webhook(webhook: str, data: Path, database: str | None) -> None:
 @webhooks.command("delete")
 @webhook_argument
 @administers
-def delete_webhook(webhook: str, data: Path, database: str | None) -> None:
+def delete_webhook(settings: Settings, webhook: str) -> None:
     """Delete a webhook."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         stored_webhooks.delete_webhook(connection, webhook, time.time())
     click.echo(f"{webhook} is deleted")
 
@@ -170,9 +175,9 @@ def delete_webhook(webhook: str, data: Path, database: str | None) -> None:
 @click.option("--limit", type=click.IntRange(1), default=100, help="most entries to show")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON document a line, for programs")
 @administers
-def audit_log(subject: str | None, data: Path, database: str | None, limit: int, as_json: bool) -> None:
+def audit_log(settings: Settings, subject: str | None, limit: int, as_json: bool) -> None:
     """Show who changed what and when, newest first."""
-    with audit.visited(data, database) as connection:
+    with audit.visited(settings) as connection:
         entries = audit.read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:

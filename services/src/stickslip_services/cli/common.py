@@ -25,7 +25,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 FILE = click.Path(path_type=Path)
-DEFAULT_DATA = Path("stickslip-data")
 _SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "zarr"})
 """Modules that the extra `arrays` installs; one that is missing is no fault of ours."""
@@ -36,11 +35,6 @@ url_option = click.option("--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, 
 json_option = click.option("--json", "as_json", is_flag=True, help="print JSON for programs")
 spec_argument = click.argument("file", type=FILE, help="a JobSpec, YAML or JSON")
 job_argument = click.argument("job_id", metavar="JOB", help="id of a job")
-data_option = click.option("--data", type=FILE, default=DEFAULT_DATA, help="data directory of the coordinator")
-database_option = click.option(
-    "--database", help="URL of a PostgreSQL database; give one with a password as STICKSLIP_DATABASE"
-)
-store_option = click.option("--store", help="directory of the store, or s3://BUCKET/PREFIX, if it is not DATA/store")
 
 
 def amount(unit: str, least: float) -> Callable[[str], float]:
@@ -147,11 +141,6 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
 def asks(command: Callable[P, R]) -> Callable[P, R]:
     """Give a command the option `--url` of a coordinator, and show its errors."""
     return url_option(shows_errors(command))
-
-
-def administers(command: Callable[P, R]) -> Callable[P, R]:
-    """Give a command the options of a coordinator's database, and show its errors."""
-    return data_option(database_option(shows_errors(command)))
 
 
 def _print_error(message: str) -> None:

@@ -13,7 +13,7 @@ from stickslip_services import __version__
 
 _COMMANDS = {
     "up": "service.up",
-    "workers": "service.workers",
+    "workers": "workers.workers",
     "validate": "jobs.validate",
     "upload": "jobs.upload",
     "submit": "jobs.submit",
@@ -57,7 +57,7 @@ _COMPLETIONS = {
 def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
     module, attribute = _COMMANDS[name].split(".")
-    if module in ("admin", "maintenance"):  # they import the server, which a client lacks
+    if module in ("admin", "maintenance", "service"):  # they import the server, which a client lacks
         from stickslip_services.cli.common import require_server, shows_errors
 
         shows_errors(require_server)()

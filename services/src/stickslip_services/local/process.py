@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from stickslip_services.errors import DatabaseRefusedError
+from stickslip_services.errors import DatabaseRefusedError, ListeningError
 
 _M_ARENA_MAX = -8  # of glibc's malloc.h
 
@@ -25,7 +25,7 @@ def limit_arenas() -> None:
 def locked(data: Path) -> Iterator[int]:
     """Hold the lock of a data directory, which one coordinator or one `stickslip up` may use at a time.
 
-    Yield the file descriptor of the lock. Child processes inherit it, so the lock is held until the last one ends.
+    Yield the file descriptor of the lock. A process that inherits it holds the lock, too, until it ends.
     Raise DatabaseRefusedError if another process holds it.
     """
     data.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -39,39 +39,27 @@ def locked(data: Path) -> Iterator[int]:
             except BlockingIOError:
                 holder = path.read_text(encoding="utf-8").strip()
                 # After a kill of `stickslip up`, its coordinator holds the lock for another moment.
-                if _is_alive(holder) or time.monotonic() > deadline:
+                if Path("/proc", holder or "nobody").exists() or time.monotonic() > deadline:
                     message = f"{path.parent} is in use by another `stickslip up` or coordinator (pid {holder})"
                     raise DatabaseRefusedError(message) from None
                 time.sleep(0.1)
         file.truncate(0)
         file.write(f"{os.getpid()}\n")
         file.flush()
-        os.set_inheritable(file.fileno(), True)
         yield file.fileno()
 
 
-def _is_alive(pid: str) -> bool:
-    if not pid.isdecimal():
-        return False
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a port, but does not accept connections yet."""
+    """Return a socket that is bound to a port, but does not accept connections yet; raise ListeningError."""
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(address)
-    except OSError:
+    except OSError as error:
         listener.close()
-        raise
+        rule = f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
+        raise ListeningError(rule) from error
     return listener
 
 

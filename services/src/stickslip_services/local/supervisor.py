@@ -9,7 +9,6 @@ import ctypes
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,7 +21,6 @@ from types import FrameType
 import httpx
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.addresses import DATABASE_VARIABLE, PRIVATE_VARIABLES
 from stickslip_services.errors import SupervisorError
 from stickslip_services.local.process import listen, locked
 from stickslip_services.settings import Settings
@@ -34,21 +32,10 @@ SOON_SECONDS = 5.0
 MAX_FAILED_STARTS = 5
 STOP_SECONDS = {"dispatcher": 6.0, "ray": 4.0, "coordinator": 4.0}
 """Time limit for each child to stop before it is killed [s]."""
+_PRIVATE = ("STICKSLIP_DATABASE", "STICKSLIP_SECRETS_KEY")
+"""Variables with secrets that only the coordinator needs."""
 _TICK = 0.1
 _PR_SET_PDEATHSIG = 1
-
-
-@dataclass(frozen=True, slots=True)
-class LocalService:
-    """Settings of `stickslip up`."""
-
-    settings: Settings
-    """Of the coordinator. `data` is an absolute path."""
-    name: str = "local"
-    """Name of the dispatcher among all that have the same database."""
-    slots: int | None = None
-    workers: str | None = None
-    """Another command than `python -m stickslip_workers`, for tests."""
 
 
 @dataclass(slots=True)
@@ -58,7 +45,7 @@ class _Child:
     log: Path
     inherited: tuple[int, ...] = ()
     private: dict[str, str] = field(default_factory=dict)
-    """Variables with secrets, for this process only."""
+    """Variables for this process only."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0
@@ -66,7 +53,7 @@ class _Child:
 
     def start(self) -> None:
         """Start in a new session, so that Ctrl-C reaches only the supervisor, which stops children in order."""
-        others = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
+        others = {name: value for name, value in os.environ.items() if name not in _PRIVATE}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 self.command,
@@ -100,7 +87,8 @@ class _Child:
                 f"The end of {self.log}:\n{self.last_words()}"
             )
         wait = 0.0 if self.failed_starts == 0 else 0.25 * 2**self.failed_starts
-        _say(f"the {self.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
+        again = f"starting it again in {wait:g} s" if wait else "starting it again"
+        sys.stderr.write(f"{time.strftime('%H:%M:%S')} the {self.name} {how}; {again}\n")
         self.start_again_at = time.monotonic() + wait
 
     def stop(self, is_urgent: Callable[[], bool]) -> None:
@@ -134,28 +122,43 @@ class _Child:
             os.killpg(self.process.pid, signal.SIGKILL)
 
 
-def run(service: LocalService, *, on_ready: Callable[[str], None]) -> int:
-    """Run until a signal to stop; return the exit status. Raise SupervisorError."""
-    settings = service.settings
+def run(
+    settings: Settings, *, name: str, slots: int | None, workers: str | None, on_ready: Callable[[str], None]
+) -> int:
+    """Run until a signal to stop; return the exit status. Raise SupervisorError.
+
+    `settings` are those of the coordinator, with an absolute path of `data`; `name` is that of the dispatcher among all
+    that have the same database. `workers` is another command than `python -m stickslip_workers`, for tests.
+    """
     data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
         signals = stack.enter_context(_stop_signals())
         # The supervisor owns the socket, so requests wait while the coordinator restarts.
-        listener = _listen(settings.host, settings.port)
-        stack.callback(listener.close)
+        listener = stack.enter_context(listen(settings.host, settings.port))
+        listener.listen(512)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+        program = [sys.executable, "-m", "stickslip_workers"] if workers is None else shlex.split(workers)
         coordinator = _Child(
             "coordinator",
-            _coordinator_command(settings, listener.fileno()),
+            [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--fd", str(listener.fileno())],
             data / "logs" / "coordinator.log",
             (lock, listener.fileno()),
-            {name: os.environ[name] for name in PRIVATE_VARIABLES if name in os.environ}
-            | ({} if settings.database is None else {DATABASE_VARIABLE: settings.database.get_secret_value()}),
+            settings.variables,
         )
-        ray = _Child("ray", _ray_command(service, data), data / "logs" / "ray.log")
-        dispatcher = _Child("dispatcher", _dispatcher_command(service, settings), data / "logs" / "dispatcher.log")
+        head = [*program, "head", "--ray-data", str(data), *([] if slots is None else ["--cpus", str(slots)])]
+        ray = _Child("ray", head, data / "logs" / "ray.log")
+        places = {
+            "--ray-data": data,
+            "--url": settings.url,
+            "--store": settings.store_place,
+            "--name": name,
+            "--key-file": settings.worker_key_path,
+            "--tls-certificate": settings.tls_certificate,
+        }
+        words = [str(word) for place in places.items() if place[1] is not None for word in place]
+        dispatcher = _Child("dispatcher", [*program, "dispatch", "--once", *words], data / "logs" / "dispatcher.log")
         children = [coordinator, ray, dispatcher]
         try:
             coordinator.start()
@@ -174,53 +177,6 @@ def run(service: LocalService, *, on_ready: Callable[[str], None]) -> int:
             for child in reversed(children):  # the dispatcher first, which returns its leases
                 child.stop(lambda: len(signals) > 1)
             (data / "url").unlink(missing_ok=True)
-
-
-def _say(message: str) -> None:
-    """Write a line with the time on standard error."""
-    sys.stderr.write(f"{time.strftime('%H:%M:%S')} {message}\n")
-
-
-def _coordinator_command(settings: Settings, listener: int) -> list[str]:
-    module = "stickslip_services.app"
-    place = ["--data", str(settings.data), "--host", settings.host, "--port", str(settings.port), "--fd", str(listener)]
-    place += [] if settings.store is None else ["--store", settings.store]
-    auth = [f"--allow-host={host}" for host in settings.allowed_hosts]
-    auth += ["--require-keys"] if settings.require_keys else []
-    auth += ["--behind-proxy"] if settings.behind_proxy else []
-    if settings.tls_certificate is not None:
-        auth += ["--tls-certificate", str(settings.tls_certificate), "--tls-key", str(settings.tls_key)]
-    auth += [] if settings.signing_key is None else ["--signing-key", str(settings.signing_key)]
-    return [sys.executable, "-m", module, *place, *auth]
-
-
-def _workers_program(service: LocalService) -> list[str]:
-    return [sys.executable, "-m", "stickslip_workers"] if service.workers is None else shlex.split(service.workers)
-
-
-def _ray_command(service: LocalService, data: Path) -> list[str]:
-    slots = [] if service.slots is None else ["--cpus", str(service.slots)]
-    return [*_workers_program(service), "head", "--ray-data", str(data), *slots]
-
-
-def _dispatcher_command(service: LocalService, settings: Settings) -> list[str]:
-    pinned = [] if settings.tls_certificate is None else ["--tls-certificate", str(settings.tls_certificate)]
-    return [
-        *_workers_program(service),
-        "dispatch",
-        "--once",
-        "--ray-data",
-        str(settings.data),
-        "--url",
-        settings.url,
-        "--store",
-        settings.store_place,
-        "--name",
-        service.name,
-        "--key-file",
-        str(settings.worker_key_path),
-        *pinned,
-    ]
 
 
 def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int]) -> bool:
@@ -261,18 +217,6 @@ def _stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    try:
-        listener = listen(host, port)
-    except OSError as error:
-        raise SupervisorError(
-            f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
-        ) from error
-    listener.listen(512)
-    listener.set_inheritable(True)
-    return listener
 
 
 def _die_with_parent() -> None:
