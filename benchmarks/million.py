@@ -36,7 +36,6 @@ from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest
 from stickslip_services.queue.planner import Planner
@@ -338,7 +337,7 @@ def main() -> None:
     parser.add_argument("--delay", type=float, default=0.025, help="of each request to the store [s]")
     arguments = parser.parse_args()
     if arguments.database is not None:
-        os.environ[DATABASE_VARIABLE] = arguments.database
+        os.environ["STICKSLIP_DATABASE"] = arguments.database
     measure = plan if arguments.what == "plan" else partial(publish, delay=arguments.delay)
     print(json.dumps(measure(arguments.samples), indent=2))
 

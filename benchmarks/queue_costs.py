@@ -28,7 +28,6 @@ import httpx
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
 from stickslip_services.access.asker import Scope
 from stickslip_services.access.keys import create_key
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.api.connections import allow_many_files
 from stickslip_services.api.sse import MOST_STREAMS
 from stickslip_services.database.database import Role
@@ -83,7 +82,7 @@ def report_lease_and_complete(server: ServerProcess, worker: PretendWorker, batc
     wall, spent, other = time.perf_counter() - begin, cpu_seconds(server) - cpu, database_seconds() - other
     print(
         f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, {done / wall:.0f} a second"
-        + (f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL" if DATABASE_VARIABLE in os.environ else "")
+        + (f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL" if "STICKSLIP_DATABASE" in os.environ else "")
     )
 
 
@@ -268,7 +267,7 @@ def report_heartbeats(server: ServerProcess, worker: PretendWorker, held: int, s
     print(
         f"heartbeats with {held} leases, {senders} workers: {total / seconds:.0f} a second beside the load of this "
         f"machine; {spent:.2f} CPU ms each, so one core takes {1e3 / spent:.0f} a second; {sender:.2f} CPU ms to send"
-        + (f", {database:.2f} of PostgreSQL" if DATABASE_VARIABLE in os.environ else "")
+        + (f", {database:.2f} of PostgreSQL" if "STICKSLIP_DATABASE" in os.environ else "")
     )
 
 
@@ -284,7 +283,7 @@ def main() -> None:
     parser.add_argument("--database", help="URL of an empty PostgreSQL database")
     options = parser.parse_args()
     if options.database is not None:
-        os.environ[DATABASE_VARIABLE] = options.database
+        os.environ["STICKSLIP_DATABASE"] = options.database
     allow_many_files()
     with tempfile.TemporaryDirectory() as directory:
         server = start_server(Path(directory) / "data")

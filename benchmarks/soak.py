@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 
 from stickslip_schemas.format.manifest import Contents, Manifest
 from stickslip_schemas.store import open_store
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.client import Client, ClientError, ProblemError, pull, verify
 from stickslip_services.client.errors import DamagedError
@@ -285,7 +284,7 @@ def database_and_bucket() -> Iterator[str]:
     programs = find_programs()
     assert programs is not None, "the PostgreSQL server is not installed: apt-get install postgresql"
     with postgresql_server(programs) as server, s3_proxy() as proxy:
-        os.environ |= variables(proxy) | {DATABASE_VARIABLE: server.empty()}
+        os.environ |= variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}
         make_bucket(proxy, "soak")
         proxy.some(1, FAULTS)
         yield "s3://soak/lab"

@@ -11,7 +11,6 @@ from shutil import copyfile
 from typing import TYPE_CHECKING
 
 import pytest
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import connect, opened
 from stickslip_services.queue.context import Context
@@ -81,7 +80,7 @@ def database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     chosen: str = getattr(request, "param", "sqlite")
     if chosen == "postgresql":
         server: PostgresqlServer = request.getfixturevalue("postgresql")
-        monkeypatch.setenv(DATABASE_VARIABLE, server.clean())
+        monkeypatch.setenv("STICKSLIP_DATABASE", server.clean())
     return chosen
 
 

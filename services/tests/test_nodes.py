@@ -21,7 +21,6 @@ from click.testing import CliRunner
 from sqlalchemy import select
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.store import open_store
-from stickslip_services.addresses import DATABASE_VARIABLE
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
 from stickslip_services.database.opening import connect
@@ -47,7 +46,7 @@ def settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest
         return Settings.chosen(data=tmp_path / "a", durable=False)
     bucket = request.getfixturevalue("bucket")
     request.getfixturevalue("s3").some(1, FAULTS)
-    monkeypatch.setenv(DATABASE_VARIABLE, request.getfixturevalue("postgresql").clean())
+    monkeypatch.setenv("STICKSLIP_DATABASE", request.getfixturevalue("postgresql").clean())
     return Settings.chosen(data=tmp_path / "a", store=bucket, durable=False)
 
 

@@ -262,7 +262,7 @@ def test_jobs_are_searched_filtered_and_ordered(client: httpx.Client, app: FastA
     client.post(f"/ui/jobs/{second}/cancel")
 
     def shown(query: str) -> list[str]:
-        return re.findall(r'<a href="/jobs/(job-[0-9a-z]+)">', read(client, f"/ui/jobs?{query}"))
+        return re.findall(r'<a href="/jobs/(job-[0-9a-z]+)">', read(client, f"/?{query}"))
 
     assert shown("") == [second, first]
     assert shown("order=oldest") == [first, second]

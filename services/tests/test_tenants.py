@@ -42,8 +42,6 @@ SHARED = {
     ("GET", "/datasets"),
     ("GET", "/docs"),
     ("GET", "/scenes"),
-    ("GET", "/ui/jobs"),
-    ("GET", "/ui/workers"),
     ("GET", "/workers"),
 }
 """Operations that every project may call. They must tell nothing of another project."""
@@ -77,7 +75,7 @@ OWNED = {
         for rest in ("", "/manifest", "/files/{path:path}")
     ),
     ("GET", "/jobs/{job_id}"),
-    *(("GET", f"/ui/jobs/{{job_id}}{rest}") for rest in ("", "/map", "/slowest")),
+    *(("GET", f"/ui/jobs/{{job_id}}/{part}") for part in ("map", "slowest")),
     ("POST", "/ui/jobs/{job_id}/{verb}"),
     ("GET", "/datasets/{dataset}"),
     ("GET", "/datasets/{dataset}/v{version}"),

@@ -148,7 +148,7 @@ def get_picture(
     array: str,
     index: Annotated[int, Path(ge=0)],
     request: Request,
-    step: Annotated[int, Query(ge=1, le=8)] = 1,
+    step: Step = 1,
 ) -> Response:
     """Return a picture or a frame of ground truth of a sample as PNG; `step` takes every `step`-th pixel."""
     data = opened.data

@@ -2,13 +2,12 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from urllib.parse import urlencode
 
 import numpy as np
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
-from sqlalchemy import Connection
 from stickslip_schemas.base.states import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
@@ -70,16 +69,6 @@ FilterDep = Annotated[JobFilter, Query()]
 @router.get("/")
 def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
     """Show the jobs."""
-    return html_page("jobs.html", here="jobs", url=context.settings.url, **_jobs(context, chosen))
-
-
-@router.get("/ui/jobs")
-def get_jobs_part(context: ContextDep, chosen: FilterDep) -> Response:
-    """Show the list of jobs without its page."""
-    return html_page("jobs_list.html", **_jobs(context, chosen))
-
-
-def _jobs(context: Context, chosen: JobFilter) -> dict[str, Any]:
     with context.database.read() as connection:
         page = list_jobs(
             context,
@@ -90,43 +79,42 @@ def _jobs(context: Context, chosen: JobFilter) -> dict[str, Any]:
             chosen.project,
             newest_first=chosen.order == "newest",
         )
-        values = {"workers": len(alive_workers(context, connection)), "projects": job_projects(connection)}
+        workers, projects = len(alive_workers(context, connection)), job_projects(connection)
     query = chosen.model_dump(mode="json", exclude_defaults=True)
-    more = None if page.next_page_token is None else urlencode(query | {"after": page.next_page_token})
-    return values | {"jobs": page.items, "more": more, "chosen": chosen, "query": query, "states": JobState}
+    return html_page(
+        "jobs.html",
+        here="jobs",
+        jobs=page.items,
+        more=page.next_page_token and urlencode(query | {"after": page.next_page_token}),
+        workers=workers,
+        projects=projects,
+        chosen=chosen,
+        query=query,
+        states=JobState,
+    )
 
 
 @router.get("/jobs/{job_id}")
 def get_job(job_id: str, context: ContextDep) -> Response:
     """Show a job."""
     with context.database.read() as connection:
-        values = _job(context, connection, job_id)
-    return html_page("job.html", here="jobs", spec=spec_text(values["job"].spec), **values)
-
-
-@router.get("/ui/jobs/{job_id}")
-def get_job_part(job_id: str, context: ContextDep) -> Response:
-    """Show the part of a job's page that changes."""
-    with context.database.read() as connection:
-        return html_page("job_state.html", **_job(context, connection, job_id))
-
-
-def _job(context: Context, connection: Connection, job_id: str) -> dict[str, Any]:
-    seq = int(find_job(connection, job_id).seq)
-    job: JobDetail = show_job(context, connection, seq)
-    rejected = list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items
-    end = context.clock() if job.finished_at is None else job.finished_at.timestamp()
-    return {
-        "job": job,
-        "durations": stage_durations(connection, seq),
-        "elapsed": None if job.started_at is None else end - job.started_at.timestamp(),
-        "costs": estimated(job.spec, count(job.spec), {}, 0),
-        "previews": newest_previews(connection, seq, 24),
-        "rejected": rejected,
-        "failed": failed_tasks(connection, seq, context.settings, SHOWN_LOST),
-        "states": JobState,
-        "url": context.settings.url,
-    }
+        seq = int(find_job(connection, job_id).seq)
+        job = show_job(context, connection, seq)
+        end = context.clock() if job.finished_at is None else job.finished_at.timestamp()
+        return html_page(
+            "job.html",
+            here="jobs",
+            job=job,
+            spec=spec_text(job.spec),
+            durations=stage_durations(connection, seq),
+            elapsed=None if job.started_at is None else end - job.started_at.timestamp(),
+            costs=estimated(job.spec, count(job.spec), {}, 0),
+            previews=newest_previews(connection, seq, 24),
+            rejected=list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items,
+            failed=failed_tasks(connection, seq, context.settings, SHOWN_LOST),
+            states=JobState,
+            url=context.settings.url,
+        )
 
 
 @router.get("/ui/jobs/{job_id}/map")

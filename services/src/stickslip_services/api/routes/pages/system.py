@@ -88,16 +88,6 @@ def _known(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[
 @router.get("/workers")
 def get_workers(context: ContextDep) -> Response:
     """Show the workers."""
-    return html_page("workers.html", here="workers", **_workers(context))
-
-
-@router.get("/ui/workers")
-def get_workers_part(context: ContextDep) -> Response:
-    """Show the list of workers without its page."""
-    return html_page("workers_list.html", **_workers(context))
-
-
-def _workers(context: Context) -> dict[str, Any]:
     with context.database.read() as connection:
         workers = show_workers(context, connection)
         certified = {
@@ -107,9 +97,16 @@ def _workers(context: Context) -> dict[str, Any]:
         }
         own = dataset_versions.c
         read_at, damaged = connection.execute(select(func.min(own.scrubbed_at), func.sum(own.damaged))).one()
-    scrub = None if read_at is None else (as_datetime(read_at), int(damaged))
-    shown = {"workers": workers, "certified": certified, "scrub": scrub, "now": as_datetime(context.clock())}
-    return shown | {"disk": context.store.room(), "memory": _memory()}
+    return html_page(
+        "workers.html",
+        here="workers",
+        workers=workers,
+        certified=certified,
+        scrub=None if read_at is None else (as_datetime(read_at), int(damaged)),
+        now=as_datetime(context.clock()),
+        disk=context.store.room(),
+        memory=_memory(),
+    )
 
 
 def _memory() -> dict[str, int] | None:
