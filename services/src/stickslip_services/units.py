@@ -2,9 +2,11 @@
 
 
 def duration(seconds: float) -> str:
-    """Return a time span in whole units: 9 s, 4 min, 2 h 10 min; below a second with one digit: 0.3 s."""
+    """Return a time span: 4 ms, 0.4 s, 9.0 s, 40 s, 4 min, 2 h 10 min."""
+    if 0 < seconds < 0.1:
+        return f"{1000 * seconds:.2g} ms"
     if seconds < 90:
-        return f"{seconds:.1g} s" if 0.01 < seconds < 1 else f"{seconds:.0f} s"
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 

@@ -36,7 +36,6 @@ class OriginMiddleware:
         self._allowed_hosts = allowed_hosts
 
     async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
-        """Handle a request."""
         refusal = self._refusal(scope) if scope["type"] == "http" else None
         await (self._app if refusal is None else refusal.answer)(scope, receive, send)
 
@@ -76,7 +75,6 @@ class KeyMiddleware:
         self._open = frozenset[Scope]() if required else frozenset(Scope) - {Scope.work}
 
     async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
-        """Handle a request."""
         needed = needed_scope(scope["method"], scope["path"]) if scope["type"] == "http" else None
         if needed is None:
             await self._app(scope, receive, send)

@@ -6,11 +6,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, exists, select
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.format.manifest import (
-    BrokenSectionError,
-    Contents,
-    FileEntry,
-)
+from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry
 from stickslip_schemas.store import Store
 
 from stickslip_services.access.asker import own_version

@@ -44,14 +44,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.policies["json.dumps_kwargs"] = {}  # curves keep their order
-    made.filters |= {
-        "duration": fine_duration,
-        "size": size,
-        "number": number,
-        "moment": moment,
-        "ago": ago,
-        "words": words,
-    }
+    made.filters |= {each.__name__: each for each in (duration, size, number, moment, ago, words)}
     return made
 
 
@@ -62,15 +55,6 @@ def spec_text(spec: JobSpec) -> str:
         if axis["type"] == "list":
             document["axes"][name] = axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
-
-
-def fine_duration(seconds: float | None) -> str:
-    """Return a time span: 4 ms, 0.4 s, 9 s, 4 min, 2 h 10 min."""
-    if seconds is None:
-        return "unknown"
-    if 0 < seconds < 0.1:
-        return f"{1000 * seconds:.2g} ms"
-    return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)
 
 
 def number(value: object) -> str:
@@ -89,7 +73,7 @@ def moment(value: datetime | None) -> str:
 
 def ago(value: datetime) -> str:
     """Return the time since a point in time."""
-    return f"{fine_duration(max(0.0, time.time() - value.astimezone(UTC).timestamp()))} ago"
+    return f"{duration(max(0.0, time.time() - value.astimezone(UTC).timestamp()))} ago"
 
 
 def words(value: object) -> str:

@@ -1,7 +1,6 @@
 """Progress of jobs, from the counters of the ledger, and from the frames that running simulations report."""
 
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
 
 from sqlalchemy import Connection, Row, select
 from stickslip_schemas.base.states import JobState, Stage, TaskState
@@ -36,13 +35,45 @@ def read_progress(
     if running:
         for job, stage, group, left in connection.execute(select(job_groups).where(job_groups.c.job.in_(running))):
             groups.setdefault((job, stage), []).append((group, left))
-    known = _Known(counts, stages, groups, costs, _frames(connection, seqs, frames))
-    return {row.seq: _progress(row, known, slots.get(row.seq, 0)) for row in rows}
+    told = _frames(connection, seqs, frames)
+
+    def progress_of(row: Row[tuple[object, ...]]) -> Progress:
+        shown: dict[Stage, StageProgress] = {}
+        work: dict[Stage, list[StageWork]] = {}
+        for stage in Stage:
+            kept = stages.get((row.seq, stage))
+            if kept is None:  # not planned yet
+                continue
+            mine = [each for key, of_group in told.items() if key[:2] == (row.seq, stage) for each in of_group]
+            shown[stage] = StageProgress(
+                counts={state: count for state, count in counts[row.seq, stage].items() if count},
+                cached=kept.cached,
+                cpu_seconds=kept.cpu_seconds,
+                frames=(sum(done for done, _ in mine), sum(total for _, total in mine)) if mine else None,
+            )
+            work[stage] = []
+            for group, left in groups.get((row.seq, stage), ()):
+                finished = sum(done / max(total, 1) for done, total in told.get((row.seq, stage, group), ()))
+                work[stage].append(StageWork(left - finished, timings_of(costs, stage, row.kind, group)))
+        eta = None
+        if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
+            eta = estimate(work, slots=slots.get(row.seq, 0))
+        return Progress(
+            done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
+            total=sum(count for stage in shown.values() for count in stage.counts.values()),
+            planned=row.planned,
+            stages=shown,
+            eta=eta,
+        )
+
+    return {row.seq: progress_of(row) for row in rows}
 
 
-def _frames(connection: Connection, seqs: list[int], frames: Frames) -> "_Reported":
+def _frames(
+    connection: Connection, seqs: list[int], frames: Frames
+) -> dict[tuple[int, str, str], list[tuple[int, int]]]:
     """Return what running simulations report, (frames done, frames total), by job, stage and cost group."""
-    found: _Reported = {}
+    found: dict[tuple[int, str, str], list[tuple[int, int]]] = {}
     by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
     if not by_key:
         return found
@@ -56,51 +87,8 @@ def _frames(connection: Connection, seqs: list[int], frames: Frames) -> "_Report
     return found
 
 
-_Reported = dict[tuple[int, str, str], list[tuple[int, int]]]
-
-
-class _Known(NamedTuple):
-    counts: dict[tuple[int, str], dict[TaskState, int]]
-    stages: dict[tuple[int, str], Row[tuple[object, ...]]]
-    groups: dict[tuple[int, str], list[tuple[str, int]]]
-    costs: Mapping[Group, Cost]
-    frames: _Reported
-
-
 def rejected_samples(progress: Progress) -> int:
     """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
     rendered = progress.stages.get(Stage.render)
     last = rendered if rendered is not None and rendered.counts else progress.stages.get(Stage.simulate)
     return 0 if last is None else last.counts.get(TaskState.rejected, 0)
-
-
-def _progress(row: Row[tuple[object, ...]], known: _Known, slots: int) -> Progress:
-    shown: dict[Stage, StageProgress] = {}
-    work: dict[Stage, list[StageWork]] = {}
-    for stage in Stage:
-        kept = known.stages.get((row.seq, stage))
-        if kept is None:  # not planned yet
-            continue
-        mine = known.counts[row.seq, stage]
-        told = [each for key, frames in known.frames.items() if key[:2] == (row.seq, stage) for each in frames]
-        shown[stage] = StageProgress(
-            counts={state: count for state, count in mine.items() if count},
-            cached=kept.cached,
-            cpu_seconds=kept.cpu_seconds,
-            frames=(sum(done for done, _ in told), sum(total for _, total in told)) if told else None,
-        )
-        work[stage] = []
-        for group, left in known.groups.get((row.seq, stage), ()):
-            timings = timings_of(known.costs, stage, row.kind, group)
-            finished = sum(done / max(total, 1) for done, total in known.frames.get((row.seq, stage, group), ()))
-            work[stage].append(StageWork(left - finished, timings))
-    eta = None
-    if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
-        eta = estimate(work, slots=slots)
-    return Progress(
-        done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
-        total=sum(count for stage in shown.values() for count in stage.counts.values()),
-        planned=row.planned,
-        stages=shown,
-        eta=eta,
-    )

@@ -203,16 +203,10 @@ def _builds(document: str) -> Mapping[str, Builds]:
 
 
 def _worker(row: Any) -> RegisteredWorker:
-    return RegisteredWorker(
-        id=row.id,
-        name=row.name,
-        builds=_builds(row.builds),
-        condition=WorkerCondition.model_validate_json(row.condition),
-        versions=json.loads(row.versions),
-        registered_at=row.registered_at,
-        last_seen_at=row.last_seen_at,
-        superseded=bool(row.superseded),
-    )
+    condition = WorkerCondition.model_validate_json(row.condition)
+    versions, superseded = json.loads(row.versions), bool(row.superseded)
+    times = row.registered_at, row.last_seen_at
+    return RegisteredWorker(row.id, row.name, _builds(row.builds), condition, versions, *times, superseded)
 
 
 _PLANNED_JOBS = Prepared(
