@@ -101,7 +101,6 @@ class Pace:
         """Whether the last renders that were leased share shadings."""
 
     def note(self, one: Call, seconds: float, results: list[TaskResult]) -> None:
-        """Note the duration of a call."""
         self._seconds[one.stage] = max(seconds / len(results), 1e-3)
         if one.stage is Stage.render:
             cpu = max(sum(result.cpu_seconds for result in results) / len(results), 1e-3)
@@ -112,7 +111,6 @@ class Pace:
         return self._seconds.get(stage, math.inf) * self.tasks(stage)
 
     def tasks(self, stage: Stage) -> int:
-        """Return how many tasks one call takes."""
         if stage is Stage.simulate:
             return LARGEST_BATCH if self._seconds.get(stage, math.inf) < ENOUGH_SECONDS else 1
         if stage is Stage.render:

@@ -56,6 +56,5 @@ def _core(kernel: str = "") -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return versions of libraries, for display."""
     names = ("stickslip-workers", "stickslip-schemas", "stickslip-sim-core", "ray", "zarr")
     return {name: metadata.version(name) for name in names}

@@ -69,7 +69,6 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
 
 
 def verdict(report: ProtocolReport) -> str:
-    """Return the outcome of a protocol in words."""
     if report.message:
         return f"broke off: {report.message}"
     error = "infinite" if report.error is None else f"{report.error:.1e}"
@@ -114,7 +113,6 @@ def _environment() -> dict[str, str]:
 
 
 def _protocol_sources() -> str:
-    """Return the digest of the protocols and their master curves."""
     return content_key("protocols", digests(sources(["stickslip_sim_core.protocols"])))
 
 

@@ -62,7 +62,6 @@ class Dispatcher:
         return self._calls is not None
 
     def run(self) -> None:
-        """Work until stopped."""
         try:
             self._session.start()
             self._described = {False: StageActor(os.devnull).describe(), True: self._describe_renderer()}
@@ -92,7 +91,6 @@ class Dispatcher:
         return dict(json.loads(done.stdout.splitlines()[-1]))
 
     def _registration(self) -> WorkerRegistration:
-        """Return what this dispatcher says about itself."""
         own, rendering = (self._described.get(who, {"builds": {}})["builds"] for who in (False, True))
         calls = None if self._error else self._calls
         waiting = f"waiting for Ray: {time.monotonic() - self._began:.0f} s, {self._place.trouble()}"

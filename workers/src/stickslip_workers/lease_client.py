@@ -85,11 +85,9 @@ class CoordinatorClient:
         return self._post("/v1/workers", registration, WorkerSession)
 
     def lease(self, request: LeaseRequest) -> LeaseBatch:
-        """Ask for tasks."""
         return self._post("/v1/worker/lease", request, LeaseBatch, timeout=PATIENT)
 
     def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
-        """Renew leases."""
         return self._post("/v1/worker/heartbeat", heartbeat, HeartbeatAnswer)
 
     def report(self, reports: ReportBatch) -> ReportAnswer:
@@ -136,7 +134,6 @@ class Backoff:
         return delay
 
     def succeeded(self) -> None:
-        """Reset the wait."""
         self._delay, self.next_try = self._first, 0.0
 
 
@@ -186,7 +183,6 @@ class LeaseBook:
                     self._reports.pop(lease.task_id, None)
 
     def holds(self, lease: Lease | LeaseState | Report) -> bool:
-        """Return whether the lease is still held."""
         state = self._states.get(lease.task_id)
         return state is not None and state.token == lease.token
 

@@ -47,7 +47,6 @@ def sha256(data: bytes) -> str:
 
 
 def is_sha256(text: str) -> bool:
-    """Return whether `text` is a SHA-256 in lower-case hexadecimal."""
     return re.fullmatch(KEY_PATTERN, text) is not None
 
 

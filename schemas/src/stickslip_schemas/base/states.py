@@ -46,7 +46,6 @@ class TaskState(StrEnum):
 
     @property
     def is_over(self) -> bool:
-        """True where the task has ended."""
         return self.is_settled or self in (TaskState.failed, TaskState.cancelled)
 
 

@@ -116,7 +116,6 @@ class Certificate(Document):
 
     @property
     def digest(self) -> str:
-        """Key of the content."""
         return content_key("certificate", self.model_dump(mode="json", exclude=_NOT_CONTENT))
 
     @property

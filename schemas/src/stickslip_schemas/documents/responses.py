@@ -29,7 +29,6 @@ class StageProgress(Document):
 
     @property
     def total(self) -> int:
-        """Number of tasks."""
         return sum(self.counts.values())
 
     @property

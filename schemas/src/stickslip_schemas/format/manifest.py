@@ -42,17 +42,14 @@ SECTION_SAMPLES = 10_000
 
 
 def section_samples(spec: JobSpec) -> int:
-    """Return how many samples a section of a manifest has."""
     return max(1, SECTION_SAMPLES // spec.samples_per_shard) * spec.samples_per_shard
 
 
 def has_sections(spec: JobSpec) -> bool:
-    """Return whether the manifest of a dataset of `spec` has sections."""
     return spec.sample_count > SECTION_SAMPLES
 
 
 def section_path(number: int) -> str:
-    """Return the path of a section inside its version."""
     return f"manifest/{number}.json"
 
 
@@ -221,12 +218,10 @@ class Contents:
         return {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}
 
     def rejections(self) -> Iterator[Rejection]:
-        """Yield the rejected samples, by slot."""
         for section in self.sections():
             yield from section.rejections
 
     def sample_keys(self) -> Iterator[Sha256]:
-        """Yield the keys of the samples, by slot."""
         for section in self.sections():
             yield from section.sample_keys
 

@@ -60,7 +60,6 @@ class Selection(Document):
 
     @property
     def is_everything(self) -> bool:
-        """Return whether nothing is left out."""
         return self == Selection()
 
     def choose_arrays(self, arrays: Iterable[ArrayLayout]) -> tuple[ArrayLayout, ...]:

@@ -105,7 +105,6 @@ class ClothDragSimulation(Simulation):
 
     @property
     def vertices(self) -> int:
-        """How many vertices its square has."""
         return self.mesh**2
 
 
@@ -193,7 +192,6 @@ class ClothDragSpec(ClipSpec):
         return (super().render_settings() or {}) | {"rig": RIG, "rig_digest": rig_digest(RIG)}
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras of the viewpoints, by name."""
         return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:

@@ -93,16 +93,13 @@ class ClothSceneSimulation(Simulation):
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:
-        """Meshes, starts and paths that the scene names."""
         return tuple(filter(None, (referred(name) for _, name in self.scene.files())))
 
     @property
     def vertices(self) -> int:
-        """How many vertices its sheets have together."""
         return sum(sheet.mesh.shape[0] for sheet in self.scene.sheets.values())
 
     def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
-        """Return the scene with arrays instead of files, and the seed."""
         from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
 
         return {"scene": with_arrays(self.scene, read), "seed": self.seed}
@@ -123,12 +120,10 @@ class ClothSceneRender(ClipRender):
 
     @property
     def segments(self) -> tuple[str, ...]:
-        """Names of the codes of the array `segmentation`."""
         return scene_segments(self.scene.sheets, self.scene.bodies)
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:
-        """Pictures of sheets with a texture of their own."""
         return tuple(filter(None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")))
 
 
@@ -225,17 +220,14 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def instants(self) -> int:  # type: ignore[override]
-        """How many instants of the motion a trajectory holds."""
         return self.stage.frames
 
     @property
     def instants_per_second(self) -> float:  # type: ignore[override]
-        """How many instants of the motion there are in a second."""
         return self.stage.frame_rate
 
     @property
     def segments(self) -> tuple[str, ...]:
-        """Names of the codes of the array `segmentation`."""
         return scene_segments(self.stage.sheets, self.stage.bodies)
 
     # --- documents ----------------------------------------------------------------------------------------
@@ -303,7 +295,6 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        """Files of the scene, and pictures of custom textures."""
         files = ((place, referred(name)) for place, name in self.scene.files())
         return {"/".join(("/scene", *map(str, place))): digest for place, digest in files if digest} | super().artifacts
 

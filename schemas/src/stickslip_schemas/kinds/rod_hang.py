@@ -98,7 +98,6 @@ class RodHangSpec(JobSpec):
         return Costs(simulate=0.005, render=4 * view)
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras of the array `views`, in its order."""
         return () if self.views is None else load_rig(self.views)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:

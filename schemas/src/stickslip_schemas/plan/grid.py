@@ -51,7 +51,6 @@ class Counts:
 
     @property
     def tasks(self) -> int:
-        """Tasks of all stages; the last one publishes."""
         return self.simulations + self.renders + self.shards + 1
 
 

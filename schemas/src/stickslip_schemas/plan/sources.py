@@ -53,7 +53,6 @@ def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Pat
 
 
 def digests(files: dict[str, Path]) -> dict[str, str]:
-    """Return the SHA-256 of each file."""
     return {name: sha256(path.read_bytes()) for name, path in sorted(files.items())}
 
 

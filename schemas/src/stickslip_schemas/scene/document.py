@@ -91,7 +91,6 @@ class Physics(Document):
 
     @property
     def frames(self) -> int:
-        """How many frames are kept."""
         longest = self.duration if self.end is None else self.end.at_most
         return int((longest or 0.0) * self.frame_rate * (1.0 + 1e-12)) + 1
 
@@ -108,7 +107,6 @@ class Physics(Document):
         yield from ((sheet, body) for body in self.bodies for sheet in self.sheets)
 
     def mu(self, one: str, other: str) -> float:
-        """Return the friction of two that may touch."""
         for pair in self.friction:
             if set(pair.between) == {one, other}:
                 return pair.mu
@@ -229,7 +227,6 @@ class Scene(Staged):
 
     @property
     def digest(self) -> str:
-        """Content key of all of the scene."""
         return content_key("scene", self.model_dump(mode="json"))
 
     def staged(self) -> dict[str, Any]:

@@ -43,7 +43,6 @@ def parse_yaml(text: str) -> Any:
 
 @cache
 def scene_names() -> tuple[str, ...]:
-    """Name the built-in scenes."""
     return tuple(sorted(file.stem for file in SCENES.glob("*.yaml")))
 
 

@@ -52,7 +52,6 @@ class ListAxis(_Axis[T], Generic[T]):
 
     @property
     def num(self) -> int:
-        """Number of values."""
         return len(self.values)
 
 

@@ -246,7 +246,6 @@ def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
 
 @cache
 def rig_names() -> tuple[str, ...]:
-    """Name the rigs that this package ships."""
     return tuple(sorted(file.stem for file in RIGS.glob("*.toml")))
 
 

@@ -242,7 +242,6 @@ class JobSpec(Document):
 
     @property
     def sample_count(self) -> int:
-        """Number of samples of the grid."""
         sizes = [axis.num for axis in self.named_axes.values()]
         return sizes[0] if self.combine == "zip" else prod(sizes)
 

@@ -47,7 +47,6 @@ class DirectoryStore:
         return self.root
 
     def path(self, digest: str) -> Path:
-        """Return where the artifact lies or would lie."""
         return self.root / artifact_name(digest)
 
     def dataset_path(self, dataset: str, version: int) -> Path:

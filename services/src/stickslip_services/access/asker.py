@@ -61,12 +61,10 @@ class Asker:
     project: str = ""
 
     def may(self, needed: Scope) -> bool:
-        """Return whether a scope of the asker includes `needed`."""
         return any(needed in _IMPLIED[scope] for scope in self.scopes)
 
     @property
     def sees_all(self) -> bool:
-        """Whether the asker sees what belongs to any project."""
         return Scope.admin in self.scopes
 
 

@@ -34,7 +34,6 @@ class Entry(Document):
 
 
 def note(connection: Connection, action: str, subject: str, now: float, **details: Any) -> None:
-    """Write an entry."""
     connection.execute(
         insert(audit_log).values(
             at=now, actor=this_asker().name, action=action, subject=subject, details=json.dumps(details)

@@ -29,7 +29,6 @@ class JsonBody(Generic[T]):
         self._adapter: TypeAdapter[T] = TypeAdapter(of)
 
     async def __call__(self, request: Request) -> T:
-        """Return the document; raise ProblemError."""
         body = await self.received(request)
         # A body of many megabytes keeps a thread busy, and not the event loop.
         document: T = await run_in_threadpool(self.read, body)

@@ -33,7 +33,6 @@ class PatientProtocol(H11Protocol):
     _received = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept a connection, or refuse it where there are too many."""
         self.timeout_keep_alive = IDLE_SECONDS  # type: ignore[assignment]
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
@@ -42,7 +41,6 @@ class PatientProtocol(H11Protocol):
             self._start_turn()
 
     def data_received(self, data: bytes) -> None:
-        """Process data, and start or stop the timer of the request."""
         super().data_received(data)
         self._received += len(data)
         if not self._is_clients_turn:
@@ -51,7 +49,6 @@ class PatientProtocol(H11Protocol):
             self._start_turn(len(data))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the timer."""
         self._end_turn()
         super().connection_lost(exc)
 

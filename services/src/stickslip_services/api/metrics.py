@@ -81,7 +81,6 @@ class Metrics:
         )
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Count an answered request."""
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
@@ -96,5 +95,4 @@ class Metrics:
                 self._failures.labels(stage, result.outcome, result.reason).inc()
 
     def text(self) -> bytes:
-        """Return all metrics in the text format of Prometheus."""
         return generate_latest(self._registry)

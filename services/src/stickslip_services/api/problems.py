@@ -43,7 +43,6 @@ class ProblemError(Exception):
 
     @property
     def title(self) -> str:
-        """The code in words."""
         return self.code.replace("_", " ").capitalize()
 
     def document(self, path: str | None = None, request_id: str | None = None) -> Problem:
@@ -64,12 +63,10 @@ class ProblemError(Exception):
         return Response(content, self.status, self.headers, MEDIA_TYPE)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request with the problem."""
         await self.response(scope["path"], scope.get("state", {}).get("request_id"))(scope, receive, send)
 
 
 def install(app: FastAPI) -> None:
-    """Make `app` answer every error with a problem document."""
     known = (ProblemError, errors.StickslipError, RequestValidationError, HTTPException, OperationalError, Exception)
     for sort in known:
         app.add_exception_handler(sort, _answer)

@@ -57,7 +57,6 @@ class EventStream(StreamingResponse):
     _open: ClassVar[Counter[tuple[ASGIApp, str]]] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the stream."""
         address = scope["client"][0] if scope["client"] else "no address"
         owners = {f"key {this_asker().name}": MOST_STREAMS, f"address {address}": MOST_STREAMS}
         places = {(scope["app"], owner): most for owner, most in {**owners, "coordinator": ALL_STREAMS}.items()}

@@ -142,7 +142,6 @@ def commit_version(
 
 
 def find_committed(connection: Connection, publish_task: int) -> Row[Any]:
-    """Return the row of a version that exists."""
     return connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
 
 

@@ -55,7 +55,6 @@ def say(text: str) -> None:
 
 
 def print_json(value: BaseModel | list[Any]) -> None:
-    """Print documents as JSON."""
     if isinstance(value, BaseModel):
         click.echo(value.model_dump_json(indent=2))
     else:

@@ -22,19 +22,16 @@ _NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState
 
 
 def eta(value: Eta | None) -> str:
-    """Return the remaining time with its range."""
     if value is None:
         return "unknown"
     return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
 
 
 def interval(value: Interval) -> str:
-    """Return a time with its range."""
     return f"about {duration(value.median)} ({duration(value.low)} to {duration(value.high)})"
 
 
 def state(value: JobState) -> str:
-    """Return a state in its colour."""
     return click.style(str(value), fg=_COLORS.get(value))
 
 

@@ -201,7 +201,6 @@ class Client:
         return self.job(job_id)
 
     def _stream(self, job_id: str, last_id: str) -> Iterator[dict[str, str]]:
-        """Yield the messages of an event stream, each as its fields."""
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
         timeout = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
@@ -312,7 +311,6 @@ class Client:
         return self._http.stream("GET", path, headers=headers)
 
     def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
-        """Send a request and return its answer as a model."""
         return parsed(answer, self.request(method, path, **options))
 
     def _items(self, answer: type[Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:

@@ -32,7 +32,6 @@ def sign(seal: bytes, key: Path) -> bytes:
 
 
 def is_signature(signature: bytes, seal: bytes) -> bool:
-    """Return whether somebody signed a seal with a signature."""
     with NamedTemporaryFile() as file:
         file.write(signature)
         file.flush()

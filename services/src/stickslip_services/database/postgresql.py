@@ -94,7 +94,6 @@ class PostgresqlDatabase(Database):
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """Open a transaction that excludes other writers; it is durable after the block."""
         with self._writing, self._writer.begin() as connection:
             _, _, now = connection.exec_driver_sql(_BEGIN, (self._token,)).one()
             # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
@@ -106,11 +105,9 @@ class PostgresqlDatabase(Database):
         return self._toucher.begin()
 
     def is_alone(self, connection: Connection) -> bool:
-        """Return whether no other coordinator uses the database; call it in a write transaction."""
         return not connection.exec_driver_sql(_OTHERS).scalar_one()
 
     async def listen(self, notify: Callable[[], None]) -> None:
-        """Call `notify` whenever another coordinator has written, until cancelled."""
         while True:
             try:
                 connection = await psycopg.AsyncConnection.connect(**self._arguments, autocommit=True)

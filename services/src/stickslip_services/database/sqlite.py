@@ -37,7 +37,6 @@ class SqliteDatabase(Database):
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """Open a transaction that excludes other writers; it is durable after the block."""
         with self._writing, self._writer.begin() as connection:
             yield connection
 

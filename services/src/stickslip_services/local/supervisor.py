@@ -104,7 +104,6 @@ class _Child:
         self.process.wait()
 
     def last_words(self) -> str:
-        """Return the end of the log."""
         try:
             lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
         except OSError:

@@ -67,12 +67,10 @@ def number(value: object) -> str:
 
 
 def moment(value: datetime | None) -> str:
-    """Return a point in time in UTC."""
     return "" if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
 
 
 def ago(value: datetime) -> str:
-    """Return the time since a point in time."""
     return f"{duration(max(0.0, time.time() - value.astimezone(UTC).timestamp()))} ago"
 
 

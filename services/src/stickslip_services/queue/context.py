@@ -32,7 +32,6 @@ class Notifier:
         return self._count
 
     def notify(self) -> None:
-        """Wake all waiters."""
         with self._lock:
             self._count += 1
             waiting, self._waiting = self._waiting, set()

@@ -24,7 +24,6 @@ class StoredEvent:
 
     @property
     def is_last(self) -> bool:
-        """True where the job ends with this event."""
         return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
 
 

@@ -26,7 +26,6 @@ _RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).li
 
 
 def has_runnable_job(connection: Connection) -> bool:
-    """Return whether any job has tasks to lease."""
     return _RUNNABLE_JOB.scalar(connection) is not None
 
 
@@ -83,7 +82,6 @@ def list_jobs(
 
 
 def job_projects(connection: Connection) -> list[str]:
-    """Return the projects that have jobs which the asker sees."""
     query = select(jobs.c.project).where(own(jobs.c.project)).distinct()
     return list(connection.scalars(query.order_by(jobs.c.project)))
 

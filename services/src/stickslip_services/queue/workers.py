@@ -53,7 +53,6 @@ class RegisteredWorker:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds that the worker makes."""
         return tuple(self.builds)
 
     def stage_builds(self, kind: str) -> dict[Stage, str]:
@@ -140,7 +139,6 @@ def note_heard(connection: Connection, ids: Collection[str], now: float) -> dict
 
 
 def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition) -> None:
-    """Store the time of a worker's last heartbeat, and how it is."""
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 

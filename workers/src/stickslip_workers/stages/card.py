@@ -114,7 +114,6 @@ def _certificate(manifest: Manifest) -> str:
 
 
 def _pictures(manifest: Manifest) -> list[str]:
-    """Return the quality of the pictures, if there are any."""
     pictures = manifest.pictures
     if pictures is None:
         return []

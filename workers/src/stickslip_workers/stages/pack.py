@@ -64,7 +64,6 @@ class _Shard:
         self._trajectories: dict[tuple[str, RecordRef], bytes] = {}
 
     def fill(self, row: int, slot: PackSlot) -> None:
-        """Add a sample."""
         self._check_labels(slot)
         for array in self._arrays:
             if not array.per_sample and not array.is_recorded:

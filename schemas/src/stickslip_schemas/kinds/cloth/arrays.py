@@ -121,7 +121,6 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
 
 
 def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
-    """Return the solver's diagnostics."""
     return (
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),

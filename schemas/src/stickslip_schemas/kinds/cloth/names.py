@@ -99,7 +99,6 @@ class NamingSpec(JobSpec):
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        """Pictures of the custom textures."""
         return {f"/textures/{name}": digest for name, image in self.textures.items() if (digest := referred(image))}
 
     @model_validator(mode="after")

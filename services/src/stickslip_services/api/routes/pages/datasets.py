@@ -54,7 +54,6 @@ OpenedDep = Annotated[Opened, Depends(_opened)]
 
 @router.get("/datasets")
 def get_datasets(context: ContextDep) -> Response:
-    """Show the datasets."""
     with context.database.read() as connection:
         datasets = list_datasets(connection, PageRequest(100, None)).items
     return html_page("datasets.html", here="datasets", datasets=datasets)
@@ -72,7 +71,6 @@ def get_dataset(dataset: str, context: ContextDep) -> Response:
 
 @router.get("/datasets/{dataset}/v{version}")
 def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Response:
-    """Show a version."""
     data = opened.data
     values = thumbs(data, request.query_params, 0) | losses(data)
     return html_page(
@@ -94,7 +92,6 @@ def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Res
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")
 def get_thumbs(request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0) -> Response:
-    """Show the samples within the sliders."""
     shown = thumbs(opened.data, request.query_params, start)
     page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **shown)
     if not start:
@@ -137,7 +134,6 @@ def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
 
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
 def get_spec(opened: OpenedDep) -> Response:
-    """Return the spec of a version as YAML."""
     return Response(spec_text(opened.data.manifest.spec), media_type="application/yaml")
 
 

@@ -68,7 +68,6 @@ FilterDep = Annotated[JobFilter, Query()]
 
 @router.get("/")
 def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
-    """Show the jobs."""
     with context.database.read() as connection:
         page = list_jobs(
             context,
@@ -96,7 +95,6 @@ def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
 
 @router.get("/jobs/{job_id}")
 def get_job(job_id: str, context: ContextDep) -> Response:
-    """Show a job."""
     with context.database.read() as connection:
         seq = int(find_job(connection, job_id).seq)
         job = show_job(context, connection, seq)
@@ -119,7 +117,6 @@ def get_job(job_id: str, context: ContextDep) -> Response:
 
 @router.get("/ui/jobs/{job_id}/map")
 def get_job_map(job_id: str, context: ContextDep) -> Response:
-    """Show the states of a job's samples as maps of its grid."""
     with context.database.read() as connection:
         row = find_job(connection, job_id)
         spec = job_spec_adapter.validate_json(row.spec)
@@ -135,7 +132,6 @@ def get_job_map(job_id: str, context: ContextDep) -> Response:
 
 @router.get("/ui/jobs/{job_id}/slowest")
 def get_slowest(job_id: str, context: ContextDep) -> Response:
-    """Show the finished tasks of a job that took longest."""
     with context.database.read() as connection:
         slowest = slowest_tasks(connection, int(find_job(connection, job_id).seq), SHOWN_SLOWEST)
     return html_page("slowest.html", slowest=slowest)

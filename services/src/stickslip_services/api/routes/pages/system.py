@@ -24,7 +24,6 @@ router = APIRouter()
 
 @router.get("/scenes")
 def get_scenes(context: ContextDep) -> Response:
-    """Show the scenes."""
     with context.database.read() as connection:
         scenes = known_scenes(connection)
     return html_page("scenes.html", here="scenes", scenes=scenes)
@@ -42,7 +41,6 @@ def get_scene(digest: str, context: ContextDep) -> Response:
 
 @router.get("/certificates")
 def get_certificates(context: ContextDep) -> Response:
-    """Show the certificates."""
     with context.database.read() as connection:
         entries = list_certificates(connection, PageRequest(200, None)).items
         builds = _builds(context, connection)
@@ -51,7 +49,6 @@ def get_certificates(context: ContextDep) -> Response:
 
 @router.get("/certificates/{digest}")
 def get_certificate(digest: str, context: ContextDep) -> Response:
-    """Show a certificate with its protocols and curves."""
     with context.database.read() as connection:
         stored = find_certificate(connection, digest)
         builds = _builds(context, connection)
@@ -87,7 +84,6 @@ def _known(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[
 
 @router.get("/workers")
 def get_workers(context: ContextDep) -> Response:
-    """Show the workers."""
     with context.database.read() as connection:
         workers = show_workers(context, connection)
         certified = {
@@ -121,5 +117,4 @@ def _memory() -> dict[str, int] | None:
 
 @router.get("/docs")
 def get_docs(request: Request) -> Response:
-    """Show the HTTP interface."""
     return html_page("docs.html", here="docs", api=request.app.openapi())
