@@ -73,8 +73,8 @@ def test_documents_have_the_values_of_parameters_at_all_their_places() -> None:
         }
     )
     found = list(keyed_points(spec, BUILDS))
-    assert len(found) == count(spec).samples == 16
-    assert len({point.simulation_key for point in found}) == count(spec).simulations == 8
+    assert len(found) == count(spec).sample_count == 16
+    assert len({point.simulation_key for point in found}) == count(spec).simulation_count == 8
     for point in found:
         simulation = spec.simulation(point.labels)
         assert canonical_json(simulation.model_dump(mode="json")) == point.simulation_text

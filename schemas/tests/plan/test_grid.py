@@ -61,12 +61,12 @@ def test_counts_are_those_of_the_grid(document: dict[str, Any]) -> None:
     spec = job_spec_adapter.validate_python(document)
     points = list(keyed_points(spec, BUILDS))
     counts = count(spec)
-    assert counts.samples == len(points)
-    assert counts.simulations == len({point.simulation_key for point in points})
-    assert counts.renders == len({point.render_key for point in points if point.render_key is not None})
+    assert counts.sample_count == len(points)
+    assert counts.simulation_count == len({point.simulation_key for point in points})
+    assert counts.render_count == len({point.render_key for point in points if point.render_key is not None})
     assert counts.shards == -(-len(points) // spec.samples_per_shard)
-    assert sum(counts.expected_splits.values()) == counts.samples
-    assert counts.tasks == counts.simulations + counts.renders + counts.shards + 1
+    assert sum(counts.expected_splits.values()) == counts.sample_count
+    assert counts.task_count == counts.simulation_count + counts.render_count + counts.shards + 1
 
 
 def test_splits_are_about_what_is_expected() -> None:
@@ -88,4 +88,4 @@ def test_a_million_samples_are_counted(combine: str) -> None:
     spec = job_spec_adapter.validate_python(
         {"kind": "rod_hang", "combine": combine, "axes": {"gamma": axis, "phi0": axis, "phi1": axis}}
     )
-    assert count(spec).simulations == 1_000_000
+    assert count(spec).simulation_count == 1_000_000

@@ -13,8 +13,6 @@ from stickslip_schemas.format.manifest import FileEntry, ManifestSection, Reject
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.plan.builds import Builds
 
-# --- where bytes are ------------------------------------------------------------------------------------------
-
 
 class RecordRef(Document):
     """One record of an artifact that holds several (`.npz`, first dimension = record)."""
@@ -31,9 +29,6 @@ class ChunkRef(Document):
     length: Int = Field(gt=0)
 
 
-# --- simulate -------------------------------------------------------------------------------------------------
-
-
 class SimulateTask(Document):
     """Make one trajectory."""
 
@@ -47,9 +42,6 @@ class SimulateOutput(Document):
     stage: Literal["simulate"] = "simulate"
     record: RecordRef
     labels: dict[str, Any]
-
-
-# --- render ---------------------------------------------------------------------------------------------------
 
 
 class RenderTask(Document):
@@ -77,9 +69,6 @@ class RenderOutput(Document):
     preview: Sha256 | None = None
     labels: dict[str, Any]
     clips: dict[str, "TaskResult"] = Field(default_factory=dict, description="results by texture")
-
-
-# --- pack and publish -----------------------------------------------------------------------------------------
 
 
 class PackSlot(Document):

@@ -44,11 +44,15 @@ class Estimate(Document):
 def estimated(spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval], slots: int) -> Estimate:
     """Return what a job costs; `measured` are the CPU times of stages that a service knows [s]."""
     usual = spec.usual_costs
-    shaded = 0.0 if not counts.renders else usual.start + counts.shadings * usual.shade + counts.renders * usual.render
+    shaded = (
+        0.0
+        if not counts.render_count
+        else usual.start + counts.shadings * usual.shade + counts.render_count * usual.render
+    )
     stages = {
-        Stage.simulate: _within(counts.simulations * usual.simulate, usual.unsure),
+        Stage.simulate: _within(counts.simulation_count * usual.simulate, usual.unsure),
         Stage.render: _within(shaded, UNSURE),
-        Stage.pack: _within(counts.samples * PACK_SECONDS, UNSURE),
+        Stage.pack: _within(counts.sample_count * PACK_SECONDS, UNSURE),
         Stage.publish: _within(counts.shards * PUBLISH_SECONDS, UNSURE),
     } | dict(measured)
     totals = {name: sum(getattr(stage, name) for stage in stages.values()) for name in Interval.model_fields}

@@ -40,9 +40,9 @@ def combined(spec: JobSpec, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[
 class Counts:
     """Numbers of samples and tasks of a spec."""
 
-    samples: int
-    simulations: int
-    renders: int
+    sample_count: int
+    simulation_count: int
+    render_count: int
     shadings: int
     """Renders that differ in more than the axis of variants."""
     shards: int
@@ -50,8 +50,8 @@ class Counts:
     """Samples by split if each split got exactly its share; splits are drawn, so real numbers differ a little."""
 
     @property
-    def tasks(self) -> int:
-        return self.simulations + self.renders + self.shards + 1
+    def task_count(self) -> int:
+        return self.simulation_count + self.render_count + self.shards + 1
 
 
 def count(spec: JobSpec) -> Counts:
@@ -65,9 +65,9 @@ def count(spec: JobSpec) -> Counts:
     bounds = [0.0, spec.splits.train, spec.splits.train + spec.splits.validation, 1.0]
     ends = [round(bound * spec.sample_count) for bound in bounds]
     return Counts(
-        samples=spec.sample_count,
-        simulations=_distinct(spec, physical),
-        renders=0 if spec.render_settings() is None else _distinct(spec, seen),
+        sample_count=spec.sample_count,
+        simulation_count=_distinct(spec, physical),
+        render_count=0 if spec.render_settings() is None else _distinct(spec, seen),
         shadings=0 if spec.render_settings() is None else _distinct(spec, seen - {spec.variant_axis}),
         shards=ceil(spec.sample_count / spec.samples_per_shard),
         expected_splits={name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)},

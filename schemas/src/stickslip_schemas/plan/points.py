@@ -4,6 +4,7 @@ All keys are content keys: SHA-256 of exactly what a result depends on, its buil
 """
 
 import re
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from stickslip_schemas.base.keys import canonical_json, content_key, keyed_text,
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import columns_of, combined
-from stickslip_schemas.spec.jobs import JobSpec, SeedRule, Splits
+from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
 
 class KeyedPoint(NamedTuple):
@@ -54,6 +55,7 @@ def keyed_points(spec: JobSpec, builds: Builds, *, first: int = 0) -> Iterator[K
     simulation_text = _format(simulation.document)
     simulation_keyed = _format({"simulation": simulation.document, "build": builds.simulate}, "simulate")
     drawn = {name: _hole(name) for name in names} if spec.splits.by == "clip" else simulation.unseeded
+    bounds = spec.splits.train, spec.splits.train + spec.splits.validation
     split_seed = _format({"seed": spec.seed, "for": drawn}, "seed/split")
     render_text = render_keyed = ""
     if render is not None:
@@ -71,7 +73,7 @@ def keyed_points(spec: JobSpec, builds: Builds, *, first: int = 0) -> Iterator[K
         for name, (value, own) in zip(names, cells, strict=True):
             point[name] = value
             texts.update(own)
-        split = _split_at(spec.splits, _seed_of(split_seed % texts))
+        split = bisect_right(bounds, _seed_of(split_seed % texts) / 2**31)
         simulation.draw(texts)
         key = sha256((simulation_keyed % texts).encode())
         labels, physics = labels_text % texts, simulation_text % texts
@@ -173,13 +175,10 @@ def _hole(name: str) -> str:
 
 
 def _filled(spec: JobSpec, name: str, column: list[Any]) -> Iterator[tuple[Any, dict[str, str]]]:
+    """Yield the values of an axis, each with the texts that it puts into holes: its own, and of the fields it sets."""
     for value in column:
-        yield value, _texts(spec, name, value)
-
-
-def _texts(spec: JobSpec, axis: str, value: Any) -> dict[str, str]:
-    """Return the texts that a value of an axis puts into holes: of the axis itself, and of the fields it sets."""
-    return {name: canonical_json(given) for name, given in {**spec.document_fields(axis, value), axis: value}.items()}
+        fields = {**spec.document_fields(name, value), name: value}
+        yield value, {field: canonical_json(given) for field, given in fields.items()}
 
 
 def _format(document: Any, purpose: str | None = None) -> str:
@@ -191,10 +190,3 @@ def _format(document: Any, purpose: str | None = None) -> str:
 
 def _seed_of(text: str) -> int:
     return seed_of_key(sha256(text.encode()))
-
-
-def _split_at(splits: Splits, seed: int) -> int:
-    position = seed / 2**31
-    if position < splits.train:
-        return 0
-    return 1 if position < splits.train + splits.validation else 2

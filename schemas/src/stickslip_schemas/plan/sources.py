@@ -46,8 +46,9 @@ def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Pat
         path = module_file(name)
         if path is None:  # compiled; its build is known by other means
             continue
+        folder = name if path.name == "__init__.py" else name.rpartition(".")[0]
         for file in (path, *_data_files(path)):
-            found[_short(name, path, file)] = file
+            found["/".join([*folder.split("."), file.name])] = file
         waiting += _imports(path)
     return found
 
@@ -81,11 +82,6 @@ def _package_folder(package: str) -> Path:
 def _is_cut(name: str, cut: Collection[str]) -> bool:
     parents = name.split(".")
     return name in cut or any(".".join([*parents[:length], "*"]) in cut for length in range(1, len(parents)))
-
-
-def _short(name: str, module: Path, file: Path) -> str:
-    folder = name if module.name == "__init__.py" else name.rpartition(".")[0]
-    return "/".join([*folder.split("."), file.name])
 
 
 def _data_files(module: Path) -> list[Path]:

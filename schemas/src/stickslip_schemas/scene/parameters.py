@@ -87,13 +87,11 @@ class Parameter(Document):
     @property
     def extremes(self) -> list[tuple[Path, Value]]:
         """Values that stand for all others, each with its place in the parameter: rules of numbers are ranges."""
-        listed: list[tuple[Path, Value]] = [
-            (("values", number), value) for number, value in enumerate(self.values or ())
+        listed: list[tuple[Path, Value | None]] = [
+            (("values", at), value) for at, value in enumerate(self.values or ())
         ]
-        ends: list[tuple[Path, Value]] = [
-            ((name,), value) for name, value in (("low", self.low), ("high", self.high)) if value is not None
-        ]
-        return [*listed, *ends]
+        places = [*listed, (("low",), self.low), (("high",), self.high)]
+        return [(place, value) for place, value in places if value is not None]
 
     @property
     def range(self) -> str:

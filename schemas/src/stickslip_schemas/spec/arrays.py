@@ -23,11 +23,6 @@ SAMPLE_KEY_BYTES = 32
 NAN = float("nan")
 
 
-def item_bytes(dtype: str) -> int:
-    """Return the size of a number of a type such as `float64`, `uint8` or `bool` [bytes]."""
-    return 1 if dtype == "bool" else int(dtype.lstrip("uintfloa")) // 8
-
-
 @dataclass(frozen=True, slots=True)
 class ArrayLayout:
     """One array: `shape` and `dimensions` are those of a single sample."""
@@ -54,7 +49,8 @@ class ArrayLayout:
     @property
     def sample_bytes(self) -> int:
         """Decoded size of one sample [bytes]."""
-        return prod(self.shape) * item_bytes(self.dtype)
+        bits = 8 if self.dtype == "bool" else int(self.dtype.lstrip("uintfloa"))
+        return prod(self.shape) * bits // 8
 
     @property
     def is_label(self) -> bool:

@@ -74,7 +74,8 @@ class BucketStore:
                 prefix=prefix or None,
                 client_options={
                     "timeout": min(_REQUEST_TIMEOUT, timedelta(seconds=self._patience * 5)),
-                    "allow_http": _allows_http(),
+                    # What `object_store` reads where it is given no options of a client.
+                    "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"),
                 },
                 retry_config={"retry_timeout": timedelta(seconds=self._patience)},
             )
@@ -301,11 +302,6 @@ class BucketStore:
 
 _REFUSALS = ("builder error", *(f"status code: {status}" for status in (400, 405, 411, 412, 413, 414, 416, 501)))
 """What an error says that comes again, however often the request is made."""
-
-
-def _allows_http() -> bool:
-    """Read the variable that `object_store` reads where it is given no options of a client."""
-    return os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
 
 
 class _BusyError(Exception):

@@ -18,11 +18,12 @@ from stickslip_schemas.documents.responses import (
     JobStateEvent,
     TaskStateEvent,
     TextureEntry,
+    Validation,
 )
 from stickslip_schemas.documents.responses import Progress as JobProgress
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.plan.costs import Estimate, estimated
-from stickslip_schemas.plan.grid import count
+from stickslip_schemas.plan.grid import Counts, count
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.cli import wording
@@ -69,11 +70,7 @@ def validate(file: Path, url: str, as_json: bool) -> None:
         print_json(answer)
         raise Exit(int(refused))
     cached = "unknown" if answer.cached_count is None else f"{answer.cached_count}"
-    numbers = answer.sample_count, answer.simulation_count, answer.render_count, answer.bytes_estimate
-    fields = [
-        *_counts(*numbers, answer.expected_splits, answer.spec_digest),
-        ("tasks cached", f"{cached} of {answer.task_count}"),
-    ]
+    fields = [*_counts(answer, spec), ("tasks cached", f"{cached} of {answer.task_count}")]
     if answer.stored_bytes_estimate is not None:
         fields.append(("size of the files, about", size(answer.stored_bytes_estimate)))
     print_fields([*fields, *_costs(answer.estimate), ("certificate", answer.certificate or "none")])
@@ -88,8 +85,7 @@ def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
     costs = estimated(spec, counts, {}, os.cpu_count() or 1)
     if as_json:
         return click.echo(json.dumps({"estimate": costs.model_dump(mode="json")}, indent=2))
-    numbers = counts.samples, counts.simulations, counts.renders, bytes_estimate(spec)
-    print_fields([*_counts(*numbers, counts.expected_splits, spec.content_digest), *_costs(costs)])
+    print_fields([*_counts(counts, spec), *_costs(costs)])
     return say(
         f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown, and the "
         "wall time is that of all cores of this machine. To start one here: stickslip up"
@@ -105,15 +101,13 @@ def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     yield f"wall time, {costs.slots} at once", wall
 
 
-def _counts(
-    samples: int, simulations: int, renders: int, array_bytes: int, splits: Mapping[str, int], digest: str
-) -> Iterator[tuple[str, str]]:
-    shares = ", ".join(f"{split} {number}" for split, number in splits.items())
-    yield "samples", f"{samples} ({shares}, about)"
-    yield "simulations", f"{simulations}"
-    yield "renders", f"{renders}"
-    yield "arrays before compression", size(array_bytes)
-    yield "digest of the spec", digest
+def _counts(counts: Counts | Validation, spec: JobSpec) -> Iterator[tuple[str, str]]:
+    shares = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
+    yield "samples", f"{counts.sample_count} ({shares}, about)"
+    yield "simulations", f"{counts.simulation_count}"
+    yield "renders", f"{counts.render_count}"
+    yield "arrays before compression", size(bytes_estimate(spec))
+    yield "digest of the spec", spec.content_digest
 
 
 @click.command()
@@ -153,7 +147,7 @@ def jobs(url: str, as_json: bool, limit: int, search: str, state: JobState | Non
         (
             job.id,
             wording.state(job.state),
-            wording.done_of(job.progress),
+            f"{job.progress.done}/{job.progress.total}",
             "" if job.progress.eta is None else duration(job.progress.eta.seconds),
             wording.dataset(job.dataset),
             job.name or "",

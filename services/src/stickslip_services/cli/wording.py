@@ -40,11 +40,6 @@ def dataset(value: DatasetRef | None) -> str:
     return "" if value is None else f"{value.dataset}:v{value.version}"
 
 
-def done_of(progress: Progress) -> str:
-    """Return the number of finished tasks, of all."""
-    return f"{progress.done}/{progress.total}"
-
-
 def planned(progress: Progress, sample_count: int) -> str:
     """Return the number of planned samples; empty when all are planned."""
     return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"

@@ -14,7 +14,6 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Engine, Table, event
-from sqlalchemy.pool import ConnectionPoolEntry
 
 T = TypeVar("T")
 
@@ -78,12 +77,8 @@ class Database(ABC):
     def close(self) -> None:
         """Close all connections; one that a thread still uses is closed when it is returned."""
         for engine in self._engines:
-            event.listen(engine, "checkin", _close_returned)
+            event.listen(engine, "checkin", lambda _, record: record.close())
             engine.dispose()
-
-
-def _close_returned(_connection: Any, record: ConnectionPoolEntry) -> None:
-    record.close()
 
 
 def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:

@@ -86,6 +86,8 @@ class PostgresqlDatabase(Database):
         own = {"pool_size": 4, "max_overflow": 0, "isolation_level": "AUTOCOMMIT"}
         self._toucher = create_engine(url, paramstyle="format", connect_args=given, **own)
         self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
+        for engine in (reader, writer, self._toucher):
+            event.listen(engine, "connect", lambda connection, _: connection.adapters.register_dumper(str, _TextDumper))
         event.listen(reader, "connect", _prepare_reader)
         event.listen(writer, "connect", self._prepare_writer)
         event.listen(writer, "close", _leave)
@@ -122,7 +124,6 @@ class PostgresqlDatabase(Database):
                 await asyncio.sleep(1.0)
 
     def _prepare_writer(self, connection: Any, _record: Any) -> None:
-        _prepare(connection)
         for setting in _WRITER_SETTINGS:
             connection.execute(f"SET {setting}")
         if not self._durable:
@@ -140,19 +141,13 @@ def _leave(connection: Any, _record: Any) -> None:
 
 
 def _prepare_reader(connection: Any, _record: Any) -> None:
-    _prepare(connection)
     connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
     connection.read_only = True
 
 
 def _prepare_toucher(connection: Any, _record: Any) -> None:
-    _prepare(connection)
     connection.execute("SET synchronous_commit = off")
     connection.commit()
-
-
-def _prepare(connection: Any) -> None:
-    connection.adapters.register_dumper(str, _TextDumper)
 
 
 class _TextDumper(StrDumper):

@@ -67,7 +67,10 @@ def close(book: Ledger) -> None:
     ):
         book.end_job(job, _quarantined(book.connection, job))
     _settle(book, given_up)
-    _emit(book)
+    holders = book.holders(task for task, _ in book.news)
+    for task, event in book.news:
+        for holder in holders.get(task, ()):
+            append_event(book, holder.job, EventName.task_state, event)
     for job, ending in book.endings.items():
         _end_job(book, job, ending)
     if not {JobState.cancelling, JobState.pausing}.isdisjoint(state for _, state, _ in open_jobs):
@@ -123,13 +126,6 @@ def _quarantined(connection: Connection, job: int) -> Ending:
         f"{task_id(first.stage, first.key)}: {first.message}. What is done is kept; submit the job again to try again"
     )
     return Ending(JobState.failed, Reason.quarantined, message)
-
-
-def _emit(book: Ledger) -> None:
-    holders = book.holders(task for task, _ in book.news)
-    for task, event in book.news:
-        for holder in holders.get(task, ()):
-            append_event(book, holder.job, EventName.task_state, event)
 
 
 def _end_job(book: Ledger, job: int, ending: Ending) -> None:

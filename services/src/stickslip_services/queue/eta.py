@@ -215,16 +215,13 @@ def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
         )
 
 
-_SUMS = ("wall_sum", "wall_squares", "call_sum", "call_squares")
-
-
-def _faded(column: str) -> str:
-    keep = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
-    return f"{column} = cost_groups.{column} / ({keep}) + excluded.{column}"
-
-
+_DIVISOR = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
 _ADD_TO_COST_GROUPS = Prepared(
     "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares) "
     "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
-    "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET " + ", ".join(_faded(column) for column in ("count", *_SUMS))
+    "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET "
+    + ", ".join(
+        f"{column} = cost_groups.{column} / ({_DIVISOR}) + excluded.{column}"
+        for column in ("count", "wall_sum", "wall_squares", "call_sum", "call_squares")
+    )
 )

@@ -115,12 +115,6 @@ def collector_at_rest() -> Iterator[None]:
             gc.enable()
 
 
-def preview_slots(sample_count: int, previews: int) -> set[int]:
-    """Return the slots that are rendered with a preview: the first one, and the others evenly spread."""
-    count = min(sample_count, previews)
-    return {position * sample_count // count for position in range(count)}
-
-
 def expand(spec: JobSpec, terms: Terms, *, previews: int = 0) -> Plan:
     """Return the whole plan of `spec` as one piece."""
     return next(pieces(spec, terms, size=spec.sample_count, previews=previews))
@@ -135,7 +129,8 @@ def pieces(
     of the pack tasks before it as `packed`, in order.
     """
     per_shard = spec.samples_per_shard
-    previewed = preview_slots(spec.sample_count, previews)
+    count = min(spec.sample_count, previews)
+    previewed = {position * spec.sample_count // count for position in range(count)}  # the first, and evenly spread
     pack_keys = list(packed)
     waiting = shards(spec, terms.builds, first=first // per_shard)
     while some := list(islice(waiting, -(-size // per_shard))):

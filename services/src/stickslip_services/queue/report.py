@@ -58,21 +58,11 @@ _FIND = Prepared(
         *(tasks.c[name] for name in ("kind", "cost_group", "owner", "reported_by", "reported_token")),
     ).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
 )
+_SETTLED = ("state", "reason", "message", "output", "digest", "cpu_seconds", "wall_seconds", "finished_at")
 _SETTLE = Prepared(
     update(tasks)
     .where(tasks.c.seq == bindparam("b_seq"))
-    .values(
-        state=bindparam("b_state"),
-        reason=bindparam("b_reason"),
-        message=bindparam("b_message"),
-        output=bindparam("b_output"),
-        digest=bindparam("b_digest"),
-        cpu_seconds=bindparam("b_cpu"),
-        wall_seconds=bindparam("b_wall"),
-        owner=None,
-        expires_at=None,
-        finished_at=bindparam("b_now"),
-    )
+    .values({name: bindparam(f"b_{name}") for name in _SETTLED} | {"owner": None, "expires_at": None})
 )
 _DEPENDENTS = Prepared(
     select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.key, tasks.c.stage, tasks.c.state)
@@ -112,15 +102,10 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
                 recompute(book, end.task.seq, end.result.damaged_inputs)
     for verdict in verdicts:
         if verdict.verdict == "accepted" and verdict.task_id in versions:
-            _after_commit(context, verdict.task_id)
+            with suppress(OSError):
+                for digest in context.sections.pop(verdict.task_id, ()):
+                    context.store.delete(digest)
     return ReportAnswer(verdicts=tuple(verdicts))
-
-
-def _after_commit(context: Context, task: str) -> None:
-    """Delete the temporary artifacts of a publish task."""
-    with suppress(OSError):
-        for digest in context.sections.pop(task, ()):
-            context.store.delete(digest)
 
 
 def _checked_in_store(context: Context, report: Report, versions: dict[str, Manifest]) -> Report:
@@ -246,7 +231,7 @@ def _settle(book: Ledger, settled: Sequence[_Ended]) -> None:
         book.connection,
         [
             _settled(book, end.task.seq, end.task.key, result.outcome, result.reason, result.message, output)
-            | {"b_cpu": result.cpu_seconds, "b_wall": result.wall_seconds}
+            | {"b_cpu_seconds": result.cpu_seconds, "b_wall_seconds": result.wall_seconds}
             for end in settled
             for result in [end.result]
             for output in [None if result.output is None else result.output.model_dump_json()]
@@ -273,7 +258,8 @@ def _settled(
     """Return the parameters of `_SETTLE` for a task whose run took no time."""
     made = {"b_state": state, "b_reason": reason, "b_message": message, "b_output": output}
     digest = row_digest(key, *made.values())
-    return {"b_seq": seq, **made, "b_digest": digest, "b_cpu": None, "b_wall": None, "b_now": book.now}
+    free = {"b_cpu_seconds": None, "b_wall_seconds": None}
+    return {"b_seq": seq, **made, "b_digest": digest, "b_finished_at": book.now} | free
 
 
 def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:

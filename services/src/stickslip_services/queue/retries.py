@@ -124,16 +124,11 @@ def take_back(context: Context) -> None:
     with context.ledger() as book:
         rows = _FIND_EXPIRED.rows(book.connection, {"b_now": book.now, "b_alive_since": book.now - seconds})
         lose(book, list(map(HeldTask.of, rows)), context.settings, message=f"no heartbeat for {seconds:g} s")
-        _retry_due(book)
-
-
-def _retry_due(book: Ledger) -> None:
-    """Return tasks whose retry is due to `pending`."""
-    is_due = text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now
-    due = list(map(Task.of, book.connection.execute(select(*Task.columns()).where(*is_due))))
-    book.connection.execute(update(tasks).where(*is_due).values(state=TaskState.pending, retry_at=None))
-    for task in due:
-        book.moved(task, TaskState.pending)
+        is_due = text("tasks.state = 'soft_failed'"), tasks.c.retry_at <= book.now
+        due = list(map(Task.of, book.connection.execute(select(*Task.columns()).where(*is_due))))
+        book.connection.execute(update(tasks).where(*is_due).values(state=TaskState.pending, retry_at=None))
+        for task in due:
+            book.moved(task, TaskState.pending)
 
 
 def reproducer(name: str, settings: Settings) -> str:

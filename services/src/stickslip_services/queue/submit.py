@@ -19,6 +19,7 @@ from stickslip_services.access.audit_log import note
 from stickslip_services.access.projects import check_quota
 from stickslip_services.catalog.uploads import check_files
 from stickslip_services.database.database import Database, batches
+from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import dataset_versions, idempotency_keys, job_stages, jobs, tasks
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.closing import ledger
@@ -129,14 +130,11 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         compression = _compression(connection, spec.kind)
         measured = _measured(connection, spec, counts)
         slots = sum(worker.condition.slots for worker in alive_workers(context, connection))
-    return Validation(
+    return document_of(
+        Validation,
+        counts,
         spec=spec,
         spec_digest=spec.content_digest,
-        sample_count=counts.samples,
-        simulation_count=counts.simulations,
-        render_count=counts.renders,
-        task_count=counts.tasks,
-        expected_splits=counts.expected_splits,
         cached_count=None if terms is None else _cached(database, spec, terms),
         bytes_estimate=raw,
         stored_bytes_estimate=None if compression is None else round(raw * compression),
@@ -150,7 +148,7 @@ def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Sta
     """Return what the stages cost of which tasks were measured."""
     costs, points = read_costs(connection), list(islice(grid(spec), LOOKED_UP))
     work = {Stage.pack: [StageWork(counts.shards, timings_of(costs, Stage.pack, spec.kind, ""))]}
-    for stage, number in ((Stage.simulate, counts.simulations), (Stage.render, counts.renders)):
+    for stage, number in ((Stage.simulate, counts.simulation_count), (Stage.render, counts.render_count)):
         groups = Counter(spec.cost_group(stage, point) for point in points)
         work[stage] = [
             StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))

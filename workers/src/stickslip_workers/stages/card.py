@@ -33,6 +33,9 @@ def card(manifest: Manifest) -> bytes:
     spec = manifest.spec
     name = f"{manifest.dataset}:v{manifest.version}"
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
+    arrays = layout(spec)
+    told = next((array for array in arrays if array.per_sample), arrays[0])
+    where = ", the most of them in its sections, `manifest/0.json` and so on" if manifest.sections else ""
     sections = [
         f"# {spec.name or manifest.dataset}",
         f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
@@ -50,7 +53,7 @@ def card(manifest: Manifest) -> bytes:
         "All renders of one simulation are in the same split.",
         "## Arrays",
         "The first dimension of every array is `sample`; its index is the slot of the sample.",
-        _table(("array", "shape of a sample", "type", "meaning"), [_array_row(array) for array in layout(spec)]),
+        _table(("array", "shape of a sample", "type", "meaning"), [_array_row(array) for array in arrays]),
         "## Rejected samples",
         _rejected(manifest),
         "## How it was made",
@@ -62,14 +65,13 @@ def card(manifest: Manifest) -> bytes:
         "## How to read it",
         "Any Zarr v3 reader opens this directory:",
         f'```python\nimport zarr\n\ngroup = zarr.open_group(".", mode="r")\nvalid = group["valid"][:]\n'
-        f'sample = group["{_telling_array(spec)}"][int(valid.argmax())]\n```',
+        f'sample = group["{told.name}"][int(valid.argmax())]\n```',
         "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of stickslip checks "
         "every file against `manifest.json` and raises an error where one is missing or damaged:",
         '```python\nfrom stickslip_training.data.samples import Samples\n\ntrain = Samples(".", "train")\n```',
         "## How to check it",
         "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file"
-        f"{_in_sections(manifest)}. "
-        "`stickslip verify .` checks all files.",
+        f"{where}. `stickslip verify .` checks all files.",
         "## How to cite it",
         f"Write `{name}` and the SHA-256 of `manifest.json`, which stands in `manifest.sha256`.",
     ]
@@ -129,15 +131,6 @@ def _pictures(manifest: Manifest) -> list[str]:
     if pictures.frame_share is not None:
         text += f" The cloth fills {100 * pictures.frame_share:.1f} % of a frame, in the mean."
     return [text]
-
-
-def _telling_array(spec: Any) -> str:
-    arrays = layout(spec)
-    return next((array.name for array in arrays if array.per_sample), arrays[0].name)
-
-
-def _in_sections(manifest: Manifest) -> str:
-    return ", the most of them in its sections, `manifest/0.json` and so on" if manifest.sections else ""
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -16,12 +16,17 @@ def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
     """Return the arrays of a dataset of a scene, without those of clips and parameters."""
     bias = array("bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2})
     rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
+    labels: list[ArrayLayout] = []
+    for name, sheet in scene.sheets.items():
+        labels += fabric_arrays(f"{name}.")
+        if sheet.start.type == "hung":
+            labels.append(array(f"{name}.tilt", "lean of gravity along the normal as it came to hang, over gravity"))
     return (
         array("camera", "of the clip: fx, fy, cx, cy [px], rotation (rows), translation [m]", of={"camera": 16}),
         *((bias,) if scene.bias else ()),
         *((rest,) if scene.end else ()),
         array("least_distance", "of vertices and edges of cloth in contact, at the ends of all steps [m]"),
-        *(each for name in scene.sheets for each in _sheet_labels(scene, name)),
+        *labels,
         *solver_arrays(spec),
         *_tracks(spec, scene),
         *(each for name in scene.sheets for each in _mesh(spec, scene, name) if spec.store_positions),
@@ -34,11 +39,6 @@ def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
     if isinstance(scene.default(parameter), float):
         return array(parameter, f"{given.description or 'parameter of the scene'} [{given.unit}]")
     return codes(parameter, (*Material, *scene.materials))
-
-
-def _sheet_labels(scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
-    hung = array(f"{sheet}.tilt", "lean of gravity along the normal as it came to hang, over gravity")
-    return (*fabric_arrays(f"{sheet}."), *((hung,) if scene.sheets[sheet].start.type == "hung" else ()))
 
 
 def _tracks(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
