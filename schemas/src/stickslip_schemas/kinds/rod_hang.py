@@ -101,35 +101,28 @@ class RodHangSpec(JobSpec):
         return () if self.views is None else load_rig(self.views)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        views = len(self.cameras())
-        return (*_curves(), *(_views(views) if views else ()), *_labels())
-
-
-def _curves() -> tuple[ArrayLayout, ...]:
-    points = {"point": RodHangSimulation.model_fields["points"].default}
-    curves = (
-        ("centerline", {"xyz": 3}, "positions over L at uniform arc length, clamp first"),
-        ("curvature", {"strain": 3}, "(twist, bend1, bend2) times L"),
-        ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
-    )
-    return tuple(array(name, text, "float32", points | of, is_recorded=True) for name, of, text in curves)
-
-
-def _views(count: int) -> tuple[ArrayLayout, ...]:
-    return (
-        array("views", "sRGB pictures", "uint8", {"view": count, "y": 224, "x": 224, "rgb": 3}, per_sample=True),
-        array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
-    )
-
-
-def _labels() -> tuple[ArrayLayout, ...]:
-    distance = "least distance over L at which the centreline passes another part of itself; infinite where it does not"
-    return (
-        array("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
-        array("phi0", "natural twist times L [rad]"),
-        array("phi1", "natural curvature times L [rad]"),
-        array("energy", "elastic and gravity energy over EI/L"),
-        array("multistable", "another stable shape of the same rod was found", "bool", is_recorded=True),
-        array("self_contact_distance", distance, is_recorded=True),
-        array("reach", "largest distance over L from the vertical of the clamp", is_recorded=True),
-    )
+        points = {"point": RodHangSimulation.model_fields["points"].default}
+        curves = (
+            ("centerline", {"xyz": 3}, "positions over L at uniform arc length, clamp first"),
+            ("curvature", {"strain": 3}, "(twist, bend1, bend2) times L"),
+            ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
+        )
+        pixels = {"view": len(self.cameras()), "y": 224, "x": 224, "rgb": 3}
+        seen = (
+            array("views", "sRGB pictures", "uint8", pixels, per_sample=True),
+            array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
+        )
+        distance = (
+            "least distance over L at which the centreline passes another part of itself; infinite where it does not"
+        )
+        return (
+            *(array(name, text, "float32", points | of, is_recorded=True) for name, of, text in curves),
+            *(() if self.views is None else seen),
+            array("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
+            array("phi0", "natural twist times L [rad]"),
+            array("phi1", "natural curvature times L [rad]"),
+            array("energy", "elastic and gravity energy over EI/L"),
+            array("multistable", "another stable shape of the same rod was found", "bool", is_recorded=True),
+            array("self_contact_distance", distance, is_recorded=True),
+            array("reach", "largest distance over L from the vertical of the clamp", is_recorded=True),
+        )

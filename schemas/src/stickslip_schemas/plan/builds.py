@@ -2,6 +2,7 @@
 
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import Sha256, content_key
+from stickslip_schemas.base.states import Stage
 
 
 class Builds(Document):
@@ -24,3 +25,8 @@ class Builds(Document):
     def digest(self) -> str:
         """One key for all of them."""
         return content_key("builds", self.model_dump())
+
+    @property
+    def by_stage(self) -> dict[Stage, str]:
+        """The build that a worker needs to run a task, by stage."""
+        return dict(zip(Stage, (self.simulate, self.render, self.pack, self.digest), strict=True))

@@ -4,7 +4,6 @@ These commands open the database of a data directory, also while the coordinator
 may write the data directory may make keys.
 """
 
-import json
 import time
 from collections.abc import Callable
 
@@ -181,8 +180,7 @@ def audit_log(settings: Settings, subject: str | None, limit: int, as_json: bool
         entries = audit.read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
-            document = {"at": entry.at.isoformat(), "actor": entry.actor, "action": entry.action}
-            click.echo(json.dumps(document | {"subject": entry.subject, "details": entry.details}))
+            click.echo(entry.model_dump_json())
         return
     rows = []
     for entry in entries:

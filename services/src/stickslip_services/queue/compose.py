@@ -49,16 +49,15 @@ def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish:
     Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with `publish`, which takes a
     while: do not call this in a write transaction.
     """
-    composers: Mapping[Stage, Callable[[Connection, list[StoredTask]], dict[int, AnyTask]]] = {
-        Stage.simulate: _simulate_tasks,
-        Stage.render: _render_tasks,
-        Stage.pack: lambda connection, group: {task.seq: _pack_task(connection, task) for task in group},
-        Stage.publish: lambda connection, group: {task.seq: _publish_task(connection, task, publish) for task in group},
-    }
-    composed: dict[int, AnyTask] = {}
-    for stage, compose in composers.items():
-        if group := [task for task in stored if task.stage is stage]:
-            composed |= compose(connection, group)
+    renders = [task for task in stored if task.stage is Stage.render]
+    composed = _render_tasks(connection, renders) if renders else {}
+    for task in stored:
+        if task.stage is Stage.simulate:
+            composed[task.seq] = _simulate_task(task)
+        elif task.stage is Stage.pack:
+            composed[task.seq] = _pack_task(connection, task)
+        elif task.stage is Stage.publish:
+            composed[task.seq] = _publish_task(connection, task, publish)
     return composed
 
 
@@ -77,13 +76,9 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     return compose_tasks(connection, [StoredTask.of(row)], publish)[row.seq]
 
 
-def _simulate_tasks(_connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
-    for task in group:
-        document = {"simulation": json.loads(task.payload), "build": task.build}
-        _check_key(task, content_key("simulate", document))
-    return {
-        task.seq: task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}') for task in group
-    }
+def _simulate_task(task: StoredTask) -> AnyTask:
+    _check_key(task, content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}))
+    return task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}')
 
 
 def _check_key(task: StoredTask, key: Sha256) -> None:

@@ -93,8 +93,8 @@ def has_ready_task(
                 "b_left_out": long_groups(costs, stage, kind, at_most),
             },
         )
-        for kind in worker.kinds
-        for stage, build in worker.stage_builds(kind).items()
+        for kind, builds in worker.builds.items()
+        for stage, build in builds.by_stage.items()
         if stage in stages
     )
 
@@ -139,12 +139,12 @@ def _pick(
     for job, project, priority, on_lease in _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage}):
         ready = [
             task
-            for kind in worker.kinds
+            for kind, builds in worker.builds.items()
             for task in _READY_TASKS.rows(
                 connection,
                 {
                     "b_stage": stage,
-                    "b_build": worker.stage_builds(kind)[stage],
+                    "b_build": builds.by_stage[stage],
                     "b_kind": kind,
                     "b_left_out": long_groups(costs, stage, kind, at_most),
                     "b_job": job,

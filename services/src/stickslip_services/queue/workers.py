@@ -27,16 +27,6 @@ from stickslip_services.queue.ledger import RUNNABLE
 NO_WORKER = "no worker has told its builds yet; the job is planned when one does (see the workers page)"
 
 
-def stage_builds(builds: Builds) -> dict[Stage, str]:
-    """Return the build that a worker needs to run a task, by stage."""
-    return {
-        Stage.simulate: builds.simulate,
-        Stage.render: builds.render,
-        Stage.pack: builds.pack,
-        Stage.publish: builds.digest,
-    }
-
-
 @dataclass(frozen=True, slots=True)
 class RegisteredWorker:
     """A registered worker."""
@@ -50,14 +40,6 @@ class RegisteredWorker:
     registered_at: float
     last_seen_at: float
     superseded: bool
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        return tuple(self.builds)
-
-    def stage_builds(self, kind: str) -> dict[Stage, str]:
-        """Return the builds for a kind by stage; empty where the worker does not make the kind."""
-        return stage_builds(self.builds[kind]) if kind in self.builds else {}
 
 
 def insert_worker(connection: Connection, registration: WorkerRegistration, now: float) -> RegisteredWorker:
@@ -114,7 +96,7 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
     for worker in workers:
         if kind in worker.builds:
             return worker.builds[kind]
-    kinds = ", ".join(sorted({kind for worker in workers for kind in worker.kinds}))
+    kinds = ", ".join(sorted({kind for worker in workers for kind in worker.builds}))
     raise KindNotAvailableError(f"no worker makes {kind!r}; those that have registered make {kinds}")
 
 
@@ -147,8 +129,8 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
     """Return the number of tasks of a job that can run at once; `builds` is JSON, None for an unplanned job."""
     if builds is None:
         return 0
-    needed = stage_builds(Builds.model_validate_json(builds))
-    return sum(worker.condition.slots for worker in workers if worker.stage_builds(kind) == needed)
+    needed = Builds.model_validate_json(builds)
+    return sum(worker.condition.slots for worker in workers if worker.builds.get(kind) == needed)
 
 
 def running_tasks(
@@ -242,13 +224,10 @@ def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) 
     if all(worker.condition.state == "starting" for worker in alive):
         names = ", ".join(worker.name for worker in alive)
         return f"the workers are not ready: {names}; `stickslip workers` says why"
-    makers = [worker for worker in alive if kind in worker.kinds]
-    if not makers:
+    made = [worker.builds[kind].by_stage for worker in alive if kind in worker.builds]
+    if not made:
         return f"no connected worker makes {kind!r}; the job goes on when one does"
-    needed = stage_builds(builds)
-    missing = [
-        stage for stage, build in needed.items() if all(worker.stage_builds(kind)[stage] != build for worker in makers)
-    ]
+    missing = [stage for stage, build in builds.by_stage.items() if all(own[stage] != build for own in made)]
     if missing:
         return (
             f"no connected worker has the builds that this job was planned for (stages: {', '.join(missing)}); it goes "
