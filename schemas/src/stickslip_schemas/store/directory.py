@@ -162,15 +162,9 @@ class DirectoryStore:
         return Room(*shutil.disk_usage(place))
 
     def probe(self) -> None:
-        self.root.mkdir(parents=True, exist_ok=True)
         path = self.root / f".probe-{os.getpid()}"
-        try:
-            with path.open("wb") as file:
-                file.write(bytes(_PROBE_BYTES))
-                file.flush()
-                os.fsync(file.fileno())
-        finally:
-            path.unlink(missing_ok=True)
+        write_durably(path, bytes(_PROBE_BYTES))
+        path.unlink()
 
 
 def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:

@@ -8,7 +8,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -25,9 +24,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 FILE = click.Path(path_type=Path)
-_SERVER_MODULES = ("alembic", "fastapi", "jinja2", "prometheus_client", "pydantic_settings", "sqlalchemy", "uvicorn")
 ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "zarr"})
-"""Modules that the extra `arrays` installs; one that is missing is no fault of ours."""
+"""Packages that the extra `arrays` installs; of others, commands that need them need the server."""
 _LEAST_SENTENCE = 30
 """Least width of a column of sentences [characters]."""
 
@@ -99,13 +97,6 @@ def _width(text: str) -> int:
     return len(click.unstyle(text))
 
 
-def require_server() -> None:
-    """Raise MissingExtraError if a package of the server is missing."""
-    missing = [name for name in _SERVER_MODULES if find_spec(name) is None]
-    if missing:
-        raise MissingExtraError("server", f"this command needs the server, and {', '.join(missing)}")
-
-
 def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Print the errors that a command expects, and exit with status 1."""
 
@@ -129,9 +120,11 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         except OSError as error:
             _print_error(f"{error.filename or 'the file system'}: {error.strerror or error}")
         except ModuleNotFoundError as error:
-            if error.name is None or error.name.partition(".")[0] not in ARRAYS:
+            package = (error.name or "stickslip").partition(".")[0]
+            if package.startswith("stickslip"):
                 raise
-            _print_error(str(MissingExtraError("arrays", f"this needs arrays, and {error.name}")))
+            extra, what = ("arrays", "arrays") if package in ARRAYS else ("server", "the server")
+            _print_error(str(MissingExtraError(extra, f"this needs {what}, and {error.name}")))
         raise Exit(1)
 
     return run

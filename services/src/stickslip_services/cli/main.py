@@ -56,12 +56,10 @@ _COMPLETIONS = {
 @cache
 def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
-    module, attribute = _COMMANDS[name].split(".")
-    if module in ("admin", "maintenance", "service"):  # they import the server, which a client lacks
-        from stickslip_services.cli.common import require_server, shows_errors
+    from stickslip_services.cli.common import shows_errors  # some need the server, which a client lacks
 
-        shows_errors(require_server)()
-    command: click.Command = getattr(import_module(f"stickslip_services.cli.{module}"), attribute)
+    module, attribute = _COMMANDS[name].split(".")
+    command: click.Command = getattr(shows_errors(import_module)(f"stickslip_services.cli.{module}"), attribute)
     return command
 
 

@@ -32,7 +32,7 @@ class SqliteDatabase(Database):
         writer = create_engine(url, connect_args={"timeout": 30}, pool_size=1, max_overflow=0)
         for engine, begin in ((reader, "BEGIN"), (writer, "BEGIN IMMEDIATE")):
             event.listen(engine, "connect", partial(_prepare, pragmas))
-            event.listen(engine, "begin", partial(_begin, begin))
+            event.listen(engine, "begin", lambda connection, begin=begin: connection.exec_driver_sql(begin))
         super().__init__(reader, writer)
 
     @contextmanager
@@ -42,14 +42,10 @@ class SqliteDatabase(Database):
 
 
 def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:
-    connection.isolation_level = None  # transactions are begun by _begin, not by the driver
+    connection.isolation_level = None  # the listeners begin transactions, not the driver
     connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
     for pragma in pragmas:
         connection.execute(f"PRAGMA {pragma}")
-
-
-def _begin(statement: str, connection: Connection) -> None:
-    connection.exec_driver_sql(statement)
 
 
 def _close_to_others(path: Path) -> None:

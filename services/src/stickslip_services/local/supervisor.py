@@ -12,8 +12,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -133,7 +133,7 @@ def run(
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         lock = stack.enter_context(locked(data))
-        signals = stack.enter_context(_stop_signals())
+        signals = _stop_signals()
         # The supervisor owns the socket, so requests wait while the coordinator restarts.
         listener = stack.enter_context(listen(settings.host, settings.port))
         listener.listen(512)
@@ -200,9 +200,8 @@ def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int
     return False
 
 
-@contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """Collect the numbers of the signals to stop."""
+def _stop_signals() -> list[int]:
+    """Return a list of the numbers of the signals to stop, which grows as they come."""
     caught: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -210,12 +209,9 @@ def _stop_signals() -> Iterator[list[int]]:
             os.write(2, b"stopping; another Ctrl-C stops at once. Jobs go on when you start the service again\n")
         caught.append(number)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, note)
+    return caught
 
 
 def _die_with_parent() -> None:

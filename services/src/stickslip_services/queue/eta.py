@@ -18,6 +18,7 @@ The cost of a task is its share of the wall time of the call that made it; the c
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
+from typing import Self
 
 from sqlalchemy import Connection, select
 from stickslip_schemas.base.states import Stage
@@ -54,6 +55,10 @@ class StageTimings:
     count: int
     total: float
     squares: float
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> Self:
+        return cls(len(seconds), sum(seconds), sum(each**2 for each in seconds))
 
     @property
     def mean(self) -> float:
@@ -199,20 +204,10 @@ def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
     for run in runs:
         if run.call_seconds is not None:
             by_group.setdefault((run.stage, run.kind, run.cost_group), []).append((run.wall_seconds, run.call_seconds))
-    for (stage, kind, group), costs in by_group.items():
-        _ADD_TO_COST_GROUPS.run(
-            connection,
-            {
-                "stage": stage,
-                "kind": kind,
-                "cost_group": group,
-                "n": len(costs),
-                "wall": sum(wall for wall, _ in costs),
-                "wall2": sum(wall**2 for wall, _ in costs),
-                "call": sum(call for _, call in costs),
-                "call2": sum(call**2 for _, call in costs),
-            },
-        )
+    for (stage, kind, cost_group), costs in by_group.items():
+        wall, call = (StageTimings.of(seconds) for seconds in zip(*costs, strict=True))
+        sums = {"n": wall.count, "wall": wall.total, "wall2": wall.squares, "call": call.total, "call2": call.squares}
+        _ADD_TO_COST_GROUPS.run(connection, {"stage": stage, "kind": kind, "cost_group": cost_group, **sums})
 
 
 _DIVISOR = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"

@@ -64,8 +64,8 @@ def post_job(
     """
     job = submit_job(context, spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
-        return _json(job.response, headers={"Location": f"/v1/jobs/{job.job_id}"})
-    return _json(job.model_dump_json(), status=202, headers={"Location": f"/v1/jobs/{job.id}"})
+        return Response(job.response, 200, {"Location": f"/v1/jobs/{job.job_id}"}, "application/json")
+    return Response(job.model_dump_json(), 202, {"Location": f"/v1/jobs/{job.id}"}, "application/json")
 
 
 @router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
@@ -171,7 +171,3 @@ def get_events(
         job = int(find_job(connection, job_id).seq)
     feeds: Feeds = request.app.state.feeds
     return feeds.stream(job, after=int(last_event_id or 0))
-
-
-def _json(content: str, *, status: int = 200, headers: dict[str, str] | None = None) -> Response:
-    return Response(content, status, headers, "application/json")
