@@ -13,7 +13,7 @@ from enum import Enum, auto
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine, Table, event
+from sqlalchemy import Column, Connection, Engine, Select, Table, event
 
 T = TypeVar("T")
 
@@ -86,6 +86,12 @@ def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
     iterator = iter(items)
     while batch := list(islice(iterator, size)):
         yield batch
+
+
+def rows_with(connection: Connection, query: Select[Any], column: Column[Any], values: Iterable[Any]) -> Iterator[Any]:
+    """Yield the rows of `query` whose `column` has one of many values."""
+    for batch in batches(values):
+        yield from connection.execute(query.where(column.in_(batch)))
 
 
 def insert_rows(connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> None:

@@ -16,7 +16,7 @@ from stickslip_schemas.store import Store, Stored
 
 from stickslip_services.access.audit_log import note
 from stickslip_services.catalog.versions import sealed_digests, stored_contents
-from stickslip_services.database.database import Database, batches
+from stickslip_services.database.database import Database, batches, rows_with
 from stickslip_services.database.tables import (
     certificates,
     dataset_versions,
@@ -69,15 +69,12 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
         if JobState(row.state).is_open:
             raise ConflictError(f"the job {row.id} is {row.state} and makes this version: cancel it first")
     own = [row.seq for row in rows]
-    held: set[int] = set()
-    for job in own:
-        held.update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job == job)))
+    held = set(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(own))))
     for table in (events, idempotency_keys, job_counts, job_stages, job_groups, samples, job_tasks):
         connection.execute(delete(table).where(table.c.job.in_(own)))
     connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
-    lost = set(held)  # a job has all dependencies of its tasks, too
-    for batch in batches(held):
-        lost.difference_update(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.task.in_(batch))))
+    still = {row.task for row in rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, held)}
+    lost = held - still  # a job has all dependencies of its tasks, too
     counts: Counter[tuple[str, str]] = Counter()
     for batch in batches(lost):
         of_batch = tasks.c.seq.in_(batch)

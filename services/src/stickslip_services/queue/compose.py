@@ -19,7 +19,7 @@ from stickslip_schemas.store import in_parallel
 
 from stickslip_services.access.asker import own_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
-from stickslip_services.database.database import batches
+from stickslip_services.database.database import batches, rows_with
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
@@ -88,10 +88,10 @@ def _check_key(task: StoredTask, key: Sha256) -> None:
 
 
 def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
+    seqs = [task.seq for task in group]
     edges = [
         (row.task, row.depends_on)
-        for batch in batches(task.seq for task in group)
-        for row in connection.execute(select(task_dependencies).where(task_dependencies.c.task.in_(batch)))
+        for row in rows_with(connection, select(task_dependencies), task_dependencies.c.task, seqs)
     ]
     made = _results(connection, {needed for _, needed in edges})
     simulated = {task: made[needed] for task, needed in edges}

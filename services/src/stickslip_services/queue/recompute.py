@@ -26,7 +26,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.catalog.versions import damaged_files, find_committed
-from stickslip_services.database.database import batches, insert_rows
+from stickslip_services.database.database import insert_rows, rows_with
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.errors import DamagedRowsError
@@ -56,7 +56,7 @@ def remake(book: Ledger, consumer: int, makers: Sequence[Task]) -> None:
     )
     new = [maker for maker in makers if maker.seq not in known]
     insert_rows(book.connection, task_dependencies, ("task", "depends_on"), ((consumer, maker.seq) for maker in new))
-    _wait_for(book, Counter({consumer: sum(not maker.state.is_settled for maker in new)}))
+    wait_for(book, {consumer: sum(not maker.state.is_settled for maker in new)})
     reopen(book, makers)
 
 
@@ -120,48 +120,38 @@ def reopen(book: Ledger, makers: Iterable[Task]) -> None:
     job_of = live_jobs(book.connection, [maker.seq for maker in ended])
     ended = [maker for maker in ended if maker.seq in job_of]
     settled = [maker.seq for maker in ended if maker.state.is_settled]
-    dependents: Counter[int] = Counter()
-    for batch in batches(settled):
-        edges = select(task_dependencies.c.task).where(task_dependencies.c.depends_on.in_(batch))
-        dependents.update(book.connection.scalars(edges))
-    _wait_for(book, dependents)
+    edges = rows_with(book.connection, select(task_dependencies.c.task), task_dependencies.c.depends_on, settled)
+    wait_for(book, Counter(edge.task for edge in edges))
     reset_tasks(book, ended, job_of)
 
 
 def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Task]:
     """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
+    edge = task_dependencies.c.depends_on == tasks.c.seq
+    needed = select(*Task.columns(), tasks.c.output).join(task_dependencies, edge).distinct()
     makers: list[Task] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
         below: set[int] = set()
-        for batch in batches(level):
-            rows = book.connection.execute(
-                select(*Task.columns(), tasks.c.output)
-                .join(task_dependencies, task_dependencies.c.depends_on == tasks.c.seq)
-                .where(task_dependencies.c.task.in_(batch))
-                .distinct()
-            )
-            for row in rows:
-                made = digests.intersection(_DIGEST.findall(row.output or ""))
-                if row.seq not in seen and made:
-                    makers.append(Task.of(row))
-                    digests = digests - made
-                below.add(row.seq)
+        for row in rows_with(book.connection, needed, task_dependencies.c.task, level):
+            made = digests.intersection(_DIGEST.findall(row.output or ""))
+            if row.seq not in seen and made:
+                makers.append(Task.of(row))
+                digests = digests - made
+            below.add(row.seq)
         level = below - seen
         seen |= below
     return makers
 
 
-def _wait_for(book: Ledger, more: Counter[int]) -> None:
-    """Increase the number of tasks that each task waits for."""
-    rows = [{"b_seq": task, "b_more": count} for task, count in more.items() if count]
-    if rows:
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq == bindparam("b_seq"))
-            .values(waiting_on=tasks.c.waiting_on + bindparam("b_more")),
-            rows,
-        )
+_WAIT_FOR = Prepared(
+    update(tasks).where(tasks.c.seq == bindparam("b_seq")).values(waiting_on=tasks.c.waiting_on + bindparam("b_more"))
+)
+
+
+def wait_for(book: Ledger, more: Mapping[int, int]) -> None:
+    """Add to the number of tasks that each task waits for."""
+    _WAIT_FOR.run_all(book.connection, [{"b_seq": task, "b_more": n} for task, n in more.items() if n])
 
 
 def terms_of(row: Any) -> tuple[JobSpec, Terms | None]:

@@ -32,7 +32,7 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.ledger import LIVE, Ending, HeldTask, Ledger, Task, start_tasks
-from stickslip_services.queue.recompute import recompute
+from stickslip_services.queue.recompute import recompute, wait_for
 from stickslip_services.queue.retries import fail_tries, give_back, lose
 from stickslip_services.queue.workers import find_worker, note_heard
 
@@ -68,11 +68,6 @@ _DEPENDENTS = Prepared(
     select(task_dependencies.c.depends_on, task_dependencies.c.task, tasks.c.key, tasks.c.stage, tasks.c.state)
     .join(tasks, tasks.c.seq == task_dependencies.c.task)
     .where(task_dependencies.c.depends_on.in_(bindparam("b_tasks", expanding=True)))
-)
-_COUNT_DOWN = Prepared(
-    update(tasks)
-    .where(tasks.c.seq == bindparam("b_seq"))
-    .values(waiting_on=tasks.c.waiting_on - bindparam("b_settled"))
 )
 
 
@@ -268,7 +263,7 @@ def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int
     if not edges:
         return
     waits = Counter(task for _, task, _, _, _ in edges)
-    _COUNT_DOWN.run_all(book.connection, [{"b_seq": task, "b_settled": count} for task, count in waits.items()])
+    wait_for(book, {task: -count for task, count in waits.items()})
     doomed = [
         (Task(task, Stage.render, TaskState(state)), key, rejected[dependency])
         for dependency, task, key, stage, state in edges

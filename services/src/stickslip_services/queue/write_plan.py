@@ -6,7 +6,7 @@ wait for it; if it failed or was cancelled, the new job starts it again.
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from sqlalchemy import Connection, bindparam, func, insert, select, update
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.database.database import batches, insert_rows
+from stickslip_services.database.database import insert_rows, rows_with
 from stickslip_services.database.tables import (
     job_counts,
     job_stages,
@@ -107,7 +107,9 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
     known = _find(connection, [*plan.tasks, *needed])
     seqs, rejected = _insert_tasks(connection, job, plan, known)
-    own = _held(connection, job, known.values())  # of earlier pieces
+    of_job = select(job_tasks.c.task).where(job_tasks.c.job == job)
+    earlier = rows_with(connection, of_job, job_tasks.c.task, (task.seq for task in known.values()))
+    own = {row.task for row in earlier}  # of earlier pieces
     shared = [task for task in known.values() if task.seq not in own]
     settled = rejected | {task.seq for task in shared if task.state.is_settled}
     held = ((job, seq, seq in settled) for seq in seqs.values() if seq not in own)
@@ -140,23 +142,10 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
 
 
-def _held(connection: Connection, job: int, known: Collection[_Known]) -> set[int]:
-    held: set[int] = set()
-    for batch in batches(task.seq for task in known):
-        held.update(
-            connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task.in_(batch)))
-        )
-    return held
-
-
 def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
-    found: dict[bytes, _Known] = {}
     if not connection.scalar(select(tasks.c.seq).limit(1)):
-        return found
-    for batch in batches(keys):
-        for row in connection.execute(select(*_Known.columns()).where(tasks.c.key.in_(batch))):
-            found[row.key] = _Known.of(row)
-    return found
+        return {}
+    return {row.key: _Known.of(row) for row in rows_with(connection, select(*_Known.columns()), tasks.c.key, keys)}
 
 
 def _insert_tasks(
