@@ -58,7 +58,7 @@ demo: setup
 # Three tiers. Fast: no test over one CPU second, none that starts Ray, Blender, PostgreSQL or a server. The second is what
 # a change must pass, with `check` beside the tests. Slow: the long, the random, and what repeats on another database.
 # A process of tests that dies ends the run: xdist waits for ever for the tests of one that it starts anew.
-PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup --max-worker-restart=0
+PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup --no-loadscope-reorder --max-worker-restart=0
 
 test-fast: setup
 	$(PYTEST) -m "not slow and not real and not physics" --cpu-limit=1

@@ -10,13 +10,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from _pytest.nodeid import NodeId
 
 for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write into what is in use
     os.environ.pop(_name, None)
 
-GROUPS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "database": "postgresql"}
-"""Fixtures that start a server once a process, and the group of their tests: xdist runs a group in one process. These
-tests are marked `real`."""
+os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: the other tests would starve those that use Ray
+
+SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql"}
+"""Fixtures that start a server, and the group of the tests that share it. These tests are marked `real`."""
 
 CPU_SECONDS = pytest.StashKey[float]()
 
@@ -27,13 +29,32 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let one process run all tests that share a server or a fixture of their module, and sort the modules.
+
+    What waits long or takes long comes first, so that no process is left with it when the others are done.
+    """
+    turns: dict[Path, tuple[float, bool, bool]] = {}
     for item in items:
-        names = getattr(item, "fixturenames", ())
-        for fixture, group in GROUPS.items():
-            if fixture in names and (fixture != "database" or "postgresql" in item.name):
-                item.add_marker(pytest.mark.xdist_group(group))
-                item.add_marker(pytest.mark.real)
-                break
+        scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
+        if "database" in scopes and "postgresql" in item.name:
+            scopes["postgresql"] = "session"
+        servers = [name for name in SERVERS if name in scopes]
+        if servers:
+            item.add_marker(pytest.mark.real)
+        group = next((SERVERS[name] for name in servers if scopes[name] == "session"), None)
+        if group is None and "module" in scopes.values():
+            group = item.nodeid.partition("::")[0]
+        if group is not None and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(group))
+        mark = item.get_closest_marker("xdist_group")
+        if mark is not None and hasattr(item.config, "workerinput"):
+            # What xdist 3.8 does at `item._nodeid`, which pytest 9.2 no longer reads.
+            item._id = NodeId.parse(f"{item.nodeid}@{mark.args[0]}")
+        patience = item.get_closest_marker("timeout")
+        is_other = [item.get_closest_marker(name) is None for name in ("real", "physics")]
+        turn = (-patience.args[0] if patience else 0, *is_other)
+        turns[item.path] = min(turn, turns.get(item.path, turn))
+    items.sort(key=lambda item: turns[item.path])
 
 
 @pytest.hookimpl(wrapper=True)

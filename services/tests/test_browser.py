@@ -177,7 +177,7 @@ SCHEMES = {1280: {"light": "{}", "dark": "{runOnly: ['color-contrast']}"}, 390: 
 """By width, the colour schemes and what axe looks at."""
 
 
-@pytest.mark.parametrize("width", SCHEMES)
+@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_every_page_is_whole(browser: Any, url: str, paths: list[str], width: int) -> None:
     context = browser.new_context(viewport={"width": width, "height": 900}, reduced_motion="reduce")
     page = context.new_page()

@@ -31,7 +31,7 @@ from stickslip_testing.jobs import rods
 from stickslip_testing.nodes import COORDINATOR, WORKER, Node, free_port, is_ready
 from stickslip_testing.servers import wait_until
 
-KILLS = int(os.environ.get("STICKSLIP_KILLS", "30"))
+KILLS = int(os.environ.get("STICKSLIP_KILLS", "12"))
 PATIENCE = 300.0
 """How long an answer or progress may take [s]: both coordinators may be starting, on a busy machine."""
 SAMPLES = 60

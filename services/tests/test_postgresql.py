@@ -71,19 +71,26 @@ class Pair:
         return str(response.json()["id"])
 
 
-@pytest.fixture
-def pair(settings: Settings) -> Iterator[Pair]:
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer") -> Iterator[Pair]:
+    place = tmp_path_factory.mktemp("pair")
+
     def start(name: str) -> RunningServer:
-        server = start_server(settings.data.parent / name, options=("--store", settings.store_place))
+        server = start_server(place / name, options=("--store", settings.store_place))
         stack.callback(server.stop)
         return server
 
     with ExitStack() as stack:
+        patch = stack.enter_context(pytest.MonkeyPatch.context())
+        patch.setenv("STICKSLIP_DURABLE", "0")
+        patch.setenv(DATABASE_VARIABLE, postgresql.empty())
+        settings = Settings(data=place / "data", durable=False)
         client = stack.enter_context(httpx.Client(trust_env=False, timeout=60))
         yield Pair(settings, (start("a"), start("b")), client)
 
 
 def test_two_coordinators_share_the_work(pair: Pair) -> None:
+    """The first of their tests: it counts all tasks of the database."""
     workers = [pair.worker(number % 2, f"w{number}") for number in range(4)]
     specs = [{"gamma": [1.0 + number, 2.0 + number, 3.0 + number]} for number in range(4)]  # they share tasks
     jobs: list[str] = []
