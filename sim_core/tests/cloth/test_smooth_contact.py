@@ -294,7 +294,7 @@ class TestCloth:
         assert (cloth.pair_forces.vertices >= len(SHEET.rest)).any()
         assert cloth.least_distance > 0.2 * THICKNESS
 
-    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("seed", [1, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2))])
     def test_nothing_crosses(self, seed: int) -> None:
         """Soft cloth that is thrown at a lumpy mesh that moves and turns at random."""
         rng = np.random.default_rng(seed)
