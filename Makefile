@@ -57,7 +57,8 @@ demo: setup
 
 # Three tiers. Fast: no test over one CPU second, none that starts Ray, Blender, PostgreSQL or a server. The second is what
 # a change must pass, with `check` beside the tests. Slow: the long, the random, and what repeats on another database.
-# Slow tests mostly wait, so twice as many of them run at once, with three times the time.
+# Slow tests mostly wait: twice as many run at once, with three times the time, and those with time limits of their own
+# one after the other.
 # A process of tests that dies ends the run: xdist waits for ever for the tests of one that it starts anew.
 PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup --no-loadscope-reorder --max-worker-restart=0
 

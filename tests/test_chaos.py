@@ -35,6 +35,8 @@ from stickslip_testing.samples import samples
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import LocalStore, ObjectStore
 
+pytestmark = pytest.mark.xdist_group("chaos")
+
 SPEC: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text())
 
 
