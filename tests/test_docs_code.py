@@ -144,7 +144,7 @@ def test_the_reference_of_specs_is_up_to_date() -> None:
     assert made.stdout == (ROOT / "docs/spec.md").read_text(), "run: python tools/spec_reference.py > docs/spec.md"
 
 
-@pytest.mark.real
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx", reason="pip install sphinx myst-parser furo")
