@@ -83,7 +83,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer
     with ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         patch.setenv("STICKSLIP_DURABLE", "0")
-        patch.setenv(DATABASE_VARIABLE, postgresql.empty())
+        patch.setenv("STICKSLIP_DATABASE", postgresql.empty())
         settings = Settings(data=place / "data", durable=False)
         client = stack.enter_context(httpx.Client(trust_env=False, timeout=60))
         yield Pair(settings, (start("a"), start("b")), client)
