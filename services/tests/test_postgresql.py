@@ -73,6 +73,7 @@ class Pair:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer") -> Iterator[Pair]:
+    """Each test submits samples of its own: what others have made is not made again."""
     place = tmp_path_factory.mktemp("pair")
 
     def start(name: str) -> RunningServer:
@@ -152,7 +153,7 @@ def test_requests_of_a_worker_may_go_to_any_coordinator(pair: Pair) -> None:
 
     api = HttpApi(pair.servers[0].url, "", post)
     worker = PretendWorker(api, DirectoryStore(pair.settings.store_place), name="w").register()
-    job = pair.submit(0)
+    job = pair.submit(0, gamma=[11.0, 12.0])
     deadline = time.monotonic() + 60
     while pair.client.get(f"{pair.servers[1].url}/v1/jobs/{job}").json()["finished_at"] is None:
         assert time.monotonic() < deadline
@@ -163,7 +164,7 @@ def test_requests_of_a_worker_may_go_to_any_coordinator(pair: Pair) -> None:
 
 def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
     one, other = (server.url for server in pair.servers)
-    job = pair.submit(0)
+    job = pair.submit(0, gamma=[21.0, 22.0])
     heard: list[tuple[str, float]] = []
     with (
         httpx.Client(base_url=other, timeout=20) as client,

@@ -27,6 +27,12 @@ def few(runs, split_runs):
     return train[np.arange(9)], validation[np.arange(2)], test[np.arange(2)]
 
 
+@pytest.fixture(scope="module")
+def first(few):
+    """A model to go on from; nothing may change it."""
+    return train_friction(*few[:2], SMALL, epoch=6)
+
+
 def weights(model):
     return model.net.state_dict()
 
@@ -59,8 +65,8 @@ def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, t
 
 
 @pytest.mark.physics
-def test_saved_and_loaded(few, tmp_path):
-    model = train_friction(*few[:2], SMALL, epoch=6)
+def test_saved_and_loaded(few, first, tmp_path):
+    model = first
     save_friction(tmp_path / "friction.safetensors", model)
     again = load_friction(tmp_path / "friction.safetensors")
     clips = render_clips(few[2], 2, 0)
@@ -144,8 +150,7 @@ def some_clips(few, renders=2):
 
 
 @pytest.mark.physics
-def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, tmp_path):
-    first = train_friction(*few[:2], SMALL, epoch=6)
+def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, first):
     going = replace(SMALL, steps=4, learning_rate=1e-4)
     clips = some_clips(few)
     model = train_friction(*few[:2], going, clips=clips, start=first, epoch=2)
@@ -171,8 +176,7 @@ def test_half_of_each_batch_is_of_the_clips(few):
 
 
 @pytest.mark.physics
-def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrored(few):
-    first = train_friction(*few[:2], SMALL, epoch=6)
+def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrored(few, first):
     learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16, repeats=2), start=first)
     drawn = [learner.batch(number) for number in range(3)]
     for step, count in ((0, 1), (1, 1), (2, 2), (5, 3)):
@@ -192,8 +196,7 @@ def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrore
 
 
 @pytest.mark.physics
-def test_the_silhouettes_of_a_start_stay_and_its_reader_learns(few):
-    first = train_friction(*few[:2], SMALL, epoch=6)
+def test_the_silhouettes_of_a_start_stay_and_its_reader_learns(few, first):
     model = train_friction(*few[:2], replace(SMALL, seed=3), start=first, epoch=6)
     for name, tensor in weights(first).items():
         if name.startswith("silhouette.") or name in ("mu.weight", "encoder.0.weight"):
@@ -223,10 +226,9 @@ def test_clips_of_one_simulation_in_both_splits_are_refused(few):
 
 
 @pytest.mark.physics
-def test_a_model_of_another_size_is_no_start(few):
-    model = train_friction(*few[:2], SMALL, epoch=6)
+def test_a_model_of_another_size_is_no_start(few, first):
     with pytest.raises(ValueError, match="the model to start from must know the runs' materials, and be"):
-        train_friction(*few[:2], replace(SMALL, width=24), start=model)
+        train_friction(*few[:2], replace(SMALL, width=24), start=first)
 
 
 def file_of_clips(path, shown):
