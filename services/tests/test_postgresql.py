@@ -73,7 +73,7 @@ class Pair:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer") -> Iterator[Pair]:
-    """Each test submits samples of its own: what others have made is not made again."""
+    """Each test submits samples of its own: results of another would end its job at once."""
     place = tmp_path_factory.mktemp("pair")
 
     def start(name: str) -> RunningServer:
