@@ -28,6 +28,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start
 from stickslip_services.settings import Settings
@@ -248,6 +249,19 @@ def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:
         with pytest.raises(DatabaseRefusedError, match="is in use by"):
             check(settings, Role.upkeep)
     check(settings, Role.coordinator)
+
+
+def test_the_server_knows_how_large_a_planned_job_makes_the_tables(settings: Settings) -> None:
+    """Otherwise it keeps plans for empty tables, and a lease reads all tasks."""
+    context = Context.open(settings.model_copy(update={"plan_samples": 2}))
+    start(context)
+    PretendWorker(DirectApi(context), context.store).register()
+    submit_job(context, parsed(rods(gamma=[float(number) for number in range(1, 10)])), None)
+    Planner(context).run()
+    with context.database.read() as connection:
+        known = text("SELECT CAST(reltuples AS bigint) FROM pg_class WHERE relname = 'tasks'")
+        assert connection.scalar(known) == connection.scalar(select(func.count()).select_from(tasks)) > 18
+    context.close()
 
 
 def test_a_coordinator_goes_on_after_the_server_has_closed_its_connections(

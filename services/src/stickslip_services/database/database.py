@@ -66,6 +66,10 @@ class Database(ABC):
         """
         return self.write()
 
+    def analyse(self) -> None:
+        """Tell the database how large its tables have become, where it must know that to choose plans."""
+        return
+
     def is_alone(self, connection: Connection) -> bool:
         """Return whether no other coordinator uses the database; call it in a write transaction."""
         return True

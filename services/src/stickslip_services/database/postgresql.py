@@ -106,6 +106,14 @@ class PostgresqlDatabase(Database):
         """Connect beside writers; each statement is a transaction. A crash of the server may lose it."""
         return self._toucher.begin()
 
+    def analyse(self) -> None:
+        """Tell the server how large its tables have become, and make it forget its plans.
+
+        By itself it does so a minute later. Until then it reads the whole of a table that was empty when it planned.
+        """
+        with self._toucher.connect() as connection:
+            connection.exec_driver_sql("ANALYZE tasks, job_tasks, task_dependencies, samples")
+
     def is_alone(self, connection: Connection) -> bool:
         return not connection.exec_driver_sql(_OTHERS).scalar_one()
 
