@@ -63,8 +63,8 @@ SAMPLING = {
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
     Quality.preview: ClothSampling(1, 1, 0.0, 4, (24.0, 20.0, 21.0)),
-    Quality.draft: ClothSampling(2, 3, 0.0, 12, (30.0, 27.0, 25.0)),
-    Quality.standard: ClothSampling(2, 5, 0.0, 20, (34.0, 30.0, 28.0)),
+    Quality.draft: ClothSampling(1, 3, 0.0, 12, (30.0, 27.0, 25.0)),
+    Quality.standard: ClothSampling(1, 5, 0.0, 20, (34.0, 30.0, 28.0)),
     Quality.high: ClothSampling(8, 128, 0.03, 100, (35.0, 31.0, 29.0)),
 }
 _FEWEST = 8  # paths of a pixel before its noise is estimated
