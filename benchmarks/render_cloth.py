@@ -41,7 +41,7 @@ from stickslip_blender.cloth.scene import Shot
 from stickslip_blender.cloth.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.engine import CLOTH_SAMPLING, REFERENCE, ClothSampling, Sampling
+from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.cycles.pixels import FrameReader, encode
 from stickslip_blender.raster import Textures, Window, projected, see
 from stickslip_blender.workshop import Workshop
@@ -58,6 +58,8 @@ MATERIAL = "gray-interlock"
 TEXTURES = tuple(Texture)[:8]
 COMPARED = (Texture.checker, Texture.houndstooth, Texture.floral)
 CREASES = 0.5
+REFERENCE = Sampling(samples=256, seed=1)
+"""What pictures are compared with; its seed is another, so that it shares no noise with them."""
 SMOOTH = Sampling(REFERENCE.samples, "guided", REFERENCE.seed)
 
 
@@ -324,7 +326,7 @@ def main() -> None:
     qualities = {str(quality): sampling for quality, sampling in CLOTH_SAMPLING.items()}
     for pair in options.also:
         frame, window = map(int, pair.split("+"))
-        qualities[pair] = ClothSampling(frame, window, 0.0, window, (0.0, 0.0, 0.0))
+        qualities[pair] = ClothSampling(frame, window, (0.0, 0.0, 0.0))
     chosen = list(shots(bench.track, options.frames, ("matt",)))
     bench.composed(chosen[0], CLOTH_SAMPLING[Quality.draft])  # shaders are compiled once
     if options.look or options.ground_truth:

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.engine import REFERENCE, SAMPLING, Sampling
+from stickslip_blender.cycles.engine import SAMPLING, Sampling
 from stickslip_blender.rods.renderer import GROUND_LEVEL, POINTS, RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 
+REFERENCE = Sampling(samples=256, seed=1)
+"""What pictures are compared with; its seed is another, so that it shares no noise with them."""
 OTHERS = {
     f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(samples=samples, denoiser=denoiser)
     for samples in (4, 8, 16, 32, 64, 128)

@@ -107,10 +107,7 @@ class PostgresqlDatabase(Database):
         return self._toucher.begin()
 
     def analyse(self) -> None:
-        """Tell the server how large its tables have become, and make it forget its plans.
-
-        By itself it does so a minute later. Until then it reads the whole of a table that was empty when it planned.
-        """
+        """Tell the server what it would learn a minute later; until then its plans are those for empty tables."""
         with self._toucher.connect() as connection:
             connection.exec_driver_sql("ANALYZE tasks, job_tasks, task_dependencies, samples")
 

@@ -71,8 +71,6 @@ class Planner:
         self._name = new_id("planner")
         self._job: int | None = None
         self._end = 0
-        self._analysed = 0
-        """Samples of the job when the database was last told how large its tables are."""
         self._pieces: Iterator[Plan] = iter(())
 
     def run(self) -> None:
@@ -127,7 +125,7 @@ class Planner:
     def _begin(self, row: Row[tuple[object, ...]], packed: list[str]) -> Iterator[Plan]:
         spec, terms = terms_of(row)
         assert terms is not None
-        self._job, self._end, self._analysed = row.seq, row.planned, row.planned // 2
+        self._job, self._end = row.seq, row.planned
         return pieces(
             spec,
             terms,
@@ -145,9 +143,8 @@ class Planner:
                 return
             write_plan(book, job, piece)
         self._end = piece.end
-        if piece.is_last or piece.end >= 2 * self._analysed:
+        if piece.is_last or piece.end.bit_length() > piece.first.bit_length():  # at each power of two
             self._context.database.analyse()
-            self._analysed = piece.end
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]

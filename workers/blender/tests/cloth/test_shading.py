@@ -72,9 +72,7 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
         substrate=substrate,
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    clip = renderer.clip(
-        look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, 0.0, 16, (0.0, 0.0, 0.0))
-    )
+    clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, (0.0, 0.0, 0.0)))
     names = trio("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
     videos, _ = clip.clips(clip.shading(), pictures)

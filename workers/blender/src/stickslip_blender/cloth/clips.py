@@ -134,7 +134,7 @@ class ClipRenderer:
         """Render instants directly with up to three textures, a share as `instants` says; `draw`: more of the seed."""
         greens = [self._grained(texture)[..., 1] for texture in textures]
         picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
-        for frame in instants(len(self.shots), share, self.sampling.usual, (self.seed, *draw)):
+        for frame in instants(len(self.shots), share, FINE**2 * self.sampling.window, (self.seed, *draw)):
             shot = self.shots[frame]
             window = self.scene.window(shot, BAND + 1)
             light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)

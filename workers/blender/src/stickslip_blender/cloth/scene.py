@@ -108,7 +108,7 @@ class ClothScene:
         set_sampling(self._scene, Sampling(paths, "quick", seed))
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
         part = self.window(shot, _DISCARDED + _RAMP)
-        set_sampling(self._scene, Sampling(sampling.window, "plain", seed, noise=sampling.noise))
+        set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
         down = _share(part.top, part.bottom, self._camera.height)
         across = _share(part.left, part.right, self._camera.width)
         here = part.times(FINE).slices

@@ -17,10 +17,9 @@ class Sampling:
     """What a quality means to Cycles."""
 
     samples: int
-    """Paths per pixel; the most of a pixel where `noise` is above 0."""
+    """Paths per pixel."""
     denoiser: Literal["none", "quick", "plain", "guided"] = "none"
-    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges; `quick`, its smallest network, for an
-    even floor.
+    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges; `quick`: its smallest network.
 
     Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
     """
@@ -28,8 +27,6 @@ class Sampling:
     """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
     skipped: int = 0
     """Paths per pixel that are left out first. Cycles sends the very first one through the middle of the pixel."""
-    noise: float = 0.0
-    """Noise at which a pixel gets no more paths, as Cycles estimates it; at 0, all pixels get the same number."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +36,14 @@ class ClothSampling:
     frame: int
     """Paths per pixel in the whole frame."""
     window: int
-    """Most paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a picture."""
-    noise: float
-    """Noise of a pixel of the window at which it gets no more; 0: all get the same number."""
-    usual: int
-    """Paths per pixel of a picture that the window gets on average, for a dark floor."""
+    """Paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a picture."""
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     @property
     def finer(self) -> ClothSampling:
         """Half the noise: for a clip that is below its floors."""
-        return replace(self, frame=4 * self.frame, window=4 * self.window, noise=0.5 * self.noise)
+        return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
 # Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
@@ -62,14 +55,11 @@ SAMPLING = {
 }
 # The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
 CLOTH_SAMPLING = {
-    Quality.preview: ClothSampling(1, 1, 0.0, 4, (24.0, 20.0, 21.0)),
-    Quality.draft: ClothSampling(1, 3, 0.0, 12, (30.0, 27.0, 25.0)),
-    Quality.standard: ClothSampling(1, 5, 0.0, 20, (34.0, 30.0, 28.0)),
-    Quality.high: ClothSampling(8, 128, 0.03, 100, (35.0, 31.0, 29.0)),
+    Quality.preview: ClothSampling(1, 1, (24.0, 20.0, 21.0)),
+    Quality.draft: ClothSampling(1, 3, (30.0, 27.0, 25.0)),
+    Quality.standard: ClothSampling(1, 5, (34.0, 30.0, 28.0)),
+    Quality.high: ClothSampling(8, 32, (35.0, 31.0, 29.0)),
 }
-_FEWEST = 8  # paths of a pixel before its noise is estimated
-REFERENCE = Sampling(samples=256, seed=1)
-"""What pictures are compared with; its seed is another, so that it shares no noise with them."""
 
 
 def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: bool = True) -> Any:
@@ -127,8 +117,7 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
     cycles.use_sample_subset = sampling.skipped > 0
     cycles.sample_offset, cycles.sample_subset_length = sampling.skipped, sampling.samples
     cycles.seed = sampling.seed
-    cycles.use_adaptive_sampling = sampling.noise > 0.0
-    cycles.adaptive_threshold, cycles.adaptive_min_samples = sampling.noise, _FEWEST
+    cycles.use_adaptive_sampling = False
     cycles.use_denoising = sampling.denoiser != "none"
     if sampling.denoiser != "none":
         cycles.denoiser = "OPENIMAGEDENOISE"
