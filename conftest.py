@@ -41,15 +41,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         servers = [name for name in SERVERS if name in scopes]
         if servers:
             item.add_marker(pytest.mark.real)
-        group = next((SERVERS[name] for name in servers if scopes[name] == "session"), None)
-        if group is None and "module" in scopes.values():
-            group = item.nodeid.partition("::")[0]
-        if group is not None and item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(group))
-        mark = item.get_closest_marker("xdist_group")
-        if mark is not None and hasattr(item.config, "workerinput"):
-            # What xdist 3.8 does at `item._nodeid`, which pytest 9.2 no longer reads.
-            item._id = NodeId.parse(f"{item.nodeid}@{mark.args[0]}")
+        if hasattr(item.config, "workerinput"):  # of xdist
+            mark = item.get_closest_marker("xdist_group")
+            shared = [SERVERS[name] for name in servers if scopes[name] == "session"]
+            shared += [item.nodeid.partition("::")[0]] if "module" in scopes.values() else []
+            if group := mark.args[0] if mark else next(iter(shared), None):
+                # What xdist 3.8 does at `item._nodeid`, which pytest 9.2 no longer reads.
+                item._id = NodeId.parse(f"{item.nodeid}@{group}")
         patience = item.get_closest_marker("timeout")
         is_other = [item.get_closest_marker(name) is None for name in ("real", "physics")]
         turn = (-patience.args[0] if patience else 0, *is_other)

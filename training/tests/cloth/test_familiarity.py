@@ -22,6 +22,7 @@ def silhouettes(clips):
     return pooled(clips.cover).numpy()
 
 
+@pytest.mark.slow
 def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split_runs):
     train, judged, _ = split_runs(few, 0.3, 0.0)
     good = silhouettes(render_clips(judged, 8, 1, drawn_world=True))
