@@ -30,10 +30,7 @@ Say = Callable[[str], None]
 def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     """Certify a preset: write `certificate.json` into `out`.
 
-    A protocol that raises has not passed; the others run all the same.
-
-    Raises:
-        ValueError: There is no such preset.
+    A protocol that raises has not passed; the others run all the same. Raises ValueError for an unknown preset.
     """
     if preset not in protocols.CERTIFICATION:
         raise ValueError(f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}")

@@ -10,20 +10,12 @@ if TYPE_CHECKING:
 
 
 def scene_module(name: str) -> str:
-    """Return the module that simulates a kind.
-
-    Raises:
-        UnknownKindError: There is no such kind.
-    """
+    """Return the module that simulates a kind; raise UnknownKindError."""
     kind_named(name)
     return f"stickslip_sim_core.scenes.{name}"
 
 
 def kind(name: str) -> "Kind":
-    """Return how a kind is simulated.
-
-    Raises:
-        UnknownKindError: There is no such kind.
-    """
+    """Return how a kind is simulated; raise UnknownKindError."""
     found: Kind = import_module(scene_module(name)).KIND
     return found

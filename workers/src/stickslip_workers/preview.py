@@ -28,16 +28,8 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
 
     Cloth is not simulated: it stays as it starts. A sheet that starts hung is drawn flat.
 
-    Args:
-        scene: What to draw.
-        store: Where the files are that it names.
-        out: Directory for the pictures; it is made where it does not exist.
-        blender_python: Interpreter that has stickslip_blender.
-
-    Raises:
-        ValueError: A value breaks its rule; the message begins with its place.
-        OSError: A file cannot be read, or the pictures cannot be written.
-        RuntimeError: The drawing failed.
+    `store` has the files that it names; `out`, a directory, is made where it does not exist. Raises ValueError, whose
+    message begins with the place of the wrong value, OSError, or RuntimeError where the drawing failed.
     """
     given = scene.looks.cameras
     views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []

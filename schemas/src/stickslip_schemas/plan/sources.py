@@ -29,12 +29,7 @@ OURS = "stickslip_"
 def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Path]:
     """Return the files that the modules `roots` are made of, by their paths below the folders of our packages.
 
-    Args:
-        roots: Full names of modules.
-        cut: Names of modules that are left out; `package.*` leaves out all that is below a package.
-
-    Raises:
-        ModuleNotFoundError: There is no file for a module that is imported.
+    Modules in `cut` are left out; `package.*` stands for all that is below a package. Raises ModuleNotFoundError.
     """
     found: dict[str, Path] = {}
     waiting, seen = list(roots), set()

@@ -248,11 +248,7 @@ class Scene(Staged):
         return value
 
     def checked(self, values: Mapping[Path, Any]) -> Physics:
-        """Return the physics with other values at places of the document.
-
-        Raises:
-            ValidationError: A value breaks the rule of its field.
-        """
+        """Return the physics with other values at places of the document; raise ValidationError."""
         return Physics.model_validate(with_values(self.physics(), values))
 
     @model_validator(mode="after")

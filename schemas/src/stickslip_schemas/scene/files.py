@@ -42,12 +42,8 @@ class UnfitFileError(ValueError):
 def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str, bytes]]:
     """Return a scene with references by digest instead of names of files, and these files by digest.
 
-    Args:
-        scene: A scene whose files may be local.
-        read: Returns the bytes of a file by its name.
-
-    Raises:
-        UnfitFileError: A file is not what the scene needs there; the message begins with the place.
+    `read` returns the bytes of a file by its name. Raises UnfitFileError for a file that is not what the scene needs
+    there; the message begins with the place.
     """
     values: dict[Path, Any] = {}
     found: dict[str, bytes] = {}
@@ -70,12 +66,7 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
 def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any]:
     """Return physics as JSON, but with the arrays of files (see `read_file`) instead of references to them.
 
-    Args:
-        physics: Its files are references.
-        read: Returns the bytes of an artifact by its digest.
-
-    Raises:
-        UnfitFileError: A file is not what the scene needs there.
+    `read` returns the bytes of an artifact by its digest. Raises UnfitFileError.
     """
     files = Physics.files(physics)
     arrays = {place: read_file(place, read(name.removeprefix(ARTIFACT))) for place, name in files}
@@ -84,11 +75,7 @@ def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any
 
 
 def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
-    """Return a folder of OBJ files, one a frame of the body that names it, as one NPZ file.
-
-    Raises:
-        UnfitFileError: They are not frames of one mesh.
-    """
+    """Return a folder of OBJ files, one a frame of the body that names it, as one NPZ file; raise UnfitFileError."""
     rates = [body.frame_rate for body in scene.bodies.values() if isinstance(body, MeshBody) and body.file == name]
     if not files or not rates or rates[0] is None:
         raise UnfitFileError("must hold OBJ files, one a frame, of a body with a frame_rate [1/s]")
@@ -103,11 +90,7 @@ def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
 
 
 def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
-    """Check a file that is in the store: it is what the scene needs, and has the counts that the scene gives.
-
-    Raises:
-        UnfitFileError: It is not.
-    """
+    """Raise UnfitFileError where a file in the store is not what a scene needs, or has not the counts that it gives."""
     found, document = read_file(place, data), scene.physics()
     counts = _counts(place, found)
     if counts is not None and (said := at(document, (*place[:-1], "counts"))) != list(counts):
@@ -119,20 +102,13 @@ def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
 
 
 def read_file(place: Path, data: bytes) -> Arrays:
-    """Return the arrays of a file of the physics.
+    """Return the arrays of a file at a place in the physics; raise UnfitFileError.
 
     - a flat pattern: `rest` (V, 2), `positions` (V, 3) [m] and `triangles` (T, 3)
     - a start: `positions` (V, 3) [m]
     - a motion: `time` (K) [s], `move` (K, 3) [m] and `turn` (K, 3) [rad]
     - a body: `triangles` (T, 3), `times` (F) [s] and `positions` (F, N, 3) [m] or, of a skin, `rest` (N, 3) [m],
       `weights` (N, B) and `bones` (F, B, 3, 4), x -> A x + b
-
-    Args:
-        place: Of the file in the document.
-        data: The file.
-
-    Raises:
-        UnfitFileError: It breaks a rule.
     """
     _check_size(data)
     if place[-1] == "path":
@@ -153,11 +129,7 @@ def _check_size(data: bytes) -> None:
 
 
 def counts_of(data: bytes) -> tuple[int, int] | None:
-    """Return the numbers of vertices and triangles of an OBJ file; None of an NPZ or CSV file.
-
-    Raises:
-        UnfitFileError: It is none of these.
-    """
+    """Return the numbers of vertices and triangles of an OBJ file; None of an NPZ or CSV file. Raise UnfitFileError."""
     _check_size(data)
     if data.startswith(b"PK"):
         _names(data)
@@ -310,8 +282,7 @@ def _text(data: bytes) -> str:
 def read_obj(data: bytes) -> tuple[Floats, Triangles, Floats | None]:
     """Return the vertices (N, 3), triangles (T, 3) and, if each vertex has one, texture coordinates (N, 2).
 
-    Raises:
-        UnfitFileError: A line is no vertex or face.
+    Raises UnfitFileError for a line that is no vertex or face.
     """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []

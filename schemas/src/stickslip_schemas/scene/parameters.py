@@ -111,8 +111,7 @@ class Parameter(Document):
 def found(document: Mapping[str, Any], path: str) -> Path:
     """Return the place that a dotted path leads to; `friction.A.B` finds the coefficient of two in any order.
 
-    Raises:
-        LookupError: It leads nowhere; the message says from where on.
+    Raises LookupError, which says from where on it leads nowhere.
     """
     words = path.split(".")
     if words[0] == "friction" and len(words) == 3:

@@ -6,33 +6,25 @@ from urllib.parse import quote, unquote, urlsplit
 
 from stickslip_schemas.store.base import (
     CorruptArtifactError,
-    Room,
     ShownVersion,
     Store,
     Stored,
-    artifact_name,
     in_parallel,
     is_unavailable,
-    shown_name,
-    version_name,
 )
 from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
 
 __all__ = [
     "CorruptArtifactError",
     "DirectoryStore",
-    "Room",
     "ShownVersion",
     "Store",
     "Stored",
-    "artifact_name",
     "in_parallel",
     "is_unavailable",
     "open_store",
-    "shown_name",
     "store_place",
     "sync",
-    "version_name",
     "write_durably",
 ]
 
@@ -41,11 +33,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 def store_place(place: str | Path) -> str:
-    """Return the place of a store as every process of a machine understands it: an absolute path, or a URL of a bucket.
-
-    Raises:
-        ValueError: It is neither a directory nor `file:///DIRECTORY` nor `s3://BUCKET/PREFIX`.
-    """
+    """Return the place of a store as every process of a machine understands it, a path or a URL; raise ValueError."""
     text = str(place)
     if _SCHEME.match(text) is None and text:
         return str(Path(text).absolute())
@@ -70,8 +58,7 @@ def store_place(place: str | Path) -> str:
 def open_store(place: str | Path) -> Store:
     """Open the store at a place; see `store_place`. Nothing is written, and no server is asked.
 
-    Raises:
-        ValueError: There is no such sort of store, or what it needs is not installed.
+    Raises ValueError where there is no such sort of store, or what it needs is not installed.
     """
     place = store_place(place)
     if not place.startswith("s3://"):

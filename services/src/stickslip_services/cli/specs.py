@@ -56,8 +56,7 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
     A scene that is a file, or that names files, becomes a document with references by digest.
 
-    Raises:
-        SpecFileError: It is no document, or the scene breaks a rule.
+    Raises SpecFileError where it is no document, or the scene breaks a rule.
     """
     document = read_spec(path)
     scene = document.get("scene")
@@ -71,11 +70,7 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
-    """Return the scene of a file, with references by digest, and the files by digest that it names.
-
-    Raises:
-        SpecFileError: It is no document, or breaks a rule.
-    """
+    """Return the scene of a file, with references by digest, and its files by digest; raise SpecFileError."""
     return _inlined({"name": _name(path), **read_spec(path)}, path)
 
 

@@ -284,10 +284,8 @@ class Client:
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and repeat it while the connection fails or the coordinator is busy.
 
-        Repeating is safe: requests that change something are idempotent or carry an idempotency key.
-
-        Raises:
-            ClientError: The request failed.
+        Repeating is safe: requests that change something are idempotent or carry an idempotency key. Raises
+        ClientError.
         """
         until = time.monotonic() + self.patience
         for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):

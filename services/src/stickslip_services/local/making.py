@@ -52,8 +52,7 @@ def _asked(arguments: list[str], refusal: str) -> str:
 def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
 
-    Raises:
-        MakingError: The program failed, or `out` holds another certificate.
+    Raises MakingError where the program failed, or `out` holds another certificate.
     """
     arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
     digest = _asked(arguments, "no certificate was made").strip()
@@ -80,18 +79,8 @@ def simulate(
 ) -> dict[str, Any]:
     """Simulate the first sample of a spec into a new directory, with progress on standard error.
 
-    Args:
-        spec: Of a scene.
-        files: What it names, by digest.
-        out: A directory that does not exist; it appears when all is written.
-        certificate: Of its preset.
-        obj: Write `SHEET/0000.obj` and so on, too.
-
-    Returns:
-        What `scene.json` holds.
-
-    Raises:
-        MakingError: It was not run.
+    `files` are those that it names, by digest. `out`, which must not exist, appears when all is written; with `obj`, it
+    has `SHEET/0000.obj` and so on, too. Returns what `scene.json` holds; raises MakingError where it was not run.
     """
     import numpy as np  # the extra `arrays`
 
@@ -134,11 +123,7 @@ def simulate(
 
 
 def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
-    """Draw the start and the motions of a scene into a directory; return the names of the pictures.
-
-    Raises:
-        MakingError: It was not drawn.
-    """
+    """Draw the start and the motions of a scene into a directory; return names of pictures, or raise MakingError."""
     with _handed_over(scene, files) as (given, _):
         pictures: list[str] = _workers(["preview", *given, "--out", str(out)])["pictures"]
     return pictures

@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
-    """Simulate tasks of one kind together; return one result for each.
-
-    Raises:
-        ValueError: The tasks are of several kinds.
-        UnknownKindError: There is no such kind.
-    """
+    """Simulate tasks of one kind together; return one result for each. Raise ValueError for several kinds."""
     names = sorted({task.simulation.kind for task in tasks})
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
