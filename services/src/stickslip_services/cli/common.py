@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -121,7 +122,7 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
             _print_error(f"{error.filename or 'the file system'}: {error.strerror or error}")
         except ModuleNotFoundError as error:
             package = (error.name or "stickslip").partition(".")[0]
-            if package.startswith("stickslip"):
+            if package.startswith("stickslip") or find_spec(package):
                 raise
             extra, what = ("arrays", "arrays") if package in ARRAYS else ("server", "the server")
             _print_error(str(MissingExtraError(extra, f"this needs {what}, and {error.name}")))
