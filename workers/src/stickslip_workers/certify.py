@@ -54,7 +54,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         preset=preset,
         numbers=dict(certification.numbers()),
         sim_core=solver_build(certification.solver),
-        protocol_sources=_protocol_sources(),
+        protocol_sources=content_key("protocols", digests(sources(["stickslip_sim_core.protocols"]))),
         extent="quick" if quick else "full",
         protocols=tuple(reports),
         passed=all(report.passed for report in reports),
@@ -107,10 +107,6 @@ def _environment() -> dict[str, str]:
         "compiler": build.compiler,
         "isa": build.isa,
     }
-
-
-def _protocol_sources() -> str:
-    return content_key("protocols", digests(sources(["stickslip_sim_core.protocols"])))
 
 
 def _processor() -> str:

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 
 from cryptography.fernet import Fernet
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.store import write_durably
@@ -63,10 +63,9 @@ def list_keys(connection: Connection) -> list[ApiKey]:
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:
     """Revoke a key; raise NotFoundError."""
-    known = api_keys.c.id == key_id
-    if connection.scalar(select(api_keys.c.seq).where(known)) is None:
+    revoked = update(api_keys).values(revoked_at=func.coalesce(api_keys.c.revoked_at, now))
+    if connection.execute(revoked.where(api_keys.c.id == key_id)).rowcount == 0:
         raise NotFoundError(f"there is no key {key_id[:100]!r}")
-    connection.execute(update(api_keys).where(known, api_keys.c.revoked_at.is_(None)).values(revoked_at=now))
     note(connection, "key.revoke", key_id, now)
 
 

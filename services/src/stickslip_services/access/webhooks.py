@@ -103,16 +103,16 @@ def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
 
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Retry a webhook at once, even if it was given up; raise NotFoundError."""
-    _find(connection, webhook_id)
     values = {"next_at": now, "failures": 0, "failing_since": None}
-    connection.execute(update(webhooks).where(webhooks.c.id == webhook_id).values(values))
+    if connection.execute(update(webhooks).where(webhooks.c.id == webhook_id).values(values)).rowcount == 0:
+        raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
     note(connection, "webhook.retry", webhook_id, now)
 
 
 def delete_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Delete a webhook; raise NotFoundError."""
-    _find(connection, webhook_id)
-    connection.execute(delete(webhooks).where(webhooks.c.id == webhook_id))
+    if connection.execute(delete(webhooks).where(webhooks.c.id == webhook_id)).rowcount == 0:
+        raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
     note(connection, "webhook.delete", webhook_id, now)
 
 
@@ -242,11 +242,6 @@ async def _status(url: str, body: str, headers: dict[str, str]) -> int:
     client = httpx.AsyncClient(timeout=None, trust_env=False)
     async with client, client.stream("POST", url, content=body, headers=headers) as response:
         return response.status_code
-
-
-def _find(connection: Connection, webhook_id: str) -> None:
-    if connection.scalar(select(webhooks.c.seq).where(webhooks.c.id == webhook_id)) is None:
-        raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
 
 
 def _check(url: str) -> None:

@@ -75,7 +75,16 @@ def check(scene: str, as_json: bool) -> None:
         {"name": each.name, "dtype": each.dtype, "shape": list(each.shape), "description": each.description}
         for each in layout(spec)
     ]
-    axes = {name: _axis(given, name) for name in given.parameters}
+    axes: dict[str, dict[str, Any]] = {
+        name: {
+            "default": given.default(name),
+            "values": parameter.range,
+            "unit": parameter.unit,
+            "sets": list(parameter.sets),
+            "description": parameter.description,
+        }
+        for name, parameter in given.parameters.items()
+    }
     usual = spec.usual_costs
     said: dict[str, Any] = {
         "scene": given.name,
@@ -119,17 +128,6 @@ def preview(scene: str, out: Path, as_json: bool) -> None:
         click.echo(json.dumps({"pictures": pictures}))
     else:
         say(f"{', '.join(pictures)} in {out}")
-
-
-def _axis(scene: Scene, name: str) -> dict[str, Any]:
-    parameter = scene.parameters[name]
-    return {
-        "default": scene.default(name),
-        "values": parameter.range,
-        "unit": parameter.unit,
-        "sets": list(parameter.sets),
-        "description": parameter.description,
-    }
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, bytes]]:

@@ -63,6 +63,8 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
     with suppress(ValueError, KeyError):
         inside &= np.asarray(data.label("psnr_cloth"), dtype=float) >= float(query["psnr"])
     chosen = np.flatnonzero(inside)
+    pictured = _pictured(data)  # of a clip, its middle picture is shown; else the first view
+    pictures = None if pictured is None else data.arrays[pictured]
     columns = [(axis["name"], data.arrays[axis["name"]], data.label(axis["name"])) for axis in axes]
     shown = [
         (slot, {name: data.named(array, column[slot]) for name, array, column in columns}, data.rejection(slot))
@@ -74,8 +76,8 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
         "next_start": start + SHOWN_THUMBS if start + SHOWN_THUMBS < len(chosen) else None,
         "kept_query": {name: value for name, value in query.items() if name != "start"},
         "has_psnr": "psnr_cloth" in data.arrays,
-        "pictured": _pictured(data),
-        "picture_index": _telling_picture(data),
+        "pictured": pictured,
+        "picture_index": pictures.shape[0] // 2 if pictures is not None and pictures.dimensions[0] == "frame" else 0,
     }
 
 
@@ -89,13 +91,6 @@ def losses(data: SampleData) -> dict[str, Any]:
 def _pictured(data: SampleData) -> str | None:
     """Return the name of the array of pictures, None for a dataset without pictures."""
     return next((name for name, array in data.arrays.items() if array.dimensions[-3:] == ("y", "x", "rgb")), None)
-
-
-def _telling_picture(data: SampleData) -> int:
-    """Return the index of the picture that represents a sample: the middle of a clip, or the first view."""
-    name = _pictured(data)
-    array = None if name is None else data.arrays[name]
-    return array.shape[0] // 2 if array is not None and array.dimensions[0] == "frame" else 0
 
 
 def histograms(data: SampleData) -> list[dict[str, Any]]:
@@ -137,13 +132,14 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         elif len(array.shape) <= 1 and name != "sample_key" and (not array.shape or array.shape[0] <= 8):
             text = "" if array.categories else array.description
             groups[group[name]][name] = (data.named(array, data.read(name, slot)), text)
+    stored = data.arrays[_pictured(data) or next(iter(data.arrays))]
     chosen = groups["Parameters"]
     groups["Parameters"] = {name: chosen[name] for name in data.manifest.spec.named_axes if name in chosen}
     timed = [array for array in data.arrays.values() if array.dimensions[:1] == ("instant",)]
     frames = list(range(data.arrays[layers[0]].shape[0])) if layers else []
     return {
         "slot": slot,
-        "shard": _shard(data, slot),
+        "shard": stored.shard_path(slot // data.manifest.samples_per_file(stored)),
         "pictures": pictures,
         "layers": layers,
         "frames": data.arrays[layers[0]].attributes.get("instants", frames) if layers else [],
@@ -154,12 +150,6 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "has_contact": any(name.endswith(".contact") for name in data.arrays),
         "groups": {title: labels for title, labels in groups.items() if labels},
     }
-
-
-def _shard(data: SampleData, slot: int) -> str:
-    """Return the path of the file with the sample's pictures or, without any, the first of its arrays."""
-    array = data.arrays[_pictured(data) or next(iter(data.arrays))]
-    return array.shard_path(slot // data.manifest.samples_per_file(array))
 
 
 def groups_of(data: SampleData) -> dict[str, str]:

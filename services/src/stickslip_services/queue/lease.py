@@ -147,7 +147,9 @@ def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -
         mine = [(lease, held[name]) for lease, name in names if name in held]
         unneeded = _unneeded(book, mine)
         cancel_tasks(book, [task for _, task in mine if task.seq in unneeded])
-        halted = _halted(book, [(lease, task) for lease, task in mine if task.seq not in unneeded])
+        waiting = {task.seq for lease, task in mine if task.seq not in unneeded and not _is_started(lease, task)}
+        # Those that only paused jobs need, and that have not been started, are given back.
+        halted = live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
         for _, task in mine:
             if task.seq in halted:
                 release(book, task, TaskState.pending)
@@ -233,12 +235,6 @@ def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[
         for lease, task in held
         if task.seq not in needed and (task.seq in cancelling or not _is_started(lease, task))
     }
-
-
-def _halted(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
-    """Return the tasks to give back: those that only paused jobs need, and that have not been started."""
-    waiting = {task.seq for lease, task in held if not _is_started(lease, task)}
-    return live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
 
 
 def _is_started(lease: LeaseState, task: HeldTask) -> bool:

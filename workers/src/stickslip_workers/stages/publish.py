@@ -125,12 +125,10 @@ class _Labels:
         for section in given:
             for number, data in enumerate(in_parallel(store.read, section.labels)):
                 first = section.first + number * size
-                self._fill(data, slice(first, min(first + size, self.count)))
-
-    def _fill(self, data: bytes, slots: slice) -> None:
-        index = decode_shard_index(data, len(self.arrays)).tolist()
-        for array, (offset, length) in zip(self.arrays, index, strict=True):
-            decode_chunk(data[offset : offset + length], self._columns[array.name][slots])
+                slots = slice(first, min(first + size, self.count))
+                index = decode_shard_index(data, len(self.arrays)).tolist()
+                for array, (offset, length) in zip(self.arrays, index, strict=True):
+                    decode_chunk(data[offset : offset + length], self._columns[array.name][slots])
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self._columns[name]
