@@ -99,7 +99,8 @@ bool Stepper::easy(int iterations, bool near) const { return iterations <= const
 
 bool Stepper::near() const { return newton.pairs && newton.pairs->relevant(); }
 
-// Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law.
+// Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law. Where no part is
+// shorter this has as many iterations as in all parts before.
 StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report) {
   x = driven;
   newton.pairs->stiff = true;
@@ -108,7 +109,8 @@ StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>
   if (outcome.converged) return outcome;
   x = driven;
   assembly_.definite = true;
-  return newton.solve(problem, x, false, constants_.smooth_iterations, report, true);
+  const int attempts = halvings_ == settings_.halvings_max ? 1 + settings_.halvings_max : 1;
+  return newton.solve(problem, x, false, attempts * constants_.smooth_iterations, report, true);
 }
 
 // Solves for the state at the end of a part of a step. Where that fails it does nothing, unless no part is shorter:
@@ -180,10 +182,7 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   drive_nodes(0.0, 1.0, dt, drive, drive.bodies);
   tried_dt_ = dt;
   predicted_ = x;
-  if (sweeps(bodies_before_, drive.bodies, dt)) {
-    tried_ = {false, 0.0};
-    return false;
-  }
+  if (sweeps(bodies_before_, drive.bodies, dt)) return false;
   assembly_.definite = false;
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);

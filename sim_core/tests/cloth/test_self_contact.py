@@ -361,7 +361,14 @@ class TestNothingCrosses:
         assert unconverged <= 1
 
     @pytest.mark.parametrize(
-        "name", ["drop-1", pytest.param("drop-3", marks=pytest.mark.slow), "folding-0", "folding-1", "pile-0"]
+        "name",
+        [
+            "drop-1",
+            "folding-0",
+            "folding-1",
+            "pile-0",
+            *(pytest.param(n, marks=pytest.mark.slow) for n in ("drop-3", "pile-1")),
+        ],
     )
     def test_tumbles(self, name: str) -> None:
         seen = tumbles.watch(tumbles.tumble(name))
