@@ -203,6 +203,7 @@ def test_a_delivery_that_ends_in_its_middle_is_tried_again_without_the_wait_of_i
     stopped: bool,
     wait: float,
 ) -> None:
+    monkeypatch.setattr(webhooks, "WAIT_SECONDS", 20.0)
     made(context, receiver.url)
     run_job(context, worker, 1.0)
     messenger = WebhookDelivery(context.database, context.clock, sealer(context.settings))
