@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.physics
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 

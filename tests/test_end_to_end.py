@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tensorstore
 import xarray
-from harness import STICKSLIP, Service, read_arrays
+from harness import STICKSLIP, Service, descendants, read_arrays
 from stickslip_schemas.base.keys import sha256
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import Manifest
@@ -66,6 +66,16 @@ def test_the_job_ends_and_says_what_was_rejected(service: Service, job: dict[str
         assert rejection.labels["phi0"] == 0.0
         assert "gamma" in rejection.message
         assert rejection.reason in cli(service, "show", job["id"])
+
+
+def test_all_that_listens_is_on_loopback(service: Service, job: dict[str, Any]) -> None:
+    """The coordinator, and Ray, which has run the job."""
+    assert service.process is not None
+    ours = {service.process.pid, *descendants(service.process.pid)}
+    listeners = subprocess.run(["ss", "-ltnpH"], capture_output=True, text=True, check=True).stdout.splitlines()
+    places = [line.split()[3] for line in listeners if any(f"pid={pid}," in line for pid in ours)]
+    assert len(places) >= 3
+    assert all("127.0.0.1]:" in place or place.startswith("127.0.0.1:") for place in places), places
 
 
 def test_labels_and_curves_are_those_of_the_solver(directory: Path) -> None:
