@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.protocol import RefinedProtocol
-from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, cell_of, strip
 from stickslip_sim_core.reference import master_curves
 
@@ -44,6 +43,12 @@ class Cantilever(RefinedProtocol):
 
     name, x_name, y_name = "cantilever", "Gamma", "H/W"
     points, time_step_name = "gamma", "first_time_step"
+    constants: ClassVar = {
+        "last_time_step_at_most": LONGEST,
+        **{f"finer_beyond_{weight:g}": times for weight, times in FINER.items()},
+        "stretching_over_weight": STRETCHING,
+        "force_scale_over_node_weight": FORCE_SHARE,
+    }
 
     gamma: Sequence[float] = GAMMA
     """Weights rho_A g L^3 / D."""
@@ -59,16 +64,6 @@ class Cantilever(RefinedProtocol):
 
     def master(self, x: float, at: Mapping[str, Any]) -> float:
         return float(master_curves.cantilever(x))
-
-    def reported(self) -> dict[str, Setting]:
-        return {
-            **super().reported(),
-            "last_time_step_at_most": LONGEST,
-            **{f"finer_beyond_{weight:g}": times for weight, times in FINER.items()},
-            "stretching_over_weight": STRETCHING,
-            "force_scale_over_node_weight": FORCE_SHARE,
-            **self.counted(),
-        }
 
 
 def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING) -> tuple[float, Cloth]:

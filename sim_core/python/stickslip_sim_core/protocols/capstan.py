@@ -38,6 +38,12 @@ class Capstan(ClothProtocol):
 
     name, x_name, y_name = "capstan", "mu", "ln(T2/T1)"
     points, parameters = "friction", {"bending": "bending"}
+    constants: ClassVar = {
+        "wrap": WRAP,
+        "cells_per_turn": CELLS_PER_TURN,
+        "speed": SPEED,
+        "force_scale_over_pull_on_a_cell": FORCE_SHARE,
+    }
 
     friction: Sequence[float] = FRICTION
     """Of strip and cylinder."""
@@ -54,26 +60,11 @@ class Capstan(ClothProtocol):
         return float(np.log(heavy.mean() / LIGHT)), float(np.log(master))
 
     def reported(self) -> dict[str, Setting]:
-        return {
-            **super().reported(),
-            "wrap": WRAP,
-            "cells_per_turn": CELLS_PER_TURN,
-            "speed": SPEED,
-            "ripple": self.tally.largest,
-            "force_scale_over_pull_on_a_cell": FORCE_SHARE,
-            **self.counted(),
-        }
+        return {**super().reported(), "ripple": self.tally.largest}
 
 
 class Strip:
-    """A strip without weight over a cylinder along y, two cells wide. A pull of `LIGHT` hangs on its free end.
-
-    Args:
-        mu: Friction.
-        bending: B / T1.
-        preset: Solver settings.
-        cells_per_turn: How fine the strip is.
-    """
+    """A strip without weight over a cylinder along y, two cells wide. A pull of `LIGHT` hangs on its free end."""
 
     apart: ClassVar[float] = 0.0
     """Distance from the cylinder at the start, in thicknesses."""

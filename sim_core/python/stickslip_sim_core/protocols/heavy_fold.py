@@ -52,6 +52,16 @@ class HeavyFold(ClothProtocol):
     name, x_name, y_name = "heavy-fold", "mu", "length/L_gb, pull/(rho g L_gb)"
     points, parameters = "friction", {"what": "what"}
     what: ClassVar = range(3)
+    thickness = GAP * BENDING_LENGTH
+    constants: ClassVar = {
+        "what": "0 height, 1 nose to landing, 2 pull at slip",
+        "gap_over_bending_length": GAP,
+        "stretching_over_weight": STRETCHING,
+        "force_scale_over_node_weight": FORCE_SHARE,
+        "last_time_step_at_most": LONGEST,
+        "drift_seconds": HOLD_TIME,
+        "drift_share_of_slip_pull": HOLD_SHARE,
+    }
 
     friction: Sequence[float] = FRICTION
     """Of the strip with itself and with the floor; the shape does not depend on it."""
@@ -77,30 +87,11 @@ class HeavyFold(ClothProtocol):
         return (height, exact.height), (nose_to_landing, exact.nose_to_landing), (pull, fold.expected)
 
     def reported(self) -> dict[str, Setting]:
-        return {
-            "preset": self.solver.name,
-            "what": "0 height, 1 nose to landing, 2 pull at slip",
-            "cells": self.cells,
-            "gap_over_bending_length": GAP,
-            "stretching_over_weight": STRETCHING,
-            "force_scale_over_node_weight": FORCE_SHARE,
-            "last_time_step_at_most": LONGEST,
-            "drift_mm": 1e3 * self.tally.largest,
-            "drift_seconds": HOLD_TIME,
-            "drift_share_of_slip_pull": HOLD_SHARE,
-            "least_distance_over_thickness": self.tally.least_distance / (GAP * BENDING_LENGTH),
-            **self.counted(),
-        }
+        return {**super().reported(), "cells": self.cells, "drift_mm": 1e3 * self.tally.largest}
 
 
 class Fold:
-    """A strip on a floor, with its upper part folded back over the lower one.
-
-    Args:
-        mu: Friction with itself and with the floor.
-        preset: Solver settings.
-        cells: Along its length.
-    """
+    """A strip on a floor, with its upper part folded back over the lower one; `mu`: with itself and with the floor."""
 
     def __init__(self, mu: float, preset: SolverSettings, cells: int) -> None:
         self.mu, self.preset = mu, preset

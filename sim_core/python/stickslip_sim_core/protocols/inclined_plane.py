@@ -95,6 +95,7 @@ class SlopeProtocol(MeshedProtocol):
     """
 
     x_name, y_name, points = "mu", "tan(alpha) at slip", "friction"
+    constants: ClassVar = {"drift_seconds": HOLD_TIME, "drift_share_of_slip_angle": HOLD_SHARE}
 
     force_share: ClassVar[float]
     """Of a node's weight: the force that residuals are measured in."""
@@ -115,13 +116,8 @@ class SlopeProtocol(MeshedProtocol):
         return slope if moved <= DRIFT_MAX else np.nan, mu
 
     def reported(self) -> dict[str, Setting]:
-        return {
-            **super().reported(),
-            "force_scale_over_node_weight": self.force_share,
-            "drift_mm": 1e3 * self.tally.largest,
-            "drift_seconds": HOLD_TIME,
-            "drift_share_of_slip_angle": HOLD_SHARE,
-        }
+        own = {"force_scale_over_node_weight": self.force_share, "drift_mm": 1e3 * self.tally.largest}
+        return super().reported() | own
 
 
 @dataclass(kw_only=True, eq=False)

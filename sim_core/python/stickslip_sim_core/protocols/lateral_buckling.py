@@ -8,7 +8,7 @@ differences of the solver's own gradient.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.protocol import RefinedProtocol
-from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
 from stickslip_sim_core.reference import master_curves
 
@@ -46,6 +45,7 @@ class LateralBuckling(RefinedProtocol):
     name, x_name, y_name = "lateral-buckling", "w/L", "Gamma* = rho_A g L^3 / D"
     points, parameters = "aspect", {"mesh": "meshes", "poisson": "poisson"}
     time_step_name = "first_time_step"
+    constants: ClassVar = {"stretching_over_weight": STRETCHING, "force_scale_over_node_weight": FORCE_SHARE}
 
     aspect: Sequence[float] = ASPECT
     """Widths over length."""
@@ -56,10 +56,6 @@ class LateralBuckling(RefinedProtocol):
 
     def master(self, x: float, at: Mapping[str, Any]) -> float:
         return float(master_curves.lateral_buckling(x, at["poisson"]))
-
-    def reported(self) -> dict[str, Setting]:
-        shares = {"stretching_over_weight": STRETCHING, "force_scale_over_node_weight": FORCE_SHARE}
-        return super().reported() | shares
 
 
 def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:

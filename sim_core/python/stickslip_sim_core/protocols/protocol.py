@@ -68,9 +68,12 @@ class Protocol(ABC):
         measured, master = (tuple(float(pair[i]) for pair in pairs) for i in (0, 1))
         return Curve({name: float(value) for name, value in at.items()}, x, measured, master)
 
+    constants: ClassVar[Mapping[str, Setting]] = {}
+    """Numbers of the protocol that no setting changes, for the result."""
+
     @abstractmethod
     def reported(self) -> dict[str, Setting]:
-        """Return settings and diagnostics for the result, once all is measured."""
+        """Return settings and diagnostics for the result besides `constants`, once all is measured."""
 
     def run(self) -> ProtocolResult:
         """Measure all points of all curves."""
@@ -85,7 +88,7 @@ class Protocol(ABC):
             self.y_name,
             curves,
             self.tolerance,
-            self.reported(),
+            {**self.reported(), **self.constants},
             build_info().build_hash,
             self.limit_tolerance,
         )
@@ -109,12 +112,16 @@ class ClothProtocol(Protocol):
     def __post_init__(self) -> None:
         self.solver = preset_named(self.preset)
 
-    def reported(self) -> dict[str, Setting]:
-        return {"preset": self.solver.name, self.time_step_name: self.solver.time_step}
+    thickness: ClassVar[float | None] = None
+    """Of cloth that touches cloth [m]."""
 
-    def counted(self) -> dict[str, Setting]:
-        """Return numbers of steps, for `reported`."""
-        return {"steps": self.tally.steps, "unconverged_steps": self.tally.unconverged_steps}
+    def reported(self) -> dict[str, Setting]:
+        found: dict[str, Setting] = {"preset": self.solver.name, self.time_step_name: self.solver.time_step}
+        if self.tally.steps:
+            found |= {"steps": self.tally.steps, "unconverged_steps": self.tally.unconverged_steps}
+        if self.thickness is not None:
+            found["least_distance_over_thickness"] = self.tally.least_distance / self.thickness
+        return found
 
 
 @dataclass(kw_only=True, eq=False)

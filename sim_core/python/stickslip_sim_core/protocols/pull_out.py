@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.protocol import MeshedProtocol
-from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import MeshKind, rectangle
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
@@ -42,7 +41,12 @@ class PullOut(MeshedProtocol):
 
     name, x_name, y_name = "pull-out", "mu", "force/load"
     points, parameters = "friction", {"load": "loads", "mesh": "meshes"}
-    grids_max = 1
+    grids_max, thickness = 1, THICKNESS
+    constants: ClassVar = {
+        "speed": SPEED,
+        "friction_below_over_mu": OVER_LOWER,
+        "force_scale_over_node_weight": FORCE_SHARE,
+    }
 
     friction: Sequence[float] = FRICTION
     """mu."""
@@ -58,26 +62,11 @@ class PullOut(MeshedProtocol):
         self.tally.count(pulled.cloth)
         return found
 
-    def reported(self) -> dict[str, Setting]:
-        return {
-            **super().reported(),
-            "speed": SPEED,
-            "friction_below_over_mu": OVER_LOWER,
-            "force_scale_over_node_weight": FORCE_SHARE,
-            "least_distance_over_thickness": self.tally.least_distance / THICKNESS,
-            **self.counted(),
-        }
-
 
 class Pulled:
     """Three sheets on a rough floor. The upper one is held by its rear edge, the middle one drawn by its front edge.
 
-    Args:
-        mu: Friction of the upper two; that of the lower two is half of it.
-        load: Factor of the gravity on the upper sheet.
-        preset: Solver settings.
-        cells: Of the upper sheet along a side.
-        kind: Of the meshes.
+    `mu` is the friction of the upper two, `load` a factor of the gravity on the upper one, which has `cells` a side.
     """
 
     def __init__(self, mu: float, load: float, preset: SolverSettings, cells: int, kind: MeshKind) -> None:

@@ -82,6 +82,14 @@ class Curve:
         """The same by mesh, the coarsest first, if there are several."""
         return tuple(self._errors_of(measured) for measured in self.refinement.measured) if self.refinement else ()
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return parameters, points and errors, and of three meshes limits, orders and the errors of each."""
+        found = {name: getattr(self, name) for name in ("parameters", "x", "measured", "master", "errors")}
+        if self.refinement:
+            found |= {name: getattr(self.refinement, name) for name in ("limit", "order", "cells")}
+            found |= {"limit_errors": self.limit_errors, "errors_by_mesh": self.errors_by_mesh}
+        return found
+
     def _errors_of(self, values: Numbers) -> Numbers:
         return tuple(_relative_error(*pair) for pair in zip(values, self.master, strict=True))
 
@@ -123,43 +131,12 @@ class ProtocolResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result in JSON's types; NaN and infinity become None."""
-        return {
-            "protocol": self.protocol,
-            "x": self.x_name,
-            "y": self.y_name,
-            "tolerance": self.tolerance,
-            "error": _number(self.error),
-            "limit_tolerance": self.limit_tolerance,
-            "limit_error": None if self.limit_error is None else _number(self.limit_error),
-            "passed": self.passed,
-            "settings": {
-                name: list(value) if isinstance(value, tuple) else value for name, value in self.settings.items()
-            },
-            "build_hash": self.build_hash,
-            "curves": [
-                {
-                    "parameters": dict(curve.parameters),
-                    **{
-                        name: [_number(value) for value in getattr(curve, name)]
-                        for name in ("x", "measured", "master", "errors")
-                    },
-                    **_refinement(curve),
-                }
-                for curve in self.curves
-            ],
-        }
-
-
-def _refinement(curve: Curve) -> dict[str, Any]:
-    """Return limits, orders and the errors of each mesh in JSON's types; nothing without three meshes."""
-    if curve.refinement is None:
-        return {}
-    rows = {"limit": curve.refinement.limit, "order": curve.refinement.order, "limit_errors": curve.limit_errors}
-    return {
-        **{name: [_number(value) for value in values] for name, values in rows.items()},
-        "cells": [list(cells) for cells in curve.refinement.cells],
-        "errors_by_mesh": [[_number(error) for error in errors] for errors in curve.errors_by_mesh],
-    }
+        numbers = ("protocol", "tolerance", "error", "limit_tolerance", "limit_error", "passed", "build_hash")
+        found: dict[str, Any] = _plain(
+            {"x": self.x_name, "y": self.y_name, **{name: getattr(self, name) for name in numbers}}
+        )
+        settings = {name: list(value) if isinstance(value, tuple) else value for name, value in self.settings.items()}
+        return found | {"settings": settings, "curves": [_plain(curve.as_dict()) for curve in self.curves]}
 
 
 def _relative_error(measured: float, master: float) -> float:
@@ -170,5 +147,9 @@ def _relative_error(measured: float, master: float) -> float:
     return measured / master - 1.0
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

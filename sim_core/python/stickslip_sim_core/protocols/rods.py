@@ -200,46 +200,32 @@ class RodLateralBuckling(RodProtocol):
     """
 
     name, x_name, y_name = "rod-lateral-buckling", "poisson", "rho A g L^3 / sqrt(EI GJ)"
-    points = "poisson"
+    points, constants = "poisson", {"stiffness_ratios": STIFFNESS_RATIOS}
 
     poisson: Sequence[float] = POISSON
     elements: int = 128
     tolerance: float = 1e-4
 
     def measure(self, poisson: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        return rigid_limit(poisson, self.elements), master_curves.lateral_buckling_rod()
-
-    def reported(self) -> dict[str, Setting]:
-        return super().reported() | {"stiffness_ratios": STIFFNESS_RATIOS}
-
-
-def rigid_limit(poisson: float, elements: int) -> float:
-    """Return the buckling weight of a continuous strip, rigid in its plane."""
-    single, double, fourfold = (
-        extrapolated(partial(buckling_weight, poisson, ratio), elements) for ratio in STIFFNESS_RATIOS
-    )
-    return (8.0 * fourfold - 6.0 * double + single) / 3.0
+        single, double, fourfold = (
+            extrapolated(partial(buckling_weight, poisson, ratio), self.elements) for ratio in STIFFNESS_RATIOS
+        )
+        return (8.0 * fourfold - 6.0 * double + single) / 3.0, master_curves.lateral_buckling_rod()
 
 
 def buckling_weight(poisson: float, stiffness_ratio: float, elements: int) -> float:
     """Return rho A g L^3 / sqrt(EI GJ) at which the chain of a strip loses stability, NaN if it never does."""
     # A thin strip: EI = Y w t^3 / 12 across its plane, GJ = Y w t^3 / (6 (1 + poisson)).
     twist = 2.0 / (1.0 + poisson)
-    relax = strip_chain(twist, stiffness_ratio, elements)
+    stiffness = np.array([twist, 1.0, stiffness_ratio])  # d3 = -y is the axis it hardly bends about
+    straight = np.zeros((elements, 3))
+
+    def relax(gamma: float, frames: Floats) -> Equilibrium:
+        return Equilibrium(gamma, *_sim_core.relax_chain(gamma, stiffness, straight, frames))
+
     horizontal = planar_frames(np.full(elements + 1, 0.5 * np.pi))
     start = relax(UP_FROM * np.sqrt(twist), horizontal)
     if not start.stable:
         return np.nan
     steps = np.arange(1, np.ceil(np.log(UP_TO / UP_FROM) / np.log(UP)))
     return loss_of_stability(relax, start, start.gamma * UP**steps) / float(np.sqrt(twist))
-
-
-def strip_chain(twist_stiffness: float, stiffness_ratio: float, elements: int) -> Relax:
-    """Relax chains of a straight strip; d3 = -y is the axis it hardly bends about."""
-    stiffness = np.array([twist_stiffness, 1.0, stiffness_ratio])
-    straight = np.zeros((elements, 3))
-
-    def relax(gamma: float, frames: Floats) -> Equilibrium:
-        return Equilibrium(gamma, *_sim_core.relax_chain(gamma, stiffness, straight, frames))
-
-    return relax

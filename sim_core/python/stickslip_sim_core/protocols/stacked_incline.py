@@ -12,7 +12,6 @@ from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.protocols.inclined_plane import FABRIC, OnSlope, SlopeProtocol
-from stickslip_sim_core.protocols.result import Setting
 from stickslip_sim_core.protocols.strip import MeshKind, rectangle
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
@@ -29,7 +28,7 @@ class StackedIncline(SlopeProtocol):
     A stack in which another interface slides has no slip angle either.
     """
 
-    name, force_share = "stacked-incline", 0.1
+    name, force_share, thickness = "stacked-incline", 0.1, THICKNESS
     parameters: ClassVar = {"sheets": "sheets", "mesh": "meshes"}
 
     friction: Sequence[float] = FRICTION
@@ -42,23 +41,11 @@ class StackedIncline(SlopeProtocol):
     def lay(self, mu: float, at: Mapping[str, Any]) -> "Stack":
         return Stack(at["sheets"], mu, self.solver, self.cells, self.kinds[at["mesh"]])
 
-    def reported(self) -> dict[str, Setting]:
-        return {
-            **super().reported(),
-            "least_distance_over_thickness": self.tally.least_distance / THICKNESS,
-            "unconverged_steps": self.tally.unconverged_steps,
-        }
-
 
 class Stack(OnSlope):
-    """Sheets on each other on a slope, the widest below, with the least friction below sheet `sheets // 2`.
+    """Sheets on each other on a slope, the widest below, with the least friction, mu, below sheet `sheets // 2`.
 
-    Args:
-        sheets: Their number.
-        mu: Least friction.
-        preset: Solver settings.
-        cells: Of the sheet on top along a side.
-        kind: Diagonals of grids, or the seed of unstructured meshes.
+    `cells` are those of the sheet on top along a side.
     """
 
     share_from, share_to, rate, slid = 0.99, 1.01, 0.002, 1e-6

@@ -111,7 +111,6 @@ class StickSlip(RefinedProtocol):
         return {
             **super().reported(),
             "static_ratio_error": self.tally.largest,
-            **self.counted(),
             **dict(zip(("phase_mu", "phase_strain", "phase_regime"), columns, strict=True)),
         }
 
