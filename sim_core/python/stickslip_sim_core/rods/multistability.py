@@ -29,9 +29,6 @@ class OtherMinima:
     energy: Floats
     """Lowest energy of another stable equilibrium [EI/L], shape (n,); NaN where none was found."""
 
-    energy_gap: Floats
-    """That energy less that of `solve_rods` [EI/L], shape (n,); negative where the other one is the lower."""
-
     centerline: Floats
     """Centreline of that equilibrium [L], shape (n, points, 3); NaN where none was found."""
 
@@ -45,20 +42,17 @@ def other_minima(
     elements: int = 128,
     points: int = 150,
     solution: RodSolution | None = None,
-    thorough: bool = True,
 ) -> OtherMinima:
-    """Search for stable equilibria other than the one that `solve_rods` reaches from the natural shape.
+    """Search for a stable equilibrium other than the one that `solve_rods` reaches from the natural shape.
 
-    What such rods have is a curl of either hand. Each rod therefore starts again from the mirror images of the
-    equilibrium itself and of the one under a quarter of its weight, from its natural helix of the other hand, and with
-    two turns of twist taken off. Over the thesis's ranges the first start alone found every rod that 28 others did,
-    straight, weakly curled, twisted either way, of two hands, random, or continued in the weight. Equilibria whose
-    centrelines differ by more than 1e-3 L are distinct.
+    What such rods have is a curl of either hand. Each rod therefore starts again from the mirror image of its
+    equilibrium. Over the thesis's ranges this start found every rod that 28 others did, straight, weakly curled,
+    twisted either way, of two hands, random, or continued in the weight. Equilibria whose centrelines differ by more
+    than 1e-3 L are distinct.
 
     Args:
         gamma, phi0, phi1, poisson, elements, points: As for `solve_rods`.
         solution: What `solve_rods` returned for exactly these arguments, to save solving again.
-        thorough: Try all starts; False: the first only, in a fifth of the time.
 
     Raises:
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
@@ -72,22 +66,13 @@ def other_minima(
         raise ValueError(f"solution: must be of {n} rods at {points} points, got shape {found.centerline.shape}")
 
     natural = np.stack([twist, np.zeros(n), bend], axis=1)[:, None, :]
-    starts = [found.curvature * MIRROR]
-    if thorough:
-        light = solve_rods(0.25 * weight, twist, bend, poisson=poisson, **options)
-        untwisted = natural - np.copysign(4.0 * np.pi, natural) * [1.0, 0.0, 0.0]
-        starts += [light.curvature * MIRROR, natural * MIRROR, untwisted]
-
     stiffness = (1.0 / (1.0 + poisson), 1.0, 1.0)
-    energy = np.full(n, np.nan)
-    centerline = np.full((n, points, 3), np.nan)
-    for start in starts:
-        start = _representable(start, elements)
-        other = solve_general_rods(natural, weight, stiffness=stiffness, start_curvature=start, **options)
-        distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
-        better = other.stable & ~(distance <= DISTINCT) & ~(other.energy >= energy)
-        energy[better], centerline[better] = other.energy[better], other.centerline[better]
-    return OtherMinima(np.isfinite(energy), energy, energy - found.energy, centerline)
+    start = _representable(found.curvature * MIRROR, elements)
+    other = solve_general_rods(natural, weight, stiffness=stiffness, start_curvature=start, **options)
+    distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
+    distinct = other.stable & ~(distance <= DISTINCT)
+    centerline = np.where(distinct[:, None, None], other.centerline, np.nan)
+    return OtherMinima(distinct, np.where(distinct, other.energy, np.nan), centerline)
 
 
 def _representable(start: Floats, elements: int) -> Floats:

@@ -37,7 +37,7 @@ def _solved(rods: Sequence[Mapping[str, Any]]) -> Iterable[Outcome]:
     solution = solve_rods(*parameters, **settings)
     good = solution.converged & solution.stable
     if good.any():
-        other = other_minima(*parameters, **settings, solution=solution, thorough=False)
+        other = other_minima(*parameters, **settings, solution=solution)
         distance, far = (label(solution.centerline[good]) for label in (self_contact_distance, reach))
     row = np.cumsum(good) - 1
     for i in range(len(rods)):
