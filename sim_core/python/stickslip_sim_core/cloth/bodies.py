@@ -1,6 +1,6 @@
 """Rigid bodies that cloth touches: planes, spheres, cylinders, capsules and boxes with rounded edges."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,9 @@ ROUNDING = 5e-3
 """Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest edge. Cells of up to
 twice the radius slide over such an edge."""
 
+ORIGIN = (0.0, 0.0, 0.0)
+UPRIGHT = np.eye(3)
+UPRIGHT.flags.writeable = False
 
 BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
 
@@ -32,28 +35,26 @@ class Body:
         ValueError: `mu` is out of range, `origin` is not finite, or `rotation` is no rotation.
     """
 
-    mu: float | ArrayLike
+    mu: ArrayLike
     """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
 
     shape: int = 0
     """0 plane, which fills z < 0 in its own axes; 1 rounded: `Body::Shape` of the core."""
 
-    core: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    core: tuple[float, float, float] = ORIGIN
     """Half edges of the core along the body's own axes [m], 0 or more; inf along the axis of an endless cylinder."""
 
     radius: float = 0.0
     """Distance of the body's face from its core [m]."""
 
-    origin: Floats = field(default_factory=lambda: np.zeros(3))
+    origin: ArrayLike = ORIGIN
     """(3,) [m]"""
 
-    rotation: Floats = field(default_factory=lambda: np.eye(3))
+    rotation: ArrayLike = UPRIGHT
     """(3, 3): columns are the axes of the body in the world."""
 
     def __post_init__(self) -> None:
-        mu = np.asarray(self.mu, float)
-        if mu.ndim > 1 or not mu.size or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
+        check_friction(self.mu)
         origin, turn = np.asarray(self.origin, float), np.asarray(self.rotation, float)
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"origin: must be three finite numbers [m], got {origin.tolist()}")
@@ -81,7 +82,18 @@ class Body:
         )
 
 
-def plane(mu: float | ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = (0.0, 0.0, 0.0)) -> Body:
+def check_friction(mu: ArrayLike) -> None:
+    """Check a coefficient of friction, or those with several sheets.
+
+    Raises:
+        ValueError: One is out of range.
+    """
+    values = np.asarray(mu, float)
+    if values.ndim > 1 or not values.size or not ((values >= 0.0) & (values <= MU_MAX)).all():
+        raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {values.tolist()}")
+
+
+def plane(mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = ORIGIN) -> Body:
     """Return the half-space below a plane, with the axes of the world in the shortest turn from z to the normal."""
     n = np.asarray(normal, float)
     if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
@@ -92,50 +104,36 @@ def plane(mu: float | ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin:
     if b > 0.0:
         a = -n[0] * n[1] / b
         turn = np.array([[1.0 - n[0] ** 2 / b, a, n[0]], [a, 1.0 - n[1] ** 2 / b, n[1]], [-n[0], -n[1], n[2]]])
-    return Body(mu, 0, origin=np.asarray(origin, float), rotation=turn)
+    return Body(mu, 0, origin=origin, rotation=turn)
 
 
-def sphere(
-    mu: float | ArrayLike, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
-) -> Body:
+def sphere(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
     """Return a ball. Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step."""
-    return _rounded(mu, (0.0, 0.0, 0.0), _length("radius", radius), origin, rotation)
+    return Body(mu, 1, ORIGIN, _length("radius", radius), origin, rotation)
 
 
-def cylinder(
-    mu: float | ArrayLike, radius: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike | None = None
-) -> Body:
+def cylinder(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
     """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
-    return _rounded(mu, (0.0, 0.0, np.inf), _length("radius", radius), origin, rotation)
+    return Body(mu, 1, (0.0, 0.0, np.inf), _length("radius", radius), origin, rotation)
 
 
 def capsule(
-    mu: float | ArrayLike,
-    radius: float,
-    length: float,
-    *,
-    origin: ArrayLike = (0.0, 0.0, 0.0),
-    rotation: ArrayLike | None = None,
+    mu: ArrayLike, radius: float, length: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT
 ) -> Body:
     """Return a cylinder with half balls as ends, along the last column of its rotation (3, 3).
 
-    Args:
-        mu: Coefficient of friction, or one for each sheet.
-        radius: Of the cylinder and its ends [m].
-        length: Of the cylinder between the two half balls [m].
-        origin: Its middle (3,) [m].
-        rotation: Its axes in the world (3, 3).
+    `length` is that of the cylinder between the two half balls [m], `origin` its middle (3,) [m].
     """
-    return _rounded(mu, (0.0, 0.0, 0.5 * _length("length", length)), _length("radius", radius), origin, rotation)
+    return Body(mu, 1, (0.0, 0.0, 0.5 * _length("length", length)), _length("radius", radius), origin, rotation)
 
 
 def box(
-    mu: float | ArrayLike,
+    mu: ArrayLike,
     size: ArrayLike,
     *,
     rounding: float | None = None,
-    origin: ArrayLike = (0.0, 0.0, 0.0),
-    rotation: ArrayLike | None = None,
+    origin: ArrayLike = ORIGIN,
+    rotation: ArrayLike = UPRIGHT,
 ) -> Body:
     """Return a box with edges of `size` (3,) [m], rounded with a radius [m]; None: 5 mm, or less for a thin box."""
     whole = np.asarray(size, float)
@@ -146,21 +144,10 @@ def box(
     if radius > half:
         raise ValueError(f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}")
     a, b, c = (0.5 * whole - radius).tolist()
-    return _rounded(mu, (a, b, c), radius, origin, rotation)
+    return Body(mu, 1, (a, b, c), radius, origin, rotation)
 
 
 def _length(name: str, value: float) -> float:
     if not (np.isfinite(value) and value > 0.0):
         raise ValueError(f"{name}: must be finite and > 0, got {value}")
     return value
-
-
-def _rounded(
-    mu: float | ArrayLike,
-    core: tuple[float, float, float],
-    radius: float,
-    origin: ArrayLike,
-    rotation: ArrayLike | None,
-) -> Body:
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Body(mu, 1, core, radius, np.asarray(origin, float), turn)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.cloth.bodies import MU_MAX
+from stickslip_sim_core.cloth.bodies import MU_MAX, check_friction
 
 THICKNESS = 5e-4
 """Default thickness of cloth in self-contact or in contact with a surface [m]."""
@@ -112,9 +112,7 @@ class Surface:
     sharp."""
 
     def __post_init__(self) -> None:
-        mu = np.asarray(self.mu, float)
-        if mu.ndim > 1 or not ((mu >= 0.0) & (mu <= MU_MAX)).all():
-            raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {mu.tolist()}")
+        check_friction(self.mu)
         if not (np.isfinite(self.thickness) and self.thickness >= 0.0):
             raise ValueError(f"thickness: must be finite and >= 0, got {self.thickness}")
         if not 0.0 <= self.crease <= np.pi:

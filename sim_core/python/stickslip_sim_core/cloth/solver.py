@@ -350,8 +350,8 @@ class Cloth:
         way = self.positions - x
         if straight:
             return np.asarray(x + s * way)
-        found: Floats = x + s * s * (3.0 - 2.0 * s) * way + h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
-        return found
+        bent = h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
+        return np.asarray(x + s * s * (3.0 - 2.0 * s) * way + bent)
 
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
@@ -362,8 +362,7 @@ class Cloth:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        force: Floats = np.asarray(self._solver.momentum_rate()) - weight - holders
-        return force
+        return np.asarray(self._solver.momentum_rate() - weight - holders)
 
     def _count(self, report: StepReport) -> StepReport:
         self.steps += report.steps
