@@ -59,9 +59,6 @@ def holder_path(time: ArrayLike) -> Floats:
     return np.stack([(ways[..., 1:] * (-1.0) ** legs).sum(axis=-1), -ways[..., 0]], axis=-1)
 
 
-DURATION = duration_of(DROP) + LEGS * duration_of(DRAG)
-"""Of drop-and-drag [s]."""
-
 FRAMES = 300
 """Frames of a whole drop-and-drag."""
 

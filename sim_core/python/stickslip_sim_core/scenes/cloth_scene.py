@@ -34,10 +34,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     - `body_pose` (frame, body, 3, 4), where there are bodies: x -> A x + b from its own axes
     - `BODY.rest`, `BODY.triangles`, and `BODY.vertices` (frame, vertex, 3) [m] if it deforms, of bodies of triangles
 
-    Args:
-        document: What the scene is.
-        seed: Of what breaks its symmetry.
-        kernel: Level of the kernels, see `Cloth`.
+    `seed` is of what breaks its symmetry; on `kernel`, see `Cloth`.
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
@@ -223,16 +220,16 @@ def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Fl
     return found
 
 
-def _simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
-    return [_outcome(one, on_frame) for one in simulations]
-
-
-def _outcome(one: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
-    """Return the outcome of one simulation; values that do not fit together are a reason to reject it."""
+def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
+    """Return the outcome of a simulation; values that do not fit together are a reason to reject it."""
     try:
-        return scene(one["scene"], seed=one["seed"]).outcome(on_frame)
+        return scene(scene_and_seed["scene"], seed=scene_and_seed["seed"]).outcome(on_frame)
     except ValueError as error:
         return Outcome(reason=str(error))
 
 
-KIND = Kind(_simulate, "stickslip_sim_core.cloth", kernel=kernel_level)
+KIND = Kind(
+    lambda simulations, on_frame: [_simulated(one, on_frame) for one in simulations],
+    "stickslip_sim_core.cloth",
+    kernel=kernel_level,
+)

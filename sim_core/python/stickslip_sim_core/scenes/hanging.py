@@ -47,9 +47,6 @@ class Hung:
     tilt: Floats
     """(V, 3): gravity along the normal, over that along -z, which breaks the symmetry of what follows."""
 
-    softest: float
-    """Smallest eigenvalue of stiffness over mass [1/s^2]; positive if it is stable."""
-
     reason: str
     """Reason why it is no stable equilibrium, or empty."""
 
@@ -71,13 +68,11 @@ def hung(
     checked.
 
     Args:
-        mesh: One sheet.
-        fabric: Its material.
+        mesh, fabric: Of one sheet.
         flat: (V, 3): where it is flat [m].
         held: (K,): vertices under the holders.
         normal: (3,): of the flat sheet, the direction of the tilt.
-        seed: Of the bias.
-        kernel: Level of the kernels, see `Cloth`.
+        seed, kernel: Of the bias; see `Cloth`.
     """
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
     rng = np.random.default_rng(seed)
@@ -106,4 +101,4 @@ def hung(
         reason = f"the hung cloth did not come to rest: it moved by {moved:.1e} m in {dt:g} s"
     elif not softest > 0.0:
         reason = f"the hung cloth is not stable: its softest eigenvalue is {softest:.2g} 1/s^2"
-    return Hung(cloth.positions, held, side, bias, tilts, softest, reason)
+    return Hung(cloth.positions, held, side, bias, tilts, reason)

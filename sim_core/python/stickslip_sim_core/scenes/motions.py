@@ -138,8 +138,7 @@ def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike],
     def at(time: ArrayLike) -> Floats:
         u = np.clip(np.asarray(time, float)[..., None] - times, 0.0, None)
         reached = np.where(u < ramp, 0.5 * u * u / (ramp or 1.0), u - 0.5 * ramp)
-        found: Floats = values[0] + reached @ changes
-        return found
+        return np.asarray(values[0] + reached @ changes)
 
     return at
 
@@ -230,8 +229,7 @@ class MovingMesh:
         if self.strength == 1.0:
             return now
         start = self._placed(0.0)
-        found: Floats = start + self.strength * (now - start)
-        return found
+        return np.asarray(start + self.strength * (now - start))
 
     def _placed(self, time: float) -> Floats:
         """Return the vertices of the frames: of a skin, sum over bones of w (A x + b) [linear blend skinning]."""

@@ -17,13 +17,7 @@ from stickslip_sim_core.cloth.contact import Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.scenes.hanging import Hung, hung
 from stickslip_sim_core.scenes.holders import ALWAYS, Holder
-from stickslip_sim_core.scenes.motions import (
-    Keyframes,
-    MovingMesh,
-    RigidMotion,
-    Spin,
-    rotation,
-)
+from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
 
 Document = Mapping[str, Any]
 
@@ -56,14 +50,7 @@ class Sheet:
 
 
 def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel: str | None) -> Sheet:
-    """Return a sheet of a document.
-
-    Args:
-        name: Of the sheet.
-        given: The sheet.
-        materials: Custom fabrics of the scene.
-        seed: Of the tilt of hung cloth.
-        kernel: Level of the kernels, see `Cloth`.
+    """Return a sheet of a document with custom fabrics; `seed` is of the tilt of hung cloth.
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
@@ -186,12 +173,7 @@ class Thing:
 
 
 def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
-    """Return a body of a document.
-
-    Args:
-        name: Of the body.
-        given: The body.
-        mu: Coefficient of friction with each sheet.
+    """Return a body of a document; `mu` is its coefficient of friction with each sheet.
 
     Raises:
         ValueError: A value breaks its rule; the message begins with its place.
@@ -205,18 +187,16 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     motion = rigid_motion(given["motion"], origin)
     pose = _carried(motion, rotation(given["turn"]), origin)
 
+    made: Callable[..., Body] = {
+        "sphere": lambda **placed: sphere(mu, given["radius"], **placed),
+        "cylinder": lambda **placed: cylinder(mu, given["radius"], **placed),
+        "capsule": lambda **placed: capsule(mu, given["radius"], given["length"], **placed),
+        "box": lambda **placed: box(mu, given["size"], rounding=given["rounding"], **placed),
+    }[given["type"]]
+
     def rigid(time: float) -> Body:
         now = pose(time)
-        placed: dict[str, Any] = {"origin": now[:, 3], "rotation": now[:, :3]}
-        match given["type"]:
-            case "sphere":
-                return sphere(mu, given["radius"], **placed)
-            case "cylinder":
-                return cylinder(mu, given["radius"], **placed)
-            case "capsule":
-                return capsule(mu, given["radius"], given["length"], **placed)
-            case _:
-                return box(mu, given["size"], rounding=given["rounding"], **placed)
+        return made(origin=now[:, 3], rotation=now[:, :3])
 
     return Thing(name, pose, motion.last, rigid=rigid)
 
@@ -233,8 +213,7 @@ def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
             if given["motion"] is None:
                 return mesh.at(time)
             pose = motion.pose(time)
-            moved: Floats = mesh.at(time) @ pose[:, :3].T + pose[:, 3]
-            return moved
+            return np.asarray(mesh.at(time) @ pose[:, :3].T + pose[:, 3])
 
         surface = Surface(mesh.triangles, at, list(mu), given["thickness"])
     except ValueError as error:
