@@ -9,17 +9,16 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import FileEntry, Manifest, Rejection
-from stickslip_schemas.format.selection import Selection, part_files
+from stickslip_schemas.format.manifest import SEAL_NAME, BrokenSealError, FileEntry, Manifest, Rejection, check_seal
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.errors import InvalidDatasetError
+from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError
 from stickslip_training.data.index import Index
 from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
-from stickslip_training.data.seal import read_sealed, read_selection
-from stickslip_training.data.sources import open_source
+from stickslip_training.data.sources import DirectorySource, Source, open_source
 
 Split = Literal["train", "validation", "test"]
 
@@ -57,9 +56,9 @@ class Version:
         """
         self.source = open_source(source, api_key=api_key)
         try:
-            self.manifest_digest, group, manifest = read_sealed(self.source)
+            self.manifest_digest, group, manifest = _read_sealed(self.source)
             parsed = _parse_manifest(manifest)
-            self.selection = read_selection(self.source, self.manifest_digest)
+            self.selection = _read_selection(self.source, self.manifest_digest)
             self.arrays = {array.name: array for array in self.selection.choose_arrays(layout(parsed.spec))}
             self.index = Index(self.source, parsed, self.arrays, check_shards=check_shards, cache_bytes=cache_bytes)
             if verify:
@@ -168,12 +167,12 @@ class Version:
         """Check the Zarr metadata against the layout, and their digests against the manifest."""
         inline = consolidated(group)
         for name, array in self.arrays.items():
-            found = self._read_metadata(f"{name}/{GROUP_METADATA}") if inline is None else inline.get(name)
+            if inline is None:
+                file = self.index.file(f"{name}/{GROUP_METADATA}", "metadata")
+                found: Any = parse_metadata(self.index.read_file(file), self.index.at(file))
+            else:
+                found = inline.get(name)
             check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
-
-    def _read_metadata(self, path: str) -> dict[str, Any]:
-        file = self.index.file(path, "metadata")
-        return parse_metadata(self.index.read_file(file), self.index.at(file))
 
     def _check_labels(self) -> None:
         """Check that the manifest fits the arrays `valid` and `split`.
@@ -199,6 +198,34 @@ class Version:
                 f"split_counts of the manifest are {self.manifest.split_counts}, and those of the arrays "
                 f"{dict(zip(SPLITS, counts, strict=True))}"
             )
+
+
+def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
+    """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked against one another."""
+    manifest = source.read_manifest()
+    group = source.fetch(GROUP_METADATA)[0]
+    try:
+        digest = check_seal(manifest, group, source.fetch(SEAL_NAME)[0])
+    except BrokenSealError as error:
+        raise CorruptDataError(f"{source}/{error}") from None
+    return digest, parse_metadata(group, f"{source}/{GROUP_METADATA}"), manifest
+
+
+def _read_selection(source: Source, manifest: str) -> Selection:
+    """Return the part of the version with this manifest that the source holds, which may be all of it."""
+    if not isinstance(source, DirectorySource):
+        return Selection()  # servers have whole versions
+    try:
+        data = source.fetch(SELECTION_NAME)[0]
+    except MissingFileError:
+        return Selection()
+    try:
+        part = PartDocument.model_validate_json(data)
+    except ValidationError as error:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is damaged: {error}") from None
+    if part.manifest != manifest:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is of another version, whose manifest is {part.manifest}")
+    return part.selection
 
 
 def _parse_manifest(data: bytes) -> Manifest:
