@@ -146,8 +146,7 @@ def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Ar
     arrays = {array.name: array for array in content.arrays}
 
     def over_time(name: str) -> Array:
-        values: Array = content.read(name, alone)[0][instants]
-        return values
+        return np.asarray(content.read(name, alone)[0][instants])
 
     poses, grasped = _flat_poses(over_time("holder_pose")), over_time("grasped").astype(np.float32)
     holders = np.concatenate([poses, grasped[..., None]], axis=2)

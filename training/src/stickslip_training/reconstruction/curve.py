@@ -19,8 +19,7 @@ def knots(count: int) -> Floats:
 def basis(s: Floats, count: int, derivative: int = 0) -> Floats:
     """Return B, (n, count): B @ control points are the points, or the derivatives, at s, (n,)."""
     spline = BSpline(knots(count), np.eye(count), DEGREE)
-    values: Floats = spline(s, nu=derivative)
-    return values
+    return np.asarray(spline(s, nu=derivative))
 
 
 def fit(points: Floats, count: int) -> Floats:
@@ -47,5 +46,4 @@ def at_uniform_arc_length(control: Floats, count: int) -> Floats:
     parameter = np.linspace(0.0, 1.0, 20 * len(control))
     length = arc_length(basis(parameter, len(control)) @ control)
     wanted = np.interp(np.linspace(0.0, length[-1], count), length, parameter)
-    points: Floats = basis(wanted, len(control)) @ control
-    return points
+    return np.asarray(basis(wanted, len(control)) @ control)

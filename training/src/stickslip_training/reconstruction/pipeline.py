@@ -273,8 +273,7 @@ def _deviation(fit: Fit, points: int) -> Floats:
     B = curve.basis(np.linspace(0.0, 1.0, points), len(fit.control))
     assert fit.covariance is not None
     variance = sum(np.einsum("ij,jk,ik->i", B, fit.covariance[axis::3, axis::3], B) for axis in range(3))
-    deviation: Floats = np.sqrt(variance)
-    return deviation
+    return np.asarray(np.sqrt(variance))
 
 
 def _residual(views: Sequence[View], fit: Fit, points: int) -> Floats:

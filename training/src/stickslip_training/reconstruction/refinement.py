@@ -125,15 +125,13 @@ class _System:
     def step(self, damping: float) -> Floats:
         H = self.normal + damping * np.diag(np.diag(self.normal) + 1e-9)
         try:
-            step: Floats = -cho_solve(cho_factor(H), self.gradient)
+            return np.asarray(-cho_solve(cho_factor(H), self.gradient))
         except LinAlgError:
-            step = -self.gradient / (np.diag(H) + 1.0)
-        return step
+            return np.asarray(-self.gradient / (np.diag(H) + 1.0))
 
     def inverse(self) -> Floats:
         H = self.normal + 1e-9 * np.diag(np.diag(self.normal) + 1e-9)
-        inverse: Floats = cho_solve(cho_factor(H), np.eye(len(H)))
-        return inverse
+        return np.asarray(cho_solve(cho_factor(H), np.eye(len(H))))
 
 
 class _Problem:
@@ -271,5 +269,4 @@ class _Problem:
 def _hats(s: Floats) -> Floats:
     """Return hat functions on evenly spaced nodes, (n, LIGHT_NODES)."""
     place = s * (LIGHT_NODES - 1)
-    hats: Floats = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(LIGHT_NODES)))
-    return hats
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(LIGHT_NODES))))

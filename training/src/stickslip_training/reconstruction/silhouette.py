@@ -93,8 +93,7 @@ def _along_color(light: Floats) -> Floats:
     """Project light (y, x, channel) on the direction of the rod's colour: the ground's noise counts least there."""
     luminance = light.sum(axis=2).clip(0.0)
     color = np.einsum("yxc,yx->c", light, luminance**2)  # the rod's pixels outweigh the ground's by far
-    signal: Floats = light @ (color / max(float(np.linalg.norm(color)), 1e-12))
-    return signal
+    return np.asarray(light @ (color / max(float(np.linalg.norm(color)), 1e-12)))
 
 
 def _large_parts(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
@@ -103,8 +102,7 @@ def _large_parts(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     areas = np.bincount(labels.ravel(), minlength=count + 1)
     areas[0] = 0
     large = areas > SMALLEST_PART * areas.sum()
-    kept: npt.NDArray[np.bool_] = ndimage.binary_dilation(large[labels], iterations=3)
-    return kept
+    return np.asarray(ndimage.binary_dilation(large[labels], iterations=3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,13 +155,11 @@ class View:
         x = points @ self.R.T + self.t
         depth = np.maximum(x[..., 2], 1e-6)[..., None, None]
         slope = (x[..., :2, None] / depth) * self.R[2]
-        gradient: Floats = self.f[:, None] * (self.R[:2] - slope) / depth
-        return gradient
+        return np.asarray(self.f[:, None] * (self.R[:2] - slope) / depth)
 
 
 def shrink_image(image: Floats, factor: int) -> Floats:
     """Average blocks of pixels of (y, x) or (y, x, channel); the rest at the right and at the bottom is dropped."""
     height, width = (n // factor * factor for n in image.shape[:2])
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
-    mean: Floats = blocks.mean(axis=(1, 3))
-    return mean
+    return np.asarray(blocks.mean(axis=(1, 3)))

@@ -87,8 +87,7 @@ def _peak(sigma: float, radius: float) -> float:
 def _outside(view: View, field: Floats, points: Floats) -> Floats:
     pixels, _ = view.project(points)
     value = ndimage.map_coordinates(field, pixels[:, ::-1].T, order=1, mode="constant", cval=0.0)
-    miss: Floats = np.maximum(1.0 - value, 0.0) ** 2
-    return miss
+    return np.asarray(np.maximum(1.0 - value, 0.0) ** 2)
 
 
 def _cone(ahead: Floats) -> Floats:
@@ -110,13 +109,11 @@ def _rotation(before: Floats, after: Floats) -> Floats:
     axis = np.cross(before, after)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     angle = np.arctan2(sine, np.sum(before * after, axis=1, keepdims=True))
-    rotation: Floats = axis * (angle / np.maximum(sine, 1e-12))
-    return rotation
+    return np.asarray(axis * (angle / np.maximum(sine, 1e-12)))
 
 
 def _squared(vectors: Floats) -> Floats:
-    squared: Floats = np.einsum("ij,ij->i", vectors, vectors)
-    return squared
+    return np.asarray(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDArray[np.int64]:
@@ -192,8 +189,7 @@ def _touches(view: View, distance: Floats, points: Floats, reach: float) -> npt.
     allowed = float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71  # half a pixel's diagonal
     if reach == 0.0:
         allowed = np.zeros(len(points))
-    touches: npt.NDArray[np.bool_] = away <= allowed
-    return touches
+    return np.asarray(away <= allowed)
 
 
 def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float = 0.01) -> Floats:

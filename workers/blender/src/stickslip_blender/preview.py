@@ -107,8 +107,7 @@ def _drawn(geometry: Geometry, points: Array, colors: Array, camera: Camera) -> 
     ground = _floor(geometry, points, camera, seen.shape, light)
     picture = np.where(seen[..., None] < 0, ground[..., None], shaded[seen])
     small = picture.reshape(camera.height, _SHARPNESS, camera.width, _SHARPNESS, 3).mean(axis=(1, 3))
-    levels: npt.NDArray[np.uint8] = np.rint(255.0 * np.clip(small, 0.0, 1.0)).astype(np.uint8)
-    return levels
+    return np.asarray(np.rint(255.0 * np.clip(small, 0.0, 1.0)).astype(np.uint8))
 
 
 def _floor(geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, ...], light: Array) -> Array:

@@ -90,8 +90,7 @@ def _noise(shape: tuple[int, ...], blur: tuple[int, int], seed: int) -> Field:
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
     for axis, extent in enumerate(blur):
         noise = sum((np.roll(noise, shift, axis) for shift in range(extent)), np.zeros(shape))
-    scaled: Field = (noise - noise.mean()) / noise.std()
-    return scaled
+    return np.asarray((noise - noise.mean()) / noise.std())
 
 
 # Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of 224 is 1.5 to 3 mm, so

@@ -102,8 +102,7 @@ class Stage:
 
     def aim(self, _instant: int, vertices: Array) -> Array:
         """Return the middle of the box about the sheet."""
-        middle: Array = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        return middle
+        return np.asarray(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
 
     def moving(self, geometry: Geometry) -> Array:
         """Return the places (n, 3) [m], over time, of all that moves, and of all of the sheet."""
@@ -157,8 +156,7 @@ class Stage:
         poses = np.asarray(self._record[array][:, number], dtype=np.float64)
 
         def place(instant: int) -> Array:
-            at: Array = vertices @ poses[instant, :, :3].T + poses[instant, :, 3]
-            return at
+            return np.asarray(vertices @ poses[instant, :, :3].T + poses[instant, :, 3])
 
         return place
 
@@ -166,8 +164,7 @@ class Stage:
 def _sunk(points: Array, triangles: Array) -> Array:
     """Return the vertices (n, 3) of a mesh, moved inwards by `SUNK`."""
     given = np.asarray(points, dtype=np.float64)
-    inner: Array = given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32))
-    return inner
+    return np.asarray(given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32)))
 
 
 def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:

@@ -31,8 +31,7 @@ class Subdivision:
 
     def __call__(self, values: npt.ArrayLike) -> Array:
         """Refine values (V, k) to (V', k)."""
-        refined: Array = np.einsum("vn,vnk->vk", self._weights, np.asarray(values, dtype=np.float64)[self._sources])
-        return refined
+        return np.asarray(np.einsum("vn,vnk->vk", self._weights, np.asarray(values, dtype=np.float64)[self._sources]))
 
 
 def subdivide(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Subdivision:

@@ -119,8 +119,7 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
         marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
     else:
         marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(random, 30.0)  # finer ones would be noise far away
-    factor: npt.NDArray[np.float64] = np.clip(1.0 + substrate.grain * marks, 0.2, 1.8)
-    return factor
+    return np.asarray(np.clip(1.0 + substrate.grain * marks, 0.2, 1.8))
 
 
 def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
@@ -129,5 +128,4 @@ def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64
     decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (down**2 + along**2))
     spectrum = np.fft.rfft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE)))
     noise = np.fft.irfft2(spectrum * decay, (GRAIN_SIZE, GRAIN_SIZE))
-    spots: npt.NDArray[np.float64] = noise / noise.std()
-    return spots
+    return np.asarray(noise / noise.std())

@@ -132,16 +132,14 @@ def _inward(rim: Array) -> Array:
     """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides there by 1."""
 
     def unit(v: Array) -> Array:
-        scaled: Array = v / np.linalg.norm(v, axis=1, keepdims=True)
-        return scaled
+        return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
     def left(v: Array) -> Array:
         return np.stack([-v[:, 1], v[:, 0]], axis=1)
 
     before, after = unit(rim - np.roll(rim, 1, axis=0)), unit(np.roll(rim, -1, axis=0) - rim)
     mean = unit(left(before) + left(after))
-    inward: Array = mean / (mean * left(after)).sum(axis=1, keepdims=True)
-    return inward
+    return np.asarray(mean / (mean * left(after)).sum(axis=1, keepdims=True))
 
 
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:

@@ -52,8 +52,7 @@ def _mix(where: npt.NDArray[np.bool_] | Field, there: Rgb | Field, elsewhere: Rg
 
 def _phase(x: Field, count: float) -> Field:
     """Return where in its period a point is, [0, 1), with `count` periods on the cloth."""
-    phase: Field = np.mod(x * count, 1.0)
-    return phase
+    return np.asarray(np.mod(x * count, 1.0))
 
 
 def _checker(u: Field, v: Field) -> Field:

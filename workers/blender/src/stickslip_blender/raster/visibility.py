@@ -111,8 +111,7 @@ def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
         return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
 
     parts = np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1)
-    weights: Points = parts / area(a, b, c)[:, None]
-    return weights
+    return np.asarray(parts / area(a, b, c)[:, None])
 
 
 def projected(camera: Camera, points: npt.ArrayLike) -> Points:
