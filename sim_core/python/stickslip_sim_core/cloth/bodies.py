@@ -19,8 +19,7 @@ ROUNDING = 5e-3
 twice the radius slide over such an edge."""
 
 ORIGIN = (0.0, 0.0, 0.0)
-UPRIGHT = np.eye(3)
-UPRIGHT.flags.writeable = False
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
 
