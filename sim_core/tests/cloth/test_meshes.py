@@ -110,5 +110,3 @@ def test_sheets_lie_side_by_side() -> None:
     assert second[:, 0].min() > first[:, 0].max()
     assert np.ptp(second - b.rest, axis=0) == pytest.approx([0.0, 0.0], abs=1e-15)
     assert np.ptp(first - a.rest, axis=0) == pytest.approx([0.0, 0.0], abs=1e-15)
-    with pytest.raises(ValueError, match="parts: must not be empty"):
-        meshes.together()

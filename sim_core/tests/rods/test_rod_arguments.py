@@ -17,7 +17,7 @@ GOOD = {"gamma": [100.0, 200.0], "phi0": [1.0, 2.0], "phi1": [6.0, 7.0]}
     [
         ([1.0, np.nan], r"must be finite, got nan at index 1"),
         ([np.inf, 1.0], r"must be finite, got inf at index 0"),
-        ([[1.0, 2.0]], r"must be one-dimensional, got shape \(1, 2\)"),
+        ([[1.0, 2.0]], r"must have shape \(any\), got shape \(1, 2\)"),
         (["a", "b"], r"must be real numbers, got dtype <U1"),
         ([1j, 2.0], r"must be real numbers, got dtype complex128"),
         ([1.0, 2.0, 3.0], r"lengths must be equal, got "),

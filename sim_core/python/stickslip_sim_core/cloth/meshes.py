@@ -71,12 +71,7 @@ def together(*parts: Mesh) -> Mesh:
     """Return a mesh of several sheets, which lie side by side at rest; vertices keep their order, part by part.
 
     A single part stays as it is.
-
-    Raises:
-        ValueError: There is no part.
     """
-    if not parts:
-        raise ValueError("parts: must not be empty")
     if len(parts) == 1:
         return parts[0]
     rest, triangles, right, count = [], [], 0.0, 0

@@ -91,16 +91,9 @@ def natural_curvature(
 
 
 def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) -> Floats:
-    """Return the frames with R' = R [kappa]x from the clamp on.
+    """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on, for kappa (n, P, 3) [1/L].
 
     Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles and Norsett 1999].
-
-    Args:
-        curvature: kappa [1/L] at points of uniform arc length, shape (n, P, 3), P >= 1.
-        clamp_frame: R(0), shape (3, 3) or (n, 3, 3).
-
-    Returns:
-        Rotations, shape (n, P, 3, 3).
     """
     n, points, _ = curvature.shape
     steps = 2 * (points - 1)

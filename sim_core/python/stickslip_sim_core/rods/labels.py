@@ -8,13 +8,9 @@ from stickslip_sim_core.rods.solve import finite_array
 
 
 def reach(centerline: ArrayLike) -> Floats:
-    """Return the largest distance of each rod from the vertical through its clamp, z being up.
+    """Return the largest distance of each rod from the vertical through its clamp, z being up: (n,) [L].
 
-    Args:
-        centerline: Positions [L], shape (n, points, 3), from the clamp on; NaN for a rod without a solution.
-
-    Returns:
-        Distances [L], shape (n,); NaN where the centreline is.
+    `centerline` has positions (n, points, 3) [L] from the clamp on; where it is NaN, so is the distance.
     """
     r = _centerlines(centerline)
     return np.asarray(np.linalg.norm(r[..., :2] - r[:, :1, :2], axis=2).max(axis=1))
@@ -27,12 +23,8 @@ def self_contact_distance(centerline: ArrayLike) -> Floats:
     centreline, each free to slide along it: the doubly critical distance of the theory of ideal knots [Gonzalez and
     Maddocks 1999], ends included. A rod of radius r touches itself where it is below 2 r.
 
-    Args:
-        centerline: Positions [L], shape (n, points, 3), joined by straight segments; NaN for a rod without a solution.
-
-    Returns:
-        Distances [L], shape (n,); infinite where the distance has no such minimum, as on a straight rod; NaN where the
-        centreline is.
+    `centerline` has positions (n, points, 3) [L], joined by straight segments. The distance (n,) [L] is infinite where
+    it has no such minimum, as on a straight rod, and NaN where the centreline is.
     """
     r = _centerlines(centerline)
     return np.array([_self_contact_distance(rod) for rod in r]).reshape(len(r))

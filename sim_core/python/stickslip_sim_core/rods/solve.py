@@ -80,7 +80,7 @@ def solve_rods(
         ValueError: An argument breaks its rule; the message names the field, the rule and the value.
     """
     fields = {"gamma": gamma, "phi0": phi0, "phi1": phi1}
-    gamma, phi0, phi1 = (_finite_vector(name, values) for name, values in fields.items())
+    gamma, phi0, phi1 = (finite_array(name, np.atleast_1d(values), (None,)) for name, values in fields.items())
     if not gamma.size == phi0.size == phi1.size:
         raise ValueError(f"gamma, phi0, phi1: lengths must be equal, got {gamma.size}, {phi0.size}, {phi1.size}")
     if (gamma < 0).any():
@@ -91,14 +91,6 @@ def solve_rods(
     check_count("points", points)
     result = _sim_core.solve_rods(gamma, phi0, phi1, 1.0 / (1.0 + poisson), elements, points)
     return RodSolution(*result)
-
-
-def _finite_vector(name: str, values: ArrayLike) -> Floats:
-    """Return `values`, or a single number, as contiguous float64 of shape (n,)."""
-    vector = np.atleast_1d(values)
-    if vector.ndim != 1:
-        raise ValueError(f"{name}: must be one-dimensional, got shape {vector.shape}")
-    return finite_array(name, vector, (None,))
 
 
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:

@@ -44,11 +44,9 @@ class Holder:
 
 
 class Hands:
-    """The holders of a scene, with what each of them holds at the current time.
+    """The holders of a scene, of which no two may hold the same vertex at a time, with what each holds now.
 
-    Args:
-        holders: No two may hold the same vertex at a time.
-        positions: (V, 3) [m]: of all vertices at 0 s.
+    `positions` are those of all vertices at 0 s, (V, 3) [m].
     """
 
     def __init__(self, holders: Sequence[Holder], positions: Floats) -> None:

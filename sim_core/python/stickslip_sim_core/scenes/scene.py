@@ -156,9 +156,6 @@ class Scene:
 
         The solver's steps do not depend on the frames, whose positions are interpolated within steps.
 
-        Args:
-            on_frame: Called with (frames done, frames) after every frame.
-
         Raises:
             ValueError: A sheet starts across itself, another or a surface.
         """
