@@ -147,9 +147,5 @@ def _quantiles(errors: Floats) -> dict[str, Any]:
 
 
 def _cell(quantiles: Mapping[str, Any]) -> str:
-    return "; ".join("-" if each is None else _percent(each["value"]) for each in quantiles.values())
-
-
-def _percent(share: float) -> str:
-    value = 100.0 * share
-    return f"{value:,.0f} %" if value >= 9.95 else f"{value:.2g} %"
+    percents = [None if each is None else 100.0 * each["value"] for each in quantiles.values()]
+    return "; ".join("-" if p is None else f"{p:,.0f} %" if p >= 9.95 else f"{p:.2g} %" for p in percents)

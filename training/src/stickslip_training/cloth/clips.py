@@ -6,7 +6,7 @@ They are rendered from simulations (`render_clips`), or read from a dataset (`re
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
-from stickslip_training.cloth.runs import Runs, landed_side, load_runs, runs_of_dataset
+from stickslip_training.cloth.runs import SLIDING, Runs, landed_side, load_runs, runs_of_dataset
 from stickslip_training.cloth.world import draw_world
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.version import Split
@@ -200,7 +200,8 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     A clip of another material has the code -1. Raises ValueError where the dataset is of another kind, has no clip, or
     shows other instants than a network needs.
     """
-    check_kind(reader)
+    if reader.kind != "cloth_drag":  # crops follow the path of its holders
+        raise ValueError(f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}")
     slots = reader.slots(split)
     if not len(slots):
         raise ValueError(f"the dataset has no clip in the split {split}")
@@ -209,26 +210,35 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     cameras = {camera.name: camera for camera in reader.manifest.cameras}
     views = [cameras[names[code]] for code in reader.label("viewpoint")[slots].tolist()]
     seen = Cameras.of(views)
-    crops, covers = [], []
-    for start in range(0, len(slots), _READ_CHUNK):
-        some = slots[start : start + _READ_CHUNK]
-        place = holder_crops(seen[start : start + _READ_CHUNK], instants)
-        crops.append(cut(grey(torch.from_numpy(reader.read("video", some)[:, frames])), place))
-        if "segmentation" in reader.arrays:
-            covers.append(cut(_is_cloth(reader.read("segmentation", some)[:, frames]), place))
-        else:
-            covers.append(torch.full_like(crops[-1], math.nan))
+    chunks = [slots[start : start + _READ_CHUNK] for start in range(0, len(slots), _READ_CHUNK)]
+    names_of = [name for name in ("video", "segmentation") if name in reader.arrays]
+    pictures = ([reader.read(name, some)[:, frames] for name in names_of] for some in chunks)
+    crops, cover = _cropped(pictures, seen, instants)
     known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
     clips = Clips(
-        crops=torch.cat(crops),
+        crops=crops,
         direction=seen.rotation[:, 2],
         material=known[reader.label("material")[slots]],
         mu=reader.label("mu")[slots].astype(np.float64),
         landed=_landed(reader, slots),
         run=simulations(reader, slots),
-        cover=torch.cat(covers),
+        cover=cover,
     )
     return clips, slots
+
+
+def _cropped(
+    pictures: Iterable[Sequence[Array]], seen: Cameras, instants: tuple[float, ...]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return crops and coverage of batches of pictures (n, F, H, W, 3) and, where they are known, classes."""
+    crops, covers, first = [], [], 0
+    for video, *classes in pictures:
+        place = holder_crops(seen[first : first + len(video)], instants)
+        first += len(video)
+        crops.append(cut(grey(torch.from_numpy(video)), place))
+        masks = [torch.from_numpy((codes == SEGMENTS.index("cloth")).astype(np.float32)) for codes in classes]
+        covers.append(cut(masks[0], place) if masks else torch.full_like(crops[-1], math.nan))
+    return torch.cat(crops), torch.cat(covers)
 
 
 def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
@@ -246,21 +256,19 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     frames, instants = frames_at(shown)
     named = {camera.name: camera for camera in load_rig(RIG)}
     seen = Cameras.of([named[clip["viewpoint"]] for clip in about])
-    crops, covers = [], []
-    for clip in range(len(video)):
-        place = holder_crops(seen[clip : clip + 1], instants)
-        crops.append(cut(grey(torch.from_numpy(video[clip : clip + 1, frames])), place))
-        covers.append(cut(_is_cloth(classes[clip : clip + 1, frames]), place))
+    crops, cover = _cropped(
+        ([part[clip : clip + 1, frames] for part in (video, classes)] for clip in range(len(video))), seen, instants
+    )
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
     mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
     clips = Clips(
-        crops=torch.cat(crops),
+        crops=crops,
         direction=seen.rotation[:, 2],
         material=np.array(known),
         mu=mu,
         landed=landed,
         run=run,
-        cover=torch.cat(covers),
+        cover=cover,
     )
     return clips, about
 
@@ -308,12 +316,6 @@ def training_clips(sources: list[str], train: Runs, validation: Runs) -> tuple[l
     return named, RenderedClips(known[known.run < len(train)], known[known.run >= len(train)])
 
 
-def check_kind(reader: DatasetReader) -> None:
-    """Raise ValueError for kinds other than the drag scene: crops follow the path of its holders."""
-    if reader.kind != "cloth_drag":
-        raise ValueError(f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}")
-
-
 def simulations(reader: DatasetReader, slots: Integers) -> Integers:
     """Return a number for each slot that is the same for the clips of one simulation: one fabric, mu and bias."""
     names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
@@ -331,13 +333,9 @@ def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:
     )
 
 
-def _is_cloth(classes: Array) -> torch.Tensor:
-    return torch.from_numpy((classes == SEGMENTS.index("cloth")).astype(np.float32))
-
-
 def _landed(reader: DatasetReader, slots: Integers) -> Integers:
     """Return the side to which each cloth fell; where no vertices are stored, the side to which it was pushed."""
     if "positions" not in reader.arrays:
         return reader.label("bias_side")[slots].astype(np.int64)
     rest = reader.read("rest", slots[:1])[0]
-    return np.concatenate([landed_side(reader.read("positions", [slot]), rest) for slot in slots.tolist()])
+    return np.concatenate([landed_side(reader.read("positions", [slot])[:, SLIDING], rest) for slot in slots.tolist()])

@@ -1,6 +1,7 @@
 """A trained network with its calibration, and its file."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -46,25 +47,22 @@ class FrictionModel:
 
 def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
     """Return the last features of clips, (clips, n)."""
-    device = next(net.parameters()).device
-    net.eval()
-    with torch.inference_mode():
-        parts = [
-            net.features(
-                clips.crops[first : first + CHUNK].to(device), clips.direction[first : first + CHUNK].to(device)
-            )
-            for first in range(0, len(clips), CHUNK)
-        ]
-    return np.asarray(torch.cat(parts).cpu().numpy())
+    return _in_chunks(net, clips, net.features)
 
 
 def silhouettes(net: PosteriorNet, clips: Clips) -> SingleFloats:
     """Return the silhouettes that a network sees in clips, (clips, F, 18, 22), 0 to 1."""
+    return _in_chunks(net, clips, lambda crops, _: net.seen_silhouettes(crops))
+
+
+def _in_chunks(
+    net: PosteriorNet, clips: Clips, of: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+) -> SingleFloats:
+    device = next(net.parameters()).device
     net.eval()
     with torch.inference_mode():
-        device = next(net.parameters()).device
-        chunks = [clips.crops[first : first + CHUNK] for first in range(0, len(clips), CHUNK)]
-        parts = [net.seen_silhouettes(crops.to(device)).cpu() for crops in chunks]
+        chunks = [slice(first, first + CHUNK) for first in range(0, len(clips), CHUNK)]
+        parts = [of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu() for some in chunks]
     return np.asarray(torch.cat(parts).numpy())
 
 

@@ -120,25 +120,16 @@ def _runs(
     mu: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
-    landed = _landed(grid[:, _first(instants)])
+    sliding = next((frame for frame, instant in enumerate(instants) if instant >= SLIDING), len(instants) - 1)
+    landed = landed_side(positions[:, sliding], rest)
     return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
-    """Return the side along x, +1 or -1, of the free edge of positions at all instants, (runs, 300, V, 3) [m]."""
-    x = positions[:, SLIDING, :, 0]
+    """Return the side along x, +1 or -1, of the free edge of positions at the instant `SLIDING`, (runs, V, 3) [m]."""
+    x = positions[:, :, 0]
     free, held = (np.isclose(rest[:, 1], end, atol=1e-6) for end in (rest[:, 1].min(), rest[:, 1].max()))
     return np.where(x[:, free].mean(axis=1) - x[:, held].mean(axis=1) > 0, 1, -1)
-
-
-def _landed(grid: SingleFloats) -> Integers:
-    return np.where((grid[:, 0] - grid[:, -1])[..., 0].mean(axis=1) > 0, 1, -1)
-
-
-def _first(instants: tuple[int, ...]) -> int:
-    """Return the frame at which the branch is read."""
-    late = [frame for frame, instant in enumerate(instants) if instant >= SLIDING]
-    return late[0] if late else len(instants) - 1
 
 
 def grid_order(rest: SingleFloats) -> Integers:

@@ -8,8 +8,6 @@ decide. A way that takes a short cut has length left over for which no silhouett
 cloud has no order, and where turns of a curl come close in several views it has bridges and phantoms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from scipy.special import erf
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.silhouette import View
@@ -74,14 +73,10 @@ def _middle(view: View, radius: float) -> Floats:
     """Return how much of the rod's disc about each pixel lies in the silhouette: 1 in its middle."""
     size = radius * view.focal / float(np.linalg.norm(view.t))
     solid = np.minimum(view.coverage, 1.0)
-    return np.asarray(ndimage.gaussian_filter(solid, 0.6 * size)) / _peak(0.6 * size, size)
-
-
-def _peak(sigma: float, radius: float) -> float:
-    """What the Gaussian filter leaves in the middle of a straight strip of coverage 1."""
-    from scipy.special import erf
-
-    return float(erf(radius / sigma / np.sqrt(2.0)))
+    peak = erf(
+        size / (0.6 * size) / np.sqrt(2.0)
+    )  # what the filter leaves in the middle of a straight strip of coverage 1
+    return np.asarray(ndimage.gaussian_filter(solid, 0.6 * size)) / float(peak)
 
 
 def _outside(view: View, field: Floats, points: Floats) -> Floats:

@@ -10,8 +10,6 @@ I = I_1 + (1 - c_1) I_2. The free end is round. Pixels behind the clamp are left
 there.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,13 +155,7 @@ def _compose(pixel: Integers, part: Side, value: Floats, depth: Floats, left_out
 
 
 def _scaled(part: Side, rows: Integers, by_light: Floats, by_shape: Floats) -> Side:
-    return Side(
-        sample=part.sample[rows],
-        covered=part.covered[rows],
-        by_light=part.by_light[rows] * by_light,
-        by_slope=part.by_slope[rows] * by_light,
-        by_point=part.by_point[rows] * by_shape[:, None],
-        by_normal=part.by_normal[rows] * by_shape,
-        by_radius=part.by_radius[rows] * by_shape,
-        by_blur=part.by_blur[rows] * by_shape,
-    )
+    factors = {"by_light": by_light, "by_slope": by_light}
+    factors |= {"by_point": by_shape[:, None], "by_normal": by_shape, "by_radius": by_shape, "by_blur": by_shape}
+    scaled = {name: getattr(part, name)[rows] * factor for name, factor in factors.items()}
+    return Side(part.sample[rows], part.covered[rows], **scaled)

@@ -32,11 +32,6 @@ class Rods:
         return Rods(self.slots[chosen], self.centerline[chosen], self.strains[chosen])
 
 
-def read_rods(reader: DatasetReader, slots: Integers) -> Rods:
-    """Read the rods in `slots` into memory."""
-    return Rods(slots, reader.read("centerline", slots), reader.read("curvature", slots))
-
-
 def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, Rods], list[str]]:
     """Read the three splits, of the test split no more than `evaluation_rods`; return them, and notes on them.
 
@@ -70,7 +65,8 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
         slots["test"] = slots["test"][:evaluation_rods]
     if len(slots["test"]) < FEW_RODS:
         notes.append(f"There are only {len(slots['test'])} test rods: take medians and percentiles as a hint.")
-    return {split: read_rods(reader, slots[split]) for split in splits}, notes
+    arrays = ("centerline", "curvature")
+    return {split: Rods(some, *(reader.read(name, some) for name in arrays)) for split, some in slots.items()}, notes
 
 
 def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
