@@ -106,13 +106,12 @@ class Version:
     def close(self) -> None:
         self.source.close()
 
-    def slots(self, split: Split | None = None, *, rejected: bool = False) -> npt.NDArray[np.int64]:
+    def slots(self, split: Split | None = None) -> npt.NDArray[np.int64]:
         """Return the slots of `split`, or of all splits, in increasing order.
 
-        Rejected samples and those of other parts of the version are left out. With `rejected` all slots are in:
-        rejected samples have their parameters as labels, and reading anything else of them raises.
+        Rejected samples, which have labels only, and those of other parts of the version are left out.
         """
-        chosen = np.ones(len(self), dtype=bool) if rejected else self.chosen.copy()
+        chosen = self.chosen.copy()
         if split is not None:
             if split not in SPLITS:
                 raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split!r}")

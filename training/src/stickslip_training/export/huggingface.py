@@ -18,11 +18,12 @@ GROUP_BYTES = 32 * 2**20
 
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write the files into an empty directory."""
+    import datasets
     import pyarrow
     from pyarrow import parquet
 
     (directory / "data").mkdir()
-    schema = _features(content).arrow_schema
+    schema = datasets.Features({array.name: _feature(array) for array in content.arrays}).arrow_schema
     rows = max(1, GROUP_BYTES // content.sample_bytes)
     splits = []
     for part in content.parts():
@@ -37,12 +38,6 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
                 writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
                 on_bytes(len(slots) * content.sample_bytes)
     (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
-
-
-def _features(content: Content) -> Any:
-    import datasets
-
-    return datasets.Features({array.name: _feature(array) for array in content.arrays})
 
 
 def _feature(array: ArrayLayout) -> Any:

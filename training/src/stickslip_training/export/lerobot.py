@@ -9,8 +9,6 @@ have their frames evenly. Labels are columns of the episodes.
 Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Curves of the rod: cubic B-splines over [0, 1] with evenly spaced knots, (K, 3) control points."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import BSpline
 

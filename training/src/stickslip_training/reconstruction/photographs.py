@@ -1,7 +1,5 @@
 """A user's photographs: a folder with one picture for each camera of a calibration file, named as the camera."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Sequence

@@ -10,11 +10,10 @@
 Nothing of rods' physics is used but that they do not stretch and bend smoothly, so hair and tendrils will do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -236,7 +235,7 @@ class _Match:
     unsupported: float
 
     @classmethod
-    def of(cls, views: Sequence[View], fit: Fit) -> _Match:
+    def of(cls, views: Sequence[View], fit: Fit) -> Self:
         s = samples(views, fit)
         seen_sum = drawn_sum = difference = unexplained = unsupported = 0.0
         for index, view in enumerate(views):

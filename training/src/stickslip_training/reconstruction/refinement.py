@@ -10,8 +10,6 @@ is reduced by Levenberg-Marquardt steps with exact derivatives of the drawing; r
 and specks pull little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

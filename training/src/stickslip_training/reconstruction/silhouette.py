@@ -4,8 +4,6 @@ A rod a few pixels wide is known to a tenth of a pixel only if the brightness of
 just whether they are bright. So a silhouette is a coverage: the share of each pixel that is rod.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 
