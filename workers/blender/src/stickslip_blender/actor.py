@@ -5,16 +5,15 @@ error is raised, and the owner of the process handles it. Results are published 
 Blender leaves no partial result.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Any
 
 from stickslip_schemas.documents.tasks import RenderTask
+from stickslip_schemas.kinds import KINDS
 
 from stickslip_blender.build import build_digest
 from stickslip_blender.cycles.blender import blender_version, described
-from stickslip_blender.scenes import kind_names, renders
+from stickslip_blender.scenes import renders
 from stickslip_blender.workshop import Workshop, check_rig
 
 
@@ -27,7 +26,7 @@ class RenderActor:
     def describe(self) -> dict[str, Any]:
         """Return the build of each kind, and versions; they are equal in all processes of one installation."""
         return {
-            "builds": {kind: build_digest(kind) for kind in kind_names()},
+            "builds": {kind: build_digest(kind) for kind in KINDS},
             "versions": blender_version() | {"device": " ".join(map(str, described().values()))},
         }
 

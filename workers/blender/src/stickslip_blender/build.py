@@ -1,7 +1,5 @@
 """The build of the renderer: the part of a content key that the task does not give."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import metadata
 

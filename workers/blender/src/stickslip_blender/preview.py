@@ -4,8 +4,6 @@
 cameras side by side. The record has the arrays of `cloth_scene` that the cameras and bodies need; no light is traced.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

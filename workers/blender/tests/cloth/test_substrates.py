@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_blender.cloth.geometry import FLOOR
-from stickslip_blender.cloth.looks import LIGHTS, drawn_light, grained, look_of, looks
-from stickslip_blender.cloth.substrates import HARD, drawn_substrate, floor_factor, substrate_names
+from stickslip_blender.cloth.looks import SOURCES, drawn_light, grained, look_of, looks
+from stickslip_blender.cloth.substrates import HARD, drawn_substrate, finishes, floor_factor
 from stickslip_blender.cloth.surface import Surface
 from stickslip_blender.raster import decoded
 from stickslip_schemas.spec.appearance import Lighting, Substrate
@@ -16,12 +16,12 @@ from stickslip_schemas.spec.fabrics import Material
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:
-    assert tuple(Lighting) == LIGHTS
-    assert tuple(Substrate) == substrate_names()
+    assert tuple(Lighting) == tuple(SOURCES)
+    assert tuple(Substrate) == (*finishes(), "any")
     assert set(Material) == set(looks())
 
 
-@pytest.mark.parametrize("name", substrate_names())
+@pytest.mark.parametrize("name", Substrate)
 def test_a_substrate_is_drawn_by_its_seed(name: str) -> None:
     drawn = [drawn_substrate(name, seed) for seed in range(60)]
     assert drawn[7] == drawn_substrate(name, 7)

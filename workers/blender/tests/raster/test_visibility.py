@@ -5,8 +5,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.raster import GRID, Textures, Window, _raster, projected, see, see_albedo, window_about
-from stickslip_blender.raster.visibility import barycentric
+from stickslip_blender.raster import (
+    GRID,
+    Textures,
+    Window,
+    _raster,
+    barycentric,
+    projected,
+    see,
+    see_albedo,
+    window_about,
+)
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_testing.cameras import looking_at
 

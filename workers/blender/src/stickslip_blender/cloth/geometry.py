@@ -4,8 +4,6 @@ The scene in Blender and the rasteriser are built from the same triangles. Cycle
 of the cloth stays a function of its albedo alone; the composer lays their colours on top, as it does with the floor's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise

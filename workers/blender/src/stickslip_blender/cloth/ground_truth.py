@@ -3,8 +3,6 @@
 All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the floor.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a lens shows: the pictures of the pinhole camera that sees all of it, bent."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -13,8 +13,6 @@ One rendering serves three textures: red, green and blue of its print are the gr
 clip gets the same numbers alone or with others. A user's picture is measured by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The cloth is the solver's mesh, refined so that no facet shows. The lamp follows
 kind in `stickslip_blender.scenes` adds the props.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -18,8 +18,6 @@ Each level of a picture is within TOLERANCE of the exact value, and chosen so th
 are a tenth smaller for it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ A round body is a core, a box of half sizes (x, y, z) that may be 0, grown by a 
 capsule's a segment, a rounded box's a box. Its mesh is that of a ball, pulled apart between its eight octants.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

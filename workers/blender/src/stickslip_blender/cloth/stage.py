@@ -3,8 +3,6 @@
 Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of its names.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Every new vertex is a mean of old ones with weights that are not negative, so a 
 get below it, and everything that is given by vertex, texture coordinates too, is refined by the same rule.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

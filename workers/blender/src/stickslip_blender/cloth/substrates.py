@@ -56,23 +56,17 @@ class Substrate:
 
 
 @cache
-def _ranges() -> dict[str, dict[str, Any]]:
+def finishes() -> dict[str, dict[str, Any]]:
+    """Return the ranges of every finish, by its name."""
     text = files("stickslip_blender.cloth").joinpath("substrates.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
-def substrate_names() -> tuple[str, ...]:
-    """Return the names that `drawn_substrate` takes: the finishes, and `any` for a hard one or the matt plate."""
-    return (*_ranges(), "any")
-
-
 def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) -> Substrate:
-    """Draw a substrate of a finish, or of a custom one."""
-    if custom is None and name not in substrate_names():
-        raise ValueError(f"substrate must be one of {', '.join(substrate_names())}; got {name!r}")
+    """Draw a substrate of a finish (`any`: of a hard one or the matt plate), or of a custom one."""
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     finish = str(random.choice(["matt", *HARD])) if name == "any" else name
-    ranges = _ranges()[finish] if custom is None else custom.model_dump()
+    ranges = finishes()[finish] if custom is None else custom.model_dump()
     color = np.array(ranges.get("tint", (1.0, 1.0, 1.0)))
     if finish == "cloth":
         color = 0.15 + 0.85 * random.random(3)

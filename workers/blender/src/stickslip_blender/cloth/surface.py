@@ -4,8 +4,6 @@ The middle of the sheet is the solver's surface. Creases are a seeded height of 
 how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
 """
 
-from __future__ import annotations
-
 from copy import copy
 from functools import lru_cache
 from typing import Any
@@ -33,7 +31,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
 
 
-def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Surface:
+def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
     """Return the surface of a mesh, see `Surface`: the last ones are kept, for making one takes a second."""
     faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
     return copy(_made(faces.tobytes(), flat.tobytes()))

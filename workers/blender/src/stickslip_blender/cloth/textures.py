@@ -3,8 +3,6 @@
 Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread would be noise, a pattern is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

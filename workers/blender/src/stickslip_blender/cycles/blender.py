@@ -5,8 +5,6 @@ and a GPU, and it may differ between GPUs and drivers. The device is therefore p
 with different devices share no results.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

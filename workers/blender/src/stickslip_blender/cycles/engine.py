@@ -72,17 +72,6 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     with suppress(OSError):
         Path(bpy.app.tempdir).rmdir()  # never used, empty, and left behind by a process that is killed
     scene = bpy.context.scene
-    _set_up_cycles(scene)
-    scene.cycles.max_bounces = max_bounces
-    scene.cycles.diffuse_bounces = diffuse_bounces
-    scene.cycles.glossy_bounces = 1
-    scene.cycles.use_light_tree = light_tree
-    _set_up_colors(scene)
-    scene.world = bpy.data.worlds.new("world")
-    return scene
-
-
-def _set_up_cycles(scene: Any) -> None:
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
     render.threads_mode = "FIXED"
@@ -97,17 +86,20 @@ def _set_up_cycles(scene: Any) -> None:
     cycles.pixel_filter_type = "BOX"  # a pixel is the mean over its own area, as on a sensor
     cycles.caustics_reflective = False
     cycles.caustics_refractive = False
-
-
-def _set_up_colors(scene: Any) -> None:
-    """Make 8-bit values the sRGB encoding of the light itself, without filmic curve or dither: colors keep meaning."""
+    cycles.max_bounces = max_bounces
+    cycles.diffuse_bounces = diffuse_bounces
+    cycles.glossy_bounces = 1
+    cycles.use_light_tree = light_tree
+    # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither: colors keep meaning.
     scene.display_settings.display_device = "sRGB"
     view = scene.view_settings
     view.view_transform = "Standard"
     view.look = "None"
     view.exposure = 0.0
     view.gamma = 1.0
-    scene.render.dither_intensity = 0.0
+    render.dither_intensity = 0.0
+    scene.world = bpy.data.worlds.new("world")
+    return scene
 
 
 def set_sampling(scene: Any, sampling: Sampling) -> None:

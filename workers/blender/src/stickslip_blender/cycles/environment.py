@@ -4,8 +4,6 @@ Soft boxes stand at infinity and have no edge. Area lights would cost more: Cycl
 sample, and on a thin rod that was 6 dB noisier at equal samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

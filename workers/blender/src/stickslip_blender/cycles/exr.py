@@ -4,8 +4,6 @@
 the lines; and the lines, each with its row, its size in bytes and its channels in alphabetical order.
 """
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects of a Blender scene: meshes, materials, the lamp and the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

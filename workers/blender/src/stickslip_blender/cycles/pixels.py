@@ -4,8 +4,6 @@ Headless Blender gives no access to its pixels in memory, so a frame goes throug
 in memory, of which a killed process leaves nothing behind.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import os
 import sys

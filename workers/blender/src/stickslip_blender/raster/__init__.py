@@ -1,33 +1,193 @@
 """A rasteriser: what a camera sees of a mesh, without light.
 
 Cycles gives the light. Albedo at texture edges, silhouettes, depth and other ground truth are geometry, and cost far
-less here. The compiled part is `_raster`; raster/raster.hpp says where samples lie and how textures are looked up.
+less here: which triangle each sample of an image sees, what is interpolated there, and the albedo of many textures. The
+compiled part is `_raster`; raster/raster.hpp says where samples lie and how textures are looked up.
 """
 
-from stickslip_blender.raster.visibility import (
-    GRID,
-    Albedo,
-    Seen,
-    Textures,
-    Window,
-    decoded,
-    fans,
-    projected,
-    see,
-    see_albedo,
-    window_about,
-)
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
-__all__ = [
-    "GRID",
-    "Albedo",
-    "Seen",
-    "Textures",
-    "Window",
-    "decoded",
-    "fans",
-    "projected",
-    "see",
-    "see_albedo",
-    "window_about",
-]
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.spec.cameras import Camera
+
+from stickslip_blender.raster import _raster
+
+GRID = 12
+"""Samples across a pixel, and down: silhouettes are then within 0.0005 of their coverage."""
+
+_LANES = 8  # channels are filled up to a multiple
+
+_LINEAR = np.array([_raster.decoded(level / 255.0) for level in range(256)], dtype=np.float32)
+
+Points = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a frame: columns [left, right), rows [top, bottom) [px], row 0 on top."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def is_empty(self) -> bool:
+        """True where there is no pixel in it."""
+        return self.right <= self.left or self.bottom <= self.top
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the window in a frame (height, width, ...)."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def times(self, fine: int) -> "Window":
+        """Return the same part where each pixel is fine x fine ones."""
+        return Window(fine * self.left, fine * self.top, fine * self.right, fine * self.bottom)
+
+    @property
+    def place(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height, as the compiled rasteriser takes them."""
+        return self.left, self.top, self.right - self.left, self.bottom - self.top
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Which triangle each sample of a window sees."""
+
+    points: Points
+    """Projected vertices: column, row [px] and depth [scene units], shape (V, 3)."""
+    triangles: Indices
+    """Shape (T, 3)."""
+    window: Window
+    grid: int
+    """Samples across a pixel."""
+    triangle: Indices
+    """By sample, -1 if there is none; shape (grid height, grid width)."""
+    places: Points | None = None
+    """Columns and rows of the samples [px], (height, width, 2); none: the middles of the pixels of the window."""
+
+    def share_below(self, end: int) -> npt.NDArray[np.float32]:
+        """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
+        hit = (self.triangle >= 0) & (self.triangle < end)
+        rows, columns = self.triangle.shape[0] // self.grid, self.triangle.shape[1] // self.grid
+        share: npt.NDArray[np.float32] = hit.reshape(rows, self.grid, columns, self.grid).mean(
+            axis=(1, 3), dtype=np.float32
+        )
+        return share
+
+    def looked_up(self, places: Points) -> "Seen":
+        """Return what places (height, width, 2) [px] of the frame see, by the nearest sample, with a grid of 1."""
+        near = np.rint(places).astype(int) - (self.window.left, self.window.top)
+        return replace(self, triangle=self.triangle[near[..., 1], near[..., 0]], places=places)
+
+    def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
+        """Interpolate values of vertices (V, k) in perspective at the samples, `fill` where nothing is seen.
+
+        For a grid of one sample a pixel. Returns shape (height, width, k).
+        """
+        if self.grid != 1:
+            raise ValueError(f"grid must be 1, a sample in the middle of each pixel; got {self.grid}")
+        given = np.asarray(values, dtype=np.float64)
+        result = np.full((*self.triangle.shape, given.shape[1]), fill)
+        rows, columns = np.nonzero(self.triangle >= 0)
+        corners = self.triangles[self.triangle[rows, columns]]
+        middles = np.column_stack([columns + self.window.left, rows + self.window.top])
+        place = middles if self.places is None else self.places[rows, columns]
+        weights = barycentric(self.points[corners][..., :2], place) / self.points[corners][..., 2]
+        weights /= weights.sum(axis=1, keepdims=True)
+        result[rows, columns] = np.einsum("nk,nkx->nx", weights, given[corners])
+        return result
+
+
+def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
+    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at places (n, 2), in the image."""
+    a, b, c = (corners[:, k] for k in range(3))
+
+    def area(p: npt.NDArray[Any], q: npt.NDArray[Any], r: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        first, second = q - p, r - p
+        return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+    parts = np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1)
+    return np.asarray(parts / area(a, b, c)[:, None])
+
+
+def projected(camera: Camera, points: npt.ArrayLike) -> Points:
+    """Project world points (V, 3) to columns, rows [px] and depths [scene units], shape (V, 3)."""
+    pixels, depth = camera.project(points)
+    return np.ascontiguousarray(np.concatenate([pixels, depth[:, None]], axis=1))
+
+
+def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
+    """Return the part of the frame that projected points are in, with so many pixels around it."""
+    places = points[np.isfinite(points[:, 0]), :2]  # the others are behind the camera
+    if not len(places):
+        return Window(0, 0, 0, 0)
+    low, high = np.floor(places.min(axis=0)) - margin, np.ceil(places.max(axis=0)) + margin + 1
+    left, top = np.maximum(low, 0).astype(int)
+    right, bottom = np.minimum(high, (camera.width, camera.height)).astype(int)
+    return Window(int(left), int(top), int(right), int(bottom))
+
+
+def decoded(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Return a picture, 8-bit sRGB, as linear light [IEC 61966-2-1]."""
+    return _LINEAR[picture]
+
+
+def fans(faces: Sequence[Sequence[int]]) -> Indices:
+    """Return convex polygons as fans of triangles, shape (T, 3)."""
+    return np.array([(face[0], b, c) for face in faces for b, c in pairwise(face[1:])], dtype=np.int32)
+
+
+def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
+    """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window.
+
+    A triangle that reaches behind the camera is not seen.
+    """
+    behind = ~(points[:, 2] > 0.0)
+    if behind.any():
+        points = np.where(behind[:, None], (0.0, 0.0, 1.0), points)
+        triangles = np.where(behind[triangles].any(axis=1, keepdims=True), triangles[:1, :1], triangles)
+    return Seen(points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid))
+
+
+class Textures:
+    """Pictures of one size, packed so that one lookup serves all of them."""
+
+    def __init__(self, pictures: Sequence[npt.NDArray[np.uint8]]) -> None:
+        """Pack pictures (size, size, 3), 8-bit sRGB, row 0 at v = 0."""
+        shapes = {picture.shape for picture in pictures}
+        if len(shapes) != 1 or (shape := shapes.pop()) != (shape[0], shape[0], 3):
+            raise ValueError(f"textures must be pictures of one shape (size, size, 3); got {sorted(shapes)}")
+        self.count = len(pictures)
+        channels = -(-3 * self.count // _LANES) * _LANES
+        self.texels = np.zeros((shape[0], shape[0], channels), dtype=np.float32)
+        for number, picture in enumerate(pictures):
+            self.texels[..., 3 * number : 3 * number + 3] = picture / np.float32(255)
+
+
+@dataclass(frozen=True)
+class Albedo:
+    """What the pixels of a window see of a cloth."""
+
+    coverage: npt.NDArray[np.float32]
+    """Share of each pixel, shape (height, width)."""
+    mean: npt.NDArray[np.float32]
+    """Linear albedo of the visible cloth, 0 elsewhere; shape (height, width, textures, 3)."""
+    hits: npt.NDArray[np.int32]
+    """Samples that see each of the cloth's triangles."""
+    overall: npt.NDArray[np.float32]
+    """Mean albedo of all that is seen of the cloth, shape (textures, 3)."""
+    area: float
+    """Of the cloth's triangles, each seen alone [pixels]."""
+
+
+def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
+    """Mean textures over the visible part of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
+    packed = textures.texels, textures.count, seen.window.place, seen.grid
+    return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))

@@ -4,8 +4,6 @@ No clamp is in the picture: the rod begins at its first point. To recover the ce
 threshold against the ground; every bright pixel is rod.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 
@@ -57,19 +55,13 @@ def to_linear(color: Color) -> Color:
 class RodRenderer:
     """A scene with one rod, built once; only vertices, color and camera change between frames."""
 
-    def __init__(
-        self,
-        *,
-        quality: Quality | Sampling = Quality.standard,
-        points: int = POINTS,
-    ) -> None:
+    def __init__(self, *, quality: Quality | Sampling = Quality.standard) -> None:
         self._scene = new_scene()
         self._sampling = quality if isinstance(quality, Sampling) else SAMPLING[quality]
         set_sampling(self._scene, self._sampling)
         set_environment(self._scene, panorama(SOFT_BOXES, AMBIENT), GROUND)
-        self._points = points
-        straight = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), points)
-        faces = tube_faces(points)
+        straight = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), POINTS)
+        faces = tube_faces(POINTS)
         self._mesh = add_mesh(self._scene, "rod", tube_vertices(straight, RADIUS), faces)
         self._triangles = fans(faces)
         self._shader = add_material(self._mesh, "silicone", Roughness=0.3, IOR=1.41)  # vinyl polysiloxane
@@ -90,8 +82,8 @@ class RodRenderer:
         Seed: added to that of the sampling, so that pictures of a dataset differ in their noise.
         """
         line = np.asarray(centerline, dtype=np.float64)
-        if line.shape != (self._points, 3) or not np.isfinite(line).all():
-            raise ValueError(f"centerline must be finite, of shape ({self._points}, 3); got shape {line.shape}")
+        if line.shape != (POINTS, 3) or not np.isfinite(line).all():
+            raise ValueError(f"centerline must be finite, of shape ({POINTS}, 3); got shape {line.shape}")
         if not 0.0 < radius < 0.1:
             raise ValueError(f"radius must be in (0, 0.1) L; got {radius}")
         vertices = tube_vertices(line, radius).astype(np.float32)

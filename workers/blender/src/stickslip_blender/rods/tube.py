@@ -1,7 +1,5 @@
 """The surface of a rod: a tube of fixed topology swept along a centreline."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,13 +1,11 @@
 """The scenes of all kinds: one module per kind, named after it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 from stickslip_schemas.documents.tasks import RenderTask, TaskResult
-from stickslip_schemas.kinds import KINDS, kind_named
+from stickslip_schemas.kinds import kind_named
 
 from stickslip_blender.workshop import Workshop
 
@@ -21,7 +19,3 @@ def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
     kind_named(kind)
     render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(f"{__name__}.{kind}").render
     return render
-
-
-def kind_names() -> tuple[str, ...]:
-    return tuple(KINDS)
