@@ -85,8 +85,7 @@ def compare(material: str, vertices: int, frames: int) -> None:
         print(
             f"{material} {vertices} x {vertices}, {frames} frames, contact with itself {mu}: {seconds[mu]:.2f} CPU s, "
             f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged, {crossed} end with a crossing, "
-            f"{cloth.newton} iterations, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses, "
-            f"{ {name: round(value, 2) for name, value in cloth.phases().items()} }",
+            f"{cloth.newton} iterations, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses",
             flush=True,
         )
     print(f"  ratio {seconds[0.5] / seconds[None]:.2f}", flush=True)

@@ -79,8 +79,6 @@ void bind_cloth(nb::module_& m) {
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
-      .def_ro("flips", &StepReport::flips, "Changes of contacts between open, stick and slip.")
-      .def_ro("halvings", &StepReport::halvings)
       .def_ro("seen", &StepReport::seen)
       .def_ro("sharpest", &StepReport::sharpest, "Least radius of a skeleton that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,
@@ -169,13 +167,7 @@ void bind_cloth(nb::module_& m) {
       .def("pair_forces", &ClothSolver::pair_forces)
       .def("masses", &ClothSolver::masses)
       .def("energies", &ClothSolver::energies, "positions"_a)
-      .def("stiffness_times", &ClothSolver::stiffness_times, "positions"_a, "v"_a)
       .def("softest", &ClothSolver::softest, "positions"_a)
-      .def("phases",
-           [](const ClothSolver& self) {
-             const ClothPhases p = self.phases();
-             return std::make_tuple(p.assembly, p.factorization, p.krylov, p.contact);
-           })
       .def("kernel", &ClothSolver::kernel);
 }
 

@@ -67,7 +67,6 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   const MembranePart part = definite ? MembranePart::tension : MembranePart::exact;
   membrane_energy =
       kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, part);
-  folds_.smallest = exact ? 0.0 : settings_.fold_smallest;
   bending_energy =
       kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(), with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();
@@ -79,7 +78,7 @@ void Assembly::assemble_bending() {
     change_max = std::max({change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
                            rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
   }
-  if (!exact && !(change_max > static_cast<float>(settings_.stiffening_change))) return;
+  if (!(change_max > static_cast<float>(settings_.stiffening_change))) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
   kernel.bending_matrix(bending_.data(), stiffening_.data(), scalars_.data());
   assembled_stiffening_ = stiffening_;
@@ -90,8 +89,6 @@ void Assembly::set_diagonal(double dt, double damping) {
     diagonal_[i] = static_cast<float>(mass[i] * (1.0 / (dt * dt) + (damping + own_damping[i]) / dt));
   }
 }
-
-void Assembly::clear_diagonal() { std::fill(diagonal_.begin(), diagonal_.end(), 0.0f); }
 
 double Assembly::own_stiffness(int node) const {
   const float* block = &blocks_[12L * membrane_diagonal_[node]];

@@ -40,15 +40,12 @@ class Assembly {
   ClothMatrix matrix{};
   // Whether the matrix has the positive part of the stress only, as that of a convex energy does.
   bool definite = false;
-  // Whether the matrix is that of the state to rounding: else small folds are left out and old ones kept for a while.
-  bool exact = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
   // From now on stretching lags behind what it is at x by this share, none if 0: see kernels/membrane.hpp.
   void lag_from(const Buffer<double>& x, double share) { membrane_.lag_from(kernel, x.data(), share); }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);
-  void clear_diagonal();
   // Mean of a node's block on the diagonal, N/m.
   double own_stiffness(int node) const;
   // That block, N/m.

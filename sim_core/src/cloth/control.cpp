@@ -97,7 +97,6 @@ StepReport StepController::advance(double& time, double event, const Motion& mot
     if (solved ? level_ < finest_ && missed > constants_.reject_at : level_ < last_) {
       stepper_.reject();
       total.add_work(report);
-      ++total.halvings;
       learn(level_, constants_.rejected_work * work_of(report), share);
       ++level_;
       continue;

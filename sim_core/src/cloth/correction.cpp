@@ -3,19 +3,16 @@
 #include <algorithm>
 #include <cmath>
 
-#include "math/stopwatch.hpp"
-
 namespace sim_core {
 
 Correction::Correction(Assembly& assembly, const ClothSettings& settings, const Constants& constants,
-                       ContactState& contact, ClothPhases& phases)
+                       ContactState& contact)
     : factors(assembly.numbering, constants.factor.pool),
       change(4L * assembly.numbering.free_nodes + 64, 0.0f),
       assembly_(assembly),
       settings_(settings),
       constants_(constants.newton),
       contact_(contact),
-      phases_(phases),
       pair_factor_(constants.factor),
       work_((2 * krylov_max + 1) * 4L * assembly.numbering.free_nodes + 64, 0.0f),
       image_(change) {}
@@ -24,10 +21,7 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, St
   if (pairs) force_ = contact_.force;
   if (!pairs || !pairs->active()) {
     StaleFactor& factor = factors.latest();
-    {
-      const Stopwatch watch(phases_.factorization);
-      report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
-    }
+    report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
     const int iterations = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
     factor.spent(iterations);
     report.krylov += iterations;
@@ -44,10 +38,7 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, St
 }
 
 void Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt, StepReport& report) {
-  {
-    const Stopwatch watch(phases_.factorization);
-    report.factorizations += pair_factor_.renew(assembly_, x, contact_, pairs, dt, settings_);
-  }
+  report.factorizations += pair_factor_.renew(assembly_, x, contact_, pairs, dt, settings_);
   contact_.force = force_;
   pair_rows_ = pairs.rows();
   assembly_.matrix.pairs = &pair_rows_;
@@ -60,7 +51,6 @@ void Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, do
 }
 
 int Correction::solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance) {
-  const Stopwatch watch(phases_.krylov);
   subtract_corrections(pairs);
   double size = 0.0;
   for (float f : contact_.force) size += static_cast<double>(f) * f;

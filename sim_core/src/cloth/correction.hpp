@@ -13,8 +13,7 @@ namespace sim_core {
 
 class Correction {
  public:
-  Correction(Assembly& assembly, const ClothSettings& settings, const Constants& constants, ContactState& contact,
-             ClothPhases& phases);
+  Correction(Assembly& assembly, const ClothSettings& settings, const Constants& constants, ContactState& contact);
   Correction(const Correction&) = delete;
 
   FactorPool factors;
@@ -35,7 +34,6 @@ class Correction {
   ClothSettings settings_;
   NewtonSettings constants_;
   ContactState& contact_;
-  ClothPhases& phases_;
   PairFactor pair_factor_;
   PairData pair_rows_{};
   Buffer<float> work_, image_, force_;

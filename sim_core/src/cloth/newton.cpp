@@ -5,15 +5,13 @@
 #include <limits>
 #include <utility>
 
-#include "math/stopwatch.hpp"
-
 namespace sim_core {
 
 using Eigen::Vector3d;
 
 Newton::Newton(Assembly& assembly, const ClothSettings& settings, const Constants& constants)
     : contact(assembly.numbering.free_nodes, constants.node, constants.contact.law_stiffness),
-      correction(assembly, settings, constants, contact, phases),
+      correction(assembly, settings, constants, contact),
       residual(4L * assembly.numbering.nodes, 0.0),
       assembly_(assembly),
       settings_(settings),
@@ -23,14 +21,8 @@ Newton::Newton(Assembly& assembly, const ClothSettings& settings, const Constant
       trial_(residual),
       best_(residual) {}
 
-void Newton::evaluate(const Buffer<double>& x, bool with_matrix) {
-  const Stopwatch watch(phases.assembly);
-  assembly_.evaluate(x, with_matrix);
-}
-
 // R = M ((x - x_inertial)/dt^2 + c (x - x_start)/dt) + grad E, and the branch of each contact's law.
 Norms Newton::look(const StepProblem& problem, const Buffer<double>& x, double share) {
-  const Stopwatch watch(phases.contact);
   const double inertia = 1.0 / (problem.dt * problem.dt);
   for (int i = 0; i < assembly_.numbering.nodes; ++i) {
     const double viscous = (problem.damping + assembly_.own_damping[i]) / problem.dt;
@@ -83,13 +75,12 @@ void Newton::begin(const StepProblem& problem, Buffer<double>& x, bool from_rest
   contact.hold_reversed = false;
   predict(problem, x, x, from_rest);
   if (pairs) {
-    const Stopwatch watch(phases.contact);
     ends_ = x;
     pairs->near().cap(problem.start, x);
   }
   assembly_.set_diagonal(problem.dt, problem.damping);
   correction.factors.of(problem.dt);
-  evaluate(x, true);
+  assembly_.evaluate(x, true);
   for (int i = 0; i < free_nodes; ++i) contact.stiffness[i] = law_stiffness_ * assembly_.own_stiffness(i);
   own_stiffness_ = contact.stiffness;
   strained_ = false;
@@ -115,7 +106,6 @@ Norms Newton::move(const StepProblem& problem, const Buffer<double>& x, double s
   trial_ = x;
   for (int i = 0; i < 4 * free_nodes; ++i) trial_[i] += share * correction.change[i];
   if (pairs) {
-    const Stopwatch watch(phases.contact);
     std::copy(ends_.begin() + 4L * free_nodes, ends_.end(), trial_.begin() + 4L * free_nodes);
     wanted_ = trial_;
     if (!pairs->near().cap(x, trial_, hops)) {
@@ -127,7 +117,7 @@ Norms Newton::move(const StepProblem& problem, const Buffer<double>& x, double s
       }
     }
   }
-  evaluate(trial_, true);
+  assembly_.evaluate(trial_, true);
   return look(problem, trial_, share);
 }
 
@@ -136,7 +126,7 @@ void Newton::choose_matrix(const Buffer<double>& x, double before, double now, b
   const bool grew = now > before;
   if (assembly_.definite ? grew || !whole || !(now > constants_.slow * before) : !grew) return;
   assembly_.definite = !assembly_.definite;
-  evaluate(x, true);
+  assembly_.evaluate(x, true);
 }
 
 StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool from_rest, int iterations,
@@ -146,7 +136,6 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   if (pairs) pairs->mark_best();
   bool resumed = contact.resume(x, problem.start, residual, problem.at_start, problem.at_end, problem.dt);
   if (pairs && !smoothly) resumed = pairs->resume() || resumed;
-  std::vector<int> modes = contact.mode;
   std::vector<double> window(constants_.window, norms.squared);
   const double first = norms.squared;
   trial_ = best_ = x;
@@ -173,8 +162,6 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
       if (next.squared <= limit || cut == constants_.cuts_max || (iteration == 0 && resumed)) break;
       share *= 0.5;
     }
-    for (int i = 0; i < assembly_.numbering.free_nodes; ++i) report.flips += contact.mode[i] != modes[i];
-    modes = contact.mode;
     std::swap(x, trial_);
     last_share = share;
     const double before = std::exchange(norms, next).squared;
@@ -199,7 +186,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
   if (!(norms.largest <= settings_.tolerance)) {
     x = best_;
     if (pairs) pairs->return_to_best();
-    evaluate(x, true);
+    assembly_.evaluate(x, true);
     norms = look(problem, x);
   }
   return {norms.largest <= settings_.tolerance && arrived(x), norms.largest};

@@ -28,7 +28,6 @@ class Newton {
   Newton(const Newton&) = delete;
 
   ContactState contact;
-  ClothPhases phases;
   Correction correction;
   std::unique_ptr<ContactSet> pairs;  // null without self-contact and surfaces
   Buffer<double> residual;            // (nodes, 4), N: R = M a + grad E - M g, the force that a node needs from contact
@@ -44,8 +43,6 @@ class Newton {
 
   // Where the velocity leads the free nodes of x, or the start, out of the bodies and surfaces; these are at `ends`.
   void predict(const StepProblem& problem, const Buffer<double>& ends, Buffer<double>& x, bool from_rest);
-
-  void evaluate(const Buffer<double>& x, bool with_matrix);
 
  private:
   // `share`: of the last changes of the pairs' forces.

@@ -23,7 +23,7 @@ struct StepReport {
   double residual = 0.0;           // N: worst over the parts
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
   int missed = 0;                  // of those, by steps of the controller that are further off than it allows
-  int newton = 0, krylov = 0, flips = 0, halvings = 0;
+  int newton = 0, krylov = 0;
   double least_distance = std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest = std::numeric_limits<double>::infinity();        // cells: least radius of a skeleton that bears
   double uneven = 0.0;          // m: distance of what drives the cloth from an even motion in a step of the controller
@@ -34,8 +34,6 @@ struct StepReport {
     newton += other.newton;
     krylov += other.krylov;
     factorizations += other.factorizations;
-    flips += other.flips;
-    halvings += other.halvings;
   }
   void add(const StepReport& other) {
     add_work(other);
@@ -49,11 +47,6 @@ struct StepReport {
     uneven = std::max(uneven, other.uneven);
     seen.add(other.seen);
   }
-};
-
-// CPU seconds by phase, since construction.
-struct ClothPhases {
-  double assembly = 0.0, factorization = 0.0, krylov = 0.0, contact = 0.0;
 };
 
 }  // namespace sim_core

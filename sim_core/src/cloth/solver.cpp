@@ -4,7 +4,6 @@
 #include <cmath>
 
 #include "cloth/contact_setup.hpp"
-#include "cloth/diagnostics.hpp"
 #include "cloth/intersections.hpp"
 #include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
@@ -119,7 +118,6 @@ void ClothSolver::meet(const std::vector<Body>& bodies) {
   const long kept = 4L * (next->numbering.nodes - next->numbering.bones);
   std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
   std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());
-  next->newton.phases = impl_->newton.phases;
   impl_ = std::move(next);
 }
 
@@ -232,31 +230,46 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
 }
 
 std::tuple<double, double, Points3> ClothSolver::energies(const Points3& positions) {
-  impl_->newton.evaluate(impl_->at(positions), false);
+  impl_->assembly.evaluate(impl_->at(positions), false);
   const Assembly& assembly = impl_->assembly;
   return {assembly.membrane_energy, assembly.bending_energy, impl_->unload(assembly.gradient)};
 }
 
-Points3 ClothSolver::stiffness_times(const Points3& positions, const Points3& v) {
-  const Numbering& numbering = impl_->numbering;
-  Buffer<float> in(4 * numbering.free_nodes);
-  for (int i = 0; i < numbering.free_nodes; ++i) {
-    at_node(in, i) = v.row(numbering.vertex[i]).transpose().cast<float>();
-  }
-  const Buffer<float> out = sim_core::stiffness_times(impl_->assembly, impl_->newton, impl_->at(positions), in);
-  Points3 result = Points3::Zero(numbering.vertices, 3);
-  for (int i = 0; i < numbering.free_nodes; ++i) {
-    result.row(numbering.vertex[i]) = at_node(out, i).cast<double>().transpose();
-  }
-  return result;
-}
-
+// Inverse iteration: v <- (K + M/T^2)^-1 M v tends to the softest mode, and 1/growth - 1/T^2 to its eigenvalue.
 double ClothSolver::softest(const Points3& positions) {
-  return softest_mode(impl_->assembly, impl_->newton, impl_->at(positions));
+  constexpr double period = 0.3;  // T, s
+  constexpr int iterations = 40;
+  Assembly& assembly = impl_->assembly;
+  const int free_nodes = impl_->numbering.free_nodes;
+  const Buffer<double> x = impl_->at(positions);
+  assembly.set_diagonal(period, 0.0);
+  assembly.definite = false;
+  assembly.evaluate(x, true);
+  const ContactState open(free_nodes);
+  StaleFactor factor(impl_->numbering);
+  factor.make(assembly, x, open, period);
+  Buffer<float> v(4L * free_nodes + 64, 0.0f), y(v), work((2 * krylov_max + 1) * 4L * free_nodes + 64, 0.0f);
+  for (int i = 0; i < free_nodes; ++i) at_node(v, i).setConstant(1.0f + 0.1f * static_cast<float>(i % 7));
+  double value = 0.0;
+  for (int iteration = 0; iteration < iterations; ++iteration) {
+    double size = 0.0, growth = 0.0;
+    for (int i = 0; i < free_nodes; ++i) size += assembly.mass[i] * at_node(v, i).cast<double>().squaredNorm();
+    const float scale = static_cast<float>(1.0 / std::sqrt(size));
+    for (float& component : v) component *= scale;
+    Buffer<float> force = v;
+    for (int i = 0; i < free_nodes; ++i) at_node(force, i) *= static_cast<float>(assembly.mass[i]);
+    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(), work.data(), krylov_max,
+                           1e-3);
+    for (int i = 0; i < free_nodes; ++i) {
+      growth += assembly.mass[i] * at_node(v, i).cast<double>().dot(at_node(y, i).cast<double>());
+    }
+    value = 1.0 / growth - 1.0 / (period * period);
+    v = y;
+  }
+  return value;
 }
 
 const Eigen::VectorXd& ClothSolver::masses() const { return impl_->assembly.mass_of_vertex; }
-ClothPhases ClothSolver::phases() const { return impl_->newton.phases; }
 std::string ClothSolver::kernel() const { return impl_->assembly.kernel.name; }
 
 }  // namespace sim_core

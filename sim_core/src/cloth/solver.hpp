@@ -73,13 +73,10 @@ class ClothSolver {
 
   // Of membrane and bending, J, and the gradient of their sum, N.
   std::tuple<double, double, Points3> energies(const Points3& positions);
-  // K v with the matrix of Newton's method at `positions`, without mass; rows of held vertices are 0.
-  Points3 stiffness_times(const Points3& positions, const Points3& v);
   // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
   double softest(const Points3& positions);
 
   const Eigen::VectorXd& masses() const;
-  ClothPhases phases() const;
   std::string kernel() const;
 
  private:

@@ -260,7 +260,6 @@ StepReport Stepper::step(double dt, const Drive& drive) {
     const double begin = static_cast<double>(tick) / all, end = static_cast<double>(tick + size()) / all;
     if (!solve_part(begin, end, dt, drive, report)) {
       ++halvings_;
-      ++report.halvings;
       continue;
     }
     tick += size();

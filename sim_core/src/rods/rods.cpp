@@ -14,7 +14,7 @@ constexpr int start_elements_min = 24;
 }  // namespace
 
 std::vector<RodKernels> rod_kernels() {
-  std::vector<RodKernels> kernels{rods_scalar, rods_baseline};
+  std::vector<RodKernels> kernels{rods_baseline};
 #ifdef SIM_CORE_X86_64_KERNELS
   __builtin_cpu_init();
   if (__builtin_cpu_supports("x86-64-v3")) kernels.push_back(rods_x86_64_v3);

@@ -62,7 +62,7 @@ struct RodKernels {
   RodKernel<RodBatch> solve;
   RodKernel<GeneralRodBatch> solve_general;
 };
-extern const RodKernels rods_scalar, rods_baseline, rods_x86_64_v3, rods_x86_64_v4;
+extern const RodKernels rods_baseline, rods_x86_64_v3, rods_x86_64_v4;
 
 // Those that this processor runs, narrowest first.
 std::vector<RodKernels> rod_kernels();

@@ -9,7 +9,8 @@
 #include <optional>
 #include <tuple>
 
-#include "cloth/mesh.hpp"
+#include "cloth/assembly.hpp"
+#include "cloth/kernels/choice.hpp"
 #include "contact/nearest.hpp"
 #include "contact/pair_law.hpp"
 #include "contact/path.hpp"
@@ -101,6 +102,30 @@ NB_MODULE(_testing, m) {
         return safe_share(kind_of(edges), four(x), four(to), {keep, most, floor});
       },
       "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "See contact/closest.hpp.");
+  m.def(
+      "stiffness_times",
+      [](const Points2& rest, const Triangles& triangles, double density, const StretchTable& stretching,
+         const Eigen::Matrix3d& rigidity, const Points3& x, const Points3& v) {
+        const ClothMesh mesh(rest, triangles);
+        FactorSettings exact;  // no fold is too small, and none is old
+        exact.fold_smallest = exact.stiffening_change = 0.0;
+        Assembly assembly(cloth_kernel_named(""), mesh, Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0,
+                          exact);
+        const std::vector<int>& node = assembly.numbering.node;
+        Buffer<double> at(4 * x.rows());
+        Buffer<float> in(4 * x.rows()), out(4 * x.rows());
+        for (int i = 0; i < x.rows(); ++i) {
+          at_node(at, node[i]) = x.row(i).transpose();
+          at_node(in, node[i]) = v.row(i).transpose().cast<float>();
+        }
+        assembly.evaluate(at, true);
+        assembly.kernel.apply(assembly.matrix, in.data(), out.data());
+        Points3 result(x.rows(), 3);
+        for (int i = 0; i < x.rows(); ++i) result.row(i) = at_node(out, node[i]).cast<double>().transpose();
+        return result;
+      },
+      "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "x"_a, "v"_a,
+      "K v with the matrix of Newton's method at x, without mass.");
   m.def(
       "contact_candidates",
       [](const Triangles& triangles, const Points3& x, double reach) {

@@ -144,7 +144,7 @@ class Cloth:
         """Largest residual force of a node in any step, over `force_scale`."""
         self.seen = Observed()
         """What every step was seen to do, see `checks`."""
-        self.newton = self.krylov = self.flips = self.halvings = 0
+        self.newton = self.krylov = 0
         self.factorizations = 0.0
         """Whole factorizations, plus shares of partial ones."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
@@ -374,8 +374,6 @@ class Cloth:
         self.newton += report.newton
         self.krylov += report.krylov
         self.factorizations += report.factorizations
-        self.flips += report.flips
-        self.halvings += report.halvings
         self.least_distance = min(self.least_distance, report.least_distance)
         self.sharpest = min(self.sharpest, report.sharpest)
         self.uneven = max(self.uneven, report.uneven)
@@ -385,7 +383,3 @@ class Cloth:
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""
         return float(self._solver.softest(self.positions))
-
-    def phases(self) -> dict[str, float]:
-        """Return CPU times by phase since the start [s]."""
-        return dict(zip(("assembly", "factorization", "krylov", "contact"), self._solver.phases(), strict=True))
