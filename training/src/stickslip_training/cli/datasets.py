@@ -96,7 +96,10 @@ def export(
         if len(given) != 1:
             raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")
         [(option, target)] = given.items()
-        _require(option)
+        if missing := [name for name in _NEEDED.get(option, []) if find_spec(name) is None]:
+            raise ImportError(
+                f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
+            )
         selection = Selection.of_options(arrays, split, where)
         with DatasetReader(dataset) as reader:
             content = Content(reader, selection)
@@ -121,14 +124,6 @@ _DIRECTORIES = {
     "--obj": meshes.write_obj,
 }
 _NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--lerobot": ["av", "pandas", "pyarrow"]}
-
-
-def _require(option: str) -> None:
-    missing = [name for name in _NEEDED.get(option, []) if find_spec(name) is None]
-    if missing:
-        raise ImportError(
-            f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
-        )
 
 
 @contextmanager

@@ -11,10 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from stickslip_training.cloth.calibration import (
-    covering_temperature,
-    likeliest_temperatures,
-)
+from stickslip_training.cloth.calibration import covering_temperature, likeliest_temperatures
 from stickslip_training.cloth.clips import (
     CHOICE,
     INSTANTS,

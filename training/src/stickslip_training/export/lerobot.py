@@ -170,8 +170,7 @@ def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Ar
 
 def _flat_poses(poses: Array) -> Array:
     """Return poses (n, things, 3, 4) as places and first two columns of rotations, (n, things, 9)."""
-    columns = np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
-    return np.asarray(columns)
+    return np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
 
 
 def _tracked(rest: Array) -> list[int]:
