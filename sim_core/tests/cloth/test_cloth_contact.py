@@ -122,7 +122,7 @@ class TestBodies:
 
     @staticmethod
     def distance(body: Body, p: Floats) -> float:
-        local = body.rotation.T @ (p - body.origin)
+        local = body.pose[:, :3].T @ (p - body.pose[:, 3])
         if body.shape == 0:
             return float(local[2])
         beyond = np.abs(local) - np.array(body.core)
