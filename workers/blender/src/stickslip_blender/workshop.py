@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.states import Reason
-from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, TaskResult
+from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk, encode_clip
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
@@ -97,15 +97,6 @@ class Workshop:
             self._renderer = None  # building ends the last one, even if it fails
             self._renderer = scene, build()
         return self._renderer[1]
-
-    def rendered(self, name: str, pictures: Array, preview: bytes | None, labels: dict[str, Any]) -> TaskResult:
-        """Publish pictures (n, height, width, 3) of one sample, and a preview, and return the result."""
-        output = RenderOutput(
-            chunks={name: self.chunk(pictures)},
-            preview=None if preview is None else self.store.publish(preview),
-            labels=labels,
-        )
-        return TaskResult(outcome="succeeded", output=output)
 
     def chunk(self, values: Array) -> ChunkRef:
         """Publish the values of one sample as a chunk."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.cameras import load_rig
 
@@ -12,7 +13,7 @@ from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_line
 from stickslip_blender.workshop import Workshop, why_unfit
 
 if TYPE_CHECKING:
-    from stickslip_schemas.documents.tasks import RenderTask, TaskResult
+    from stickslip_schemas.documents.tasks import RenderTask
     from stickslip_schemas.kinds.rod_hang import RodHangRender
 
 
@@ -24,5 +25,6 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
     color = silicone_color(look.color_seed)
     renderer = workshop.renderer(("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality))
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
-    preview = png(np.concatenate(list(views), axis=1)) if task.preview else None
-    return workshop.rendered("views", views, preview, {"color": list(to_linear(color))})
+    preview = workshop.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
+    chunks, labels = {"views": workshop.chunk(views)}, {"color": list(to_linear(color))}
+    return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
