@@ -235,10 +235,6 @@ class _BoundaryPoint:
     phi: float
     solution: Solution
 
-    def fields(self, mesh: Floats, Lambda: float) -> Floats:
-        """Fields over sigma, as a guess on the mesh of another Lambda: beyond this rod's clamp they are those there."""
-        return np.stack([np.interp(mesh * Lambda, self.solution.mesh * self.Lambda, y) for y in self.solution.y])
-
 
 class _Boundary:
     """The boundary curve of one Poisson's ratio, (Lambda, phi(Lambda)), followed from an anchor along a ladder.
@@ -297,12 +293,11 @@ class _Boundary:
 
     def _solve(self, Lambda: float, near: _BoundaryPoint) -> _BoundaryPoint:
         """Find phi for this Lambda, from a point near by."""
-        mesh = near.solution.mesh
-        guess = near.solution.y
+        mesh, guess = near.solution.mesh, near.solution.y
         # Rods of more than a few units of sigma look alike in sigma, shorter ones in s.
         if not 0.95 < Lambda / near.Lambda < 1.05:
-            mesh = _mesh(Lambda)
-            guess = near.fields(mesh, Lambda)
+            mesh, known = _mesh(Lambda), mesh * near.Lambda
+            guess = np.stack([np.interp(mesh * Lambda, known, y) for y in guess])  # beyond its clamp as at its clamp
 
         def change(x: Floats, y: Numbers, p: Numbers) -> Numbers:
             return Lambda * _rates(Lambda * x, y, p[0] / Lambda, self.C)
@@ -323,10 +318,10 @@ class _Boundary:
         the problem is a good one, and the sign to watch is that at the free end.
         """
         phi = 7.0  # a little more than the onset, which is at 5.56 (C = 2/3) ... 6.39 (C = 1)
-        fields = None
+        mesh = _mesh(phi)
+        fields = np.zeros((5, len(mesh)))
         for ratio in np.arange(1.2, 0.3, -0.03):
             Lambda = float(ratio) * phi
-            mesh = _mesh(Lambda)
 
             def change(x: Floats, y: Numbers, _: Numbers, Lambda: float = Lambda) -> Numbers:
                 return Lambda * _rates(Lambda * x, y, phi / Lambda, self.C)
@@ -334,8 +329,7 @@ class _Boundary:
             def ends(tip: Numbers, clamp: Numbers, _: Numbers) -> Numbers:
                 return np.stack([tip[1], tip[2], tip[3], clamp[4] - 1.0, clamp[0]])
 
-            guess = np.zeros((5, len(mesh))) if fields is None else fields
-            found = boundary_value.solve(change, ends, mesh, guess)
+            found = boundary_value.solve(change, ends, mesh, fields)
             fields = found.y
             if found.y[4, 0] < 0.0:
                 fields[2:] /= found.y[4, 0]
