@@ -120,7 +120,7 @@ class TestSweeps:
         for step in range(1, 3):
             cloth.step(0.01, bodies=at(0.01 * step))
         middle = np.linalg.norm(SHEET.rest, axis=1).argmin()
-        assert cloth.positions[middle, 2] > at(0.02)[0].origin[2] + 0.03 - 0.1 * CELL
+        assert cloth.positions[middle, 2] > at(0.02)[0].pose[2, 3] + 0.03 - 0.1 * CELL
 
     @pytest.mark.parametrize("speed", [1.0, 10.0])
     def test_a_ball_takes_the_cloth_along(self, speed: float) -> None:
@@ -133,7 +133,7 @@ class TestSweeps:
         cloth, dt = started(0.0, ball(0.0)), 0.05 / speed / 3.0
         for step in range(1, 7):
             cloth.step(dt, bodies=ball(step * dt))
-        top = ball(6 * dt)[0].origin[2] + radius
+        top = ball(6 * dt)[0].pose[2, 3] + radius
         middle = np.linalg.norm(SHEET.rest, axis=1).argmin()
         assert cloth.positions[middle, 2] > top - 0.1 * CELL
 
@@ -147,7 +147,8 @@ class TestSweeps:
         cloth = started(0.004, paddle(0.0))
         for step in range(1, 13):
             cloth.step(0.005, bodies=paddle(0.005 * step))
-        local = (cloth.positions - paddle(0.06)[0].origin) @ paddle(0.06)[0].rotation
+        pose = paddle(0.06)[0].pose
+        local = (cloth.positions - pose[:, 3]) @ pose[:, :3]
         within = np.abs(local[:, 0]) < 0.1
         assert within.any()
         assert local[within, 2].min() > 0.0
