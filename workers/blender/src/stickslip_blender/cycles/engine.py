@@ -82,6 +82,7 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     render.resolution_percentage = 100
     use_device(scene)
     cycles.use_animated_seed = False
+    cycles.use_adaptive_sampling = False
     cycles.time_limit = 0.0
     cycles.pixel_filter_type = "BOX"  # a pixel is the mean over its own area, as on a sensor
     cycles.caustics_reflective = False
@@ -109,7 +110,6 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
     cycles.use_sample_subset = sampling.skipped > 0
     cycles.sample_offset, cycles.sample_subset_length = sampling.skipped, sampling.samples
     cycles.seed = sampling.seed
-    cycles.use_adaptive_sampling = False
     cycles.use_denoising = sampling.denoiser != "none"
     if sampling.denoiser != "none":
         cycles.denoiser = "OPENIMAGEDENOISE"
