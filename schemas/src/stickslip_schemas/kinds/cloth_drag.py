@@ -149,7 +149,7 @@ class ClothDragSpec(ClipSpec):
         le=161,
         description="vertices along a side of the square mesh",
         json_schema_extra={
-            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 5 s, 41 takes 33 s, 81 takes 5 min"
+            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 6 s, 41 takes 31 s, 81 takes 4 min"
         },
     )
     self_friction: Float | None = Field(
