@@ -27,6 +27,8 @@ UNEVEN = 1.0  # cost of a change of direction against the even bend [1/rad^2]
 BENT = 0.05  # cost of any change of direction [1/rad^2]
 CELL = 0.006  # [L]: of two ways at one place, in one direction, the better is kept
 TURN = 0.35  # the side of a cell of directions
+BLUR = 0.6  # deviation of the filter of `_middle`, over the rod's radius
+PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))  # what it leaves in the middle of a straight strip of coverage 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +75,7 @@ def _middle(view: View, radius: float) -> Floats:
     """Return how much of the rod's disc about each pixel lies in the silhouette: 1 in its middle."""
     size = radius * view.focal / float(np.linalg.norm(view.t))
     solid = np.minimum(view.coverage, 1.0)
-    peak = erf(
-        size / (0.6 * size) / np.sqrt(2.0)
-    )  # what the filter leaves in the middle of a straight strip of coverage 1
-    return np.asarray(ndimage.gaussian_filter(solid, 0.6 * size)) / float(peak)
+    return np.asarray(ndimage.gaussian_filter(solid, BLUR * size)) / PEAK
 
 
 def _outside(view: View, field: Floats, points: Floats) -> Floats:
