@@ -23,15 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from stickslip_schemas.scene.library import load_scene
-from stickslip_sim_core import (
-    Body,
-    Cloth,
-    SelfContact,
-    fabric,
-    preset_named,
-    protocols,
-    self_intersections,
-)
+from stickslip_sim_core import Body, Cloth, SelfContact, fabric, preset_named, protocols, self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS

@@ -39,13 +39,7 @@ def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> ClothRun:
     start = time.process_time()
     preset = divided(preset_named(args.preset), divisor)
     scene = cloth_drag.scene(
-        args.material,
-        args.mu,
-        preset=preset,
-        mesh=vertices,
-        frames=args.frames,
-        seed=args.seed,
-        self_friction=None,
+        args.material, args.mu, preset=preset, mesh=vertices, frames=args.frames, seed=args.seed, self_friction=None
     ).run()
     seconds = time.process_time() - start
     print(

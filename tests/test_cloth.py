@@ -63,12 +63,7 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
     simulation = spec.simulation({"material": "gray-interlock", "mu": 0.4})
     assert isinstance(simulation, ClothDragSimulation)
     run = cloth_drag.scene(
-        "gray-interlock",
-        0.4,
-        preset="fast",
-        mesh=9,
-        seed=simulation.seed,
-        self_friction=simulation.self_friction,
+        "gray-interlock", 0.4, preset="fast", mesh=9, seed=simulation.seed, self_friction=simulation.self_friction
     ).run()
     arrays = read_arrays(directory)
     assert arrays["valid"].all()

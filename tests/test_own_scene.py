@@ -139,10 +139,7 @@ def test_a_scene_is_checked_and_its_cost_named() -> None:
         ({"preset": "certified"}, "the certificate is of preset certified, and the scene has fast"),
         ({"extent": "quick"}, "the certificate is a quick one"),
         ({"sim_core": "c" * 64}, "the certificate is of another build of the solver"),
-        (
-            {"names": SCENE_PROTOCOLS[:4]},
-            "the certificate lacks what the scene needs: capstan",
-        ),
+        ({"names": SCENE_PROTOCOLS[:4]}, "the certificate lacks what the scene needs: capstan"),
     ],
 )
 def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: str) -> None:

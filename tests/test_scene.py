@@ -40,10 +40,7 @@ SCENE: dict[str, Any] = {
     },
     "bodies": {
         "floor": {"type": "plane"},
-        "block": {
-            "type": "mesh",
-            "motion": {"keys": [{"time": 0}, {"time": 0.3, "move": [0.01, 0, 0]}]},
-        },
+        "block": {"type": "mesh", "motion": {"keys": [{"time": 0}, {"time": 0.3, "move": [0.01, 0, 0]}]}},
     },
     "friction": [{"between": ["cloth", "block"], "mu": 0.5}],
     "default_friction": 0.4,

@@ -85,10 +85,7 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
 def test_no_line_can_be_changed(context: Context, change: Any) -> None:
     submit_job(context, parsed(rods()), None)
     before = lines(context)
-    with (
-        pytest.raises(DBAPIError, match="the audit log is append-only"),
-        context.database.write() as connection,
-    ):
+    with pytest.raises(DBAPIError, match="the audit log is append-only"), context.database.write() as connection:
         connection.execute(change)
     assert lines(context) == before != []
 

@@ -85,10 +85,7 @@ class Core:
             rest=scene.mesh.rest,
             triangles=scene.mesh.triangles,
             times=t,
-            record={
-                "contact_force": np.outer(t, (mu, 0.0, 1.0)),
-                "holder_force": np.outer(t, (-mu, 0.0, -1.0)),
-            },
+            record={"contact_force": np.outer(t, (mu, 0.0, 1.0)), "holder_force": np.outer(t, (-mu, 0.0, -1.0))},
             labels={
                 "bias_side": -1,
                 "landed_side": 1,

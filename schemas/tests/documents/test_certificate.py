@@ -81,10 +81,7 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "passed without a measurement": (document(protocols=[protocol(curves=[], error=None)]), "within"),
     "passed though it broke off": (document(protocols=[protocol(message="no")]), "within"),
     "a protocol twice": (document(protocols=[protocol(), protocol()]), "there once"),
-    "two builds": (
-        document(protocols=[protocol(), protocol(protocol="cantilever", build_hash="e" * 64)]),
-        "one build",
-    ),
+    "two builds": (document(protocols=[protocol(), protocol(protocol="cantilever", build_hash="e" * 64)]), "one build"),
     "no protocol": (document(protocols=[]), "at least 1 item"),
     "curves of two lengths": (document(protocols=[protocol(curves=[off_by(0.0)[0] | {"x": []}])]), "one length"),
     "a digest that is none": (document(sim_core="latest"), "pattern"),

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 from numcodecs import blosc
-from stickslip_schemas.format.codecs import (
-    CorruptChunkError,
-    axes_order,
-    decode_sample,
-    encode_sample,
-)
+from stickslip_schemas.format.codecs import CorruptChunkError, axes_order, decode_sample, encode_sample
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 SHAPE = (6, 24, 20, 3)

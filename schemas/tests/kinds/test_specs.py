@@ -20,11 +20,7 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 RODS: dict[str, Any] = {
     "kind": "rod_hang",
-    "axes": {
-        "gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": 4},
-        "phi0": [0.2, 6],
-        "phi1": 12,
-    },
+    "axes": {"gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": 4}, "phi0": [0.2, 6], "phi1": 12},
 }
 CLOTH: dict[str, Any] = {
     "kind": "cloth_drag",

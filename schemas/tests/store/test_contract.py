@@ -45,12 +45,7 @@ def directory(root: Path) -> Place:
     def damage(digest: str, data: bytes) -> None:
         store.path(digest).write_bytes(data)
 
-    return Place(
-        root.as_uri(),
-        store,
-        damage,
-        lambda path: zarr.storage.LocalStore(root / path, read_only=True),
-    )
+    return Place(root.as_uri(), store, damage, lambda path: zarr.storage.LocalStore(root / path, read_only=True))
 
 
 @pytest.fixture(scope="module")

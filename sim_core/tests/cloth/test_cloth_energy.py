@@ -162,12 +162,7 @@ def test_linear_plate(kind: MeshKind) -> None:
     """The tip of a horizontal cantilever, nu = 0, sags by rho g L^4 / 8D: to 0.08 %."""
     clamped = strip(0.02, 50, kind)
     density, rigidity, g = 0.2, 1e-5, 9.81
-    cloth = Cloth(
-        clamped.mesh,
-        isotropic(density, 500.0, rigidity),
-        preset_named("certified"),
-        held=clamped.held,
-    )
+    cloth = Cloth(clamped.mesh, isotropic(density, 500.0, rigidity), preset_named("certified"), held=clamped.held)
     at = flat(clamped.mesh)
     free = np.setdiff1d(np.arange(len(at)), clamped.held)
     K = np.empty((len(free), len(free)))

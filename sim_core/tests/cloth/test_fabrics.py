@@ -5,15 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stickslip_sim_core import (
-    PRESETS,
-    Cloth,
-    custom_fabric,
-    fabric,
-    fabric_names,
-    isotropic,
-    preset_named,
-)
+from stickslip_sim_core import PRESETS, Cloth, custom_fabric, fabric, fabric_names, isotropic, preset_named
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
 

@@ -35,11 +35,7 @@ def law(
 def test_roots(seed: int) -> None:
     n, t, _ = frame(seed)
     zero = np.zeros(3)
-    roots = [
-        (OPEN, 0.1, zero, zero),
-        (STICK, 0.0, zero, 2.0 * n + 0.9 * t),
-        (SLIP, 0.0, -0.3 * t, 2.0 * n + 1.0 * t),
-    ]
+    roots = [(OPEN, 0.1, zero, zero), (STICK, 0.0, zero, 2.0 * n + 0.9 * t), (SLIP, 0.0, -0.3 * t, 2.0 * n + 1.0 * t)]
     for mode, gap, slip, force in roots:
         found = law(gap, n, slip, force, 0.5)
         assert found[0] == mode

@@ -20,11 +20,7 @@ CERTIFIED = preset_named("certified")
 ONE_ITERATION = replace(
     CERTIFIED,
     name="one-iteration",
-    constants={
-        "contact.length_tolerance": 1.0,
-        "newton.linear_share": 1e-12,
-        "newton.cuts_max": 1.0,
-    },
+    constants={"contact.length_tolerance": 1.0, "newton.linear_share": 1e-12, "newton.cuts_max": 1.0},
 )
 H = 1e-3
 """Thickness [m]."""

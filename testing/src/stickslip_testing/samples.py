@@ -54,8 +54,7 @@ def simulation_key(simulation: Simulation, builds: Builds) -> str:
 def render_key(render: Render, of_simulation: str, builds: Builds) -> str:
     """Return the content key of a render: its trajectory, its appearance and the renderer's build."""
     return content_key(
-        "render",
-        {"render": render.model_dump(mode="json"), "simulation": of_simulation, "build": builds.render},
+        "render", {"render": render.model_dump(mode="json"), "simulation": of_simulation, "build": builds.render}
     )
 
 

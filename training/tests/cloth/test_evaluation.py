@@ -2,14 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from stickslip_training.cloth.evaluation import (
-    Truth,
-    errors,
-    measure,
-    predictions,
-    score,
-    score_predictions,
-)
+from stickslip_training.cloth.evaluation import Truth, errors, measure, predictions, score, score_predictions
 from stickslip_training.cloth.posterior import Bins, Estimates, Posterior
 
 BINS = Bins(0.0, 1.6, 64)

@@ -239,11 +239,7 @@ def file_of_clips(path, shown):
         for code, mu in zip(shown.material.tolist(), shown.mu.tolist(), strict=True)
     ]
     np.savez(
-        path,
-        video=video,
-        segmentation=classes,
-        instants=np.array(INSTANTS),
-        about=[json.dumps(clip) for clip in about],
+        path, video=video, segmentation=classes, instants=np.array(INSTANTS), about=[json.dumps(clip) for clip in about]
     )
 
 

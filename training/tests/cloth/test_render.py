@@ -6,15 +6,7 @@ import torch
 from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, frames_at, training_cameras
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
-from stickslip_training.cloth.render import (
-    POINTS,
-    _refined,
-    draw_style,
-    draw_textures,
-    render_crops,
-    splat,
-    turned,
-)
+from stickslip_training.cloth.render import POINTS, _refined, draw_style, draw_textures, render_crops, splat, turned
 from stickslip_training.cloth.world import coded, draw_world
 
 RIG = training_cameras()

@@ -67,12 +67,7 @@ def _task(record: str, *, row: int = 0, preview: bool = False, **look: Any) -> d
         "quality": "draft",
         "color_seed": 5,
     }
-    return {
-        "stage": "render",
-        "render": render | look,
-        "record": {"digest": record, "row": row},
-        "preview": preview,
-    }
+    return {"stage": "render", "render": render | look, "record": {"digest": record, "row": row}, "preview": preview}
 
 
 def _files(store: DirectoryStore) -> set[str]:

@@ -62,10 +62,7 @@ def split(tasks: Sequence[RenderTask], result: TaskResult) -> list[TaskResult]:
     """Split the result of merged renders into one a task; the cost is divided evenly."""
     if len(tasks) == 1:
         return [result]
-    share = {
-        "cpu_seconds": result.cpu_seconds / len(tasks),
-        "wall_seconds": result.wall_seconds / len(tasks),
-    }
+    share = {"cpu_seconds": result.cpu_seconds / len(tasks), "wall_seconds": result.wall_seconds / len(tasks)}
     if not isinstance(result.output, RenderOutput):
         return [result.model_copy(update=share)] * len(tasks)
     try:

@@ -118,8 +118,7 @@ class FloorNumbers(_Ranges):
         default=0.1, description="contrast of the marks on the floor; at 0, motion over it is invisible"
     )
     tint: tuple[Tint, Tint, Tint] = Field(
-        default=(1.0, 1.0, 1.0),
-        description="colour (linear red, green, blue), 0.05 to 1; only ratios count",
+        default=(1.0, 1.0, 1.0), description="colour (linear red, green, blue), 0.05 to 1; only ratios count"
     )
 
 

@@ -149,9 +149,7 @@ class JobSpec(Document):
 
     kind: str
     name: str | None = Field(
-        default=None,
-        pattern=r"^[a-z0-9][a-z0-9-]{0,62}$",
-        description="label of the job; enters no key",
+        default=None, pattern=r"^[a-z0-9][a-z0-9-]{0,62}$", description="label of the job; enters no key"
     )
     combine: Literal["product", "zip"] = Field(
         default="product",

@@ -4,14 +4,7 @@ import re
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-from stickslip_schemas.store.base import (
-    CorruptArtifactError,
-    ShownVersion,
-    Store,
-    Stored,
-    in_parallel,
-    is_unavailable,
-)
+from stickslip_schemas.store.base import CorruptArtifactError, ShownVersion, Store, Stored, in_parallel, is_unavailable
 from stickslip_schemas.store.directory import DirectoryStore, sync, write_durably
 
 __all__ = [

@@ -266,12 +266,7 @@ def _download(
 
 
 def _fetch(
-    client: Client,
-    url: str,
-    digest: Sha256,
-    part: Path,
-    on_bytes: Callable[[int], None],
-    stop: threading.Event,
+    client: Client, url: str, digest: Sha256, part: Path, on_bytes: Callable[[int], None], stop: threading.Event
 ) -> None:
     have = part.stat().st_size if part.exists() else 0
     etag = f'"{digest}"'

@@ -137,13 +137,7 @@ def pieces(
         yield _piece(spec, terms, some, previewed, pack_keys)
 
 
-def _piece(
-    spec: JobSpec,
-    terms: Terms,
-    some: Sequence[Shard],
-    previewed: set[int],
-    pack_keys: list[str],
-) -> Plan:
+def _piece(spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[int], pack_keys: list[str]) -> Plan:
     """Return the plan of some shards; add the keys of their pack tasks to `pack_keys`."""
     builds = terms.builds
     plan = Plan(spec, some[0].points[0].slot)

@@ -214,12 +214,7 @@ class Cloth:
         """Forces of the cloth on the vertices of each surface at the end of the last step: (N, 3) [N]."""
         return np.split(np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1])
 
-    def set_state(
-        self,
-        positions: ArrayLike,
-        velocities: ArrayLike | None = None,
-        bodies: Sequence[Body] = (),
-    ) -> None:
+    def set_state(self, positions: ArrayLike, velocities: ArrayLike | None = None, bodies: Sequence[Body] = ()) -> None:
         """Set positions (V, 3) [m], and velocities (V, 3) [m/s].
 
         Without `bodies`, those of this time, they do not move in the next step.
@@ -248,14 +243,7 @@ class Cloth:
         around = [body.as_tuple() for body in bodies]
         self._solver.set_state(positions, velocities, self._surfaces_at(self.time), around, begins=False)
 
-    def step(
-        self,
-        dt: float,
-        *,
-        held: ArrayLike = (),
-        bodies: Sequence[Body] = (),
-        damping: float = 0.0,
-    ) -> StepReport:
+    def step(self, dt: float, *, held: ArrayLike = (), bodies: Sequence[Body] = (), damping: float = 0.0) -> StepReport:
         """Advance by dt [s]. Positions of held vertices (K, 3), bodies and surfaces are those at its end.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
@@ -263,12 +251,7 @@ class Cloth:
         """
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
-            dt,
-            self.gravity,
-            ends,
-            self._surfaces_at(self.time + dt),
-            [body.as_tuple() for body in bodies],
-            damping,
+            dt, self.gravity, ends, self._surfaces_at(self.time + dt), [body.as_tuple() for body in bodies], damping
         )
         self.time += dt
         return self._count(report)

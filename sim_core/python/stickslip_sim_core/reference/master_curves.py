@@ -342,13 +342,7 @@ def _rates(sigma: Floats, y: Numbers, k: Numbers | float, C: float) -> Numbers:
     theta, q, mu0, mu1, eta = y
     sine, cosine = np.sin(theta), np.cos(theta)
     return np.stack(
-        [
-            -(k + q),
-            -sigma * sine,
-            -k * mu1,
-            (k + q) * mu0 - q * mu0 / C - sigma * eta,
-            -cosine * mu1 - sine * mu0 / C,
-        ]
+        [-(k + q), -sigma * sine, -k * mu1, (k + q) * mu0 - q * mu0 / C - sigma * eta, -cosine * mu1 - sine * mu0 / C]
     )
 
 

@@ -102,10 +102,7 @@ class NaturalFit:
 
 
 def fit_parameters(
-    centerline: ArrayLike,
-    *,
-    gamma: float | None = None,
-    stiffness: ArrayLike = STIFFNESS,
+    centerline: ArrayLike, *, gamma: float | None = None, stiffness: ArrayLike = STIFFNESS
 ) -> ParameterFit:
     """Fit (gamma, phi0, phi1) to a centreline, by Levenberg's and Marquardt's method from several starts.
 
@@ -137,11 +134,7 @@ def fit_parameters(
 
 
 def fit_natural_curvature(
-    centerline: ArrayLike,
-    *,
-    gamma: float | None = None,
-    noise: float | None = None,
-    stiffness: ArrayLike = STIFFNESS,
+    centerline: ArrayLike, *, gamma: float | None = None, noise: float | None = None, stiffness: ArrayLike = STIFFNESS
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 

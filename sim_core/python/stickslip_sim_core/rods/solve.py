@@ -52,13 +52,7 @@ class RodSolution:
 
 
 def solve_rods(
-    gamma: ArrayLike,
-    phi0: ArrayLike,
-    phi1: ArrayLike,
-    *,
-    poisson: float = 0.5,
-    elements: int = 128,
-    points: int = 150,
+    gamma: ArrayLike, phi0: ArrayLike, phi1: ArrayLike, *, poisson: float = 0.5, elements: int = 128, points: int = 150
 ) -> RodSolution:
     """Compute the equilibrium that each rod reaches from its natural shape.
 

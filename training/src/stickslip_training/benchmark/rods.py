@@ -46,10 +46,7 @@ class RodTask(Task):
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         exact = reader.read("centerline", slots)
-        return {
-            "centerline": exact[:, ::_EVERY],
-            "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32),
-        }
+        return {"centerline": exact[:, ::_EVERY], "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32)}
 
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
         """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3).

@@ -99,14 +99,7 @@ def reconstruct(
 
     with readable_errors():
         result = reconstruct_folder(
-            folder,
-            calibration,
-            length=length,
-            clamp=clamp,
-            direction=direction,
-            rig=rig,
-            points=points,
-            radius=radius,
+            folder, calibration, length=length, clamp=clamp, direction=direction, rig=rig, points=points, radius=radius
         )
         written = write_results(result, out)
     found, console = result.reconstruction, Console()

@@ -262,13 +262,7 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
     mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
     clips = Clips(
-        crops=crops,
-        direction=seen.rotation[:, 2],
-        material=np.array(known),
-        mu=mu,
-        landed=landed,
-        run=run,
-        cover=cover,
+        crops=crops, direction=seen.rotation[:, 2], material=np.array(known), mu=mu, landed=landed, run=run, cover=cover
     )
     return clips, about
 

@@ -196,10 +196,7 @@ def holder_points(instants: Array) -> Floats:
 
 
 def _follow(
-    path: str | Path,
-    camera: Camera,
-    holders: tuple[float, float, float, float] | None,
-    frame_rate: float | None,
+    path: str | Path, camera: Camera, holders: tuple[float, float, float, float] | None, frame_rate: float | None
 ) -> tuple[Floats, Floats]:
     """Return times (N,), and places (N, 2, 2) of the held patches without distortion [px]."""
     try:
@@ -307,13 +304,7 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
     )
 
 
-def _cut(
-    path: str | Path,
-    camera: Camera,
-    chosen: list[int],
-    instants: tuple[float, ...],
-    off: Floats,
-) -> torch.Tensor:
+def _cut(path: str | Path, camera: Camera, chosen: list[int], instants: tuple[float, ...], off: Floats) -> torch.Tensor:
     """Return the crops of some frames, whose holders are `off` (F, 2) [px]."""
     import cv2
 

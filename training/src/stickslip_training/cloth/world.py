@@ -230,11 +230,7 @@ def _floor(cloth: Cloth, cameras: Cameras, pixels: torch.Tensor, style: "Style",
     x, y = place[..., 0] - 0.15, place[..., 1]  # from the middle of the drag
     grid = torch.stack([c * x - s * y, s * x + c * y], dim=-1) / world["span"][..., None]
     pattern = functional.grid_sample(
-        world.pattern[:, None],
-        grid.flatten(1, 2),
-        mode="bilinear",
-        padding_mode="reflection",
-        align_corners=True,
+        world.pattern[:, None], grid.flatten(1, 2), mode="bilinear", padding_mode="reflection", align_corners=True
     ).reshape(cloth.alpha.shape)
     shadow = world["shadow"] * blurred(cloth.shadow, world.drawn["shadow_blur"])
     crevice = world["crevice"] * blurred(cloth.alpha, world.drawn["crevice_blur"])

@@ -34,11 +34,7 @@ def _write_array(file: object, content: Content, array: ArrayLayout, on_bytes: O
     count = len(content.slots)
     rows = max(1, min(count, CHUNK_BYTES // array.sample_bytes))
     out = file.create_dataset(
-        array.name,
-        shape=(count, *array.shape),
-        dtype=array.dtype,
-        chunks=(rows, *array.shape),
-        fletcher32=True,
+        array.name, shape=(count, *array.shape), dtype=array.dtype, chunks=(rows, *array.shape), fletcher32=True
     )
     for dimension, name in zip(out.dims, ("sample", *array.dimensions), strict=True):
         dimension.label = name

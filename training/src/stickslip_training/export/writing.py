@@ -13,10 +13,7 @@ from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Conten
 
 
 def to_directory(
-    content: Content,
-    target: Path,
-    on_bytes: OnBytes,
-    write: Callable[[Content, Path, OnBytes], None],
+    content: Content, target: Path, on_bytes: OnBytes, write: Callable[[Content, Path, OnBytes], None]
 ) -> None:
     """Let `write` fill a directory, and add the manifest and a description."""
     with made_whole(target) as scratch:

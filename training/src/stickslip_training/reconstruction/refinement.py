@@ -136,13 +136,7 @@ class _Problem:
     """Unknowns x = (control points, log radius, log blur, light and slope of each view) and their sum of squares."""
 
     def __init__(
-        self,
-        views: Sequence[View],
-        fit: Fit,
-        direction: Floats,
-        extra_blur: float,
-        shading: bool,
-        fixed_radius: bool,
+        self, views: Sequence[View], fit: Fit, direction: Floats, extra_blur: float, shading: bool, fixed_radius: bool
     ) -> None:
         self._views, self._extra = views, extra_blur
         self._K = K = len(fit.control)

@@ -11,15 +11,7 @@ from torch import nn
 
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.engine.files import MODEL_NAME, load_tensors, save_tensors, versions, write_report
-from stickslip_training.engine.fit import (
-    EpochReport,
-    FitSettings,
-    Learner,
-    check_positive,
-    fit,
-    seeded,
-    torch_threads,
-)
+from stickslip_training.engine.fit import EpochReport, FitSettings, Learner, check_positive, fit, seeded, torch_threads
 from stickslip_training.rods.dataset import Rods, load_splits, with_white_noise
 from stickslip_training.rods.evaluation import MethodReport, estimate_strains, evaluate, noisy_test_centerline, rms
 from stickslip_training.rods.nets import CurvatureNet, root_mean_square_loss

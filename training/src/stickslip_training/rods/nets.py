@@ -40,10 +40,7 @@ class CurvatureNet(nn.Module):
             nn.MaxPool1d(2, stride=1),
         )
         self.head = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(128 * (POINTS - 4), 512),
-            nn.ReLU(),
-            nn.Linear(512, POINTS * 3),
+            nn.Flatten(), nn.Linear(128 * (POINTS - 4), 512), nn.ReLU(), nn.Linear(512, POINTS * 3)
         )
         self.input_mean: torch.Tensor
         self.input_scale: torch.Tensor

@@ -83,10 +83,7 @@ def test_a_fresh_process_with_two_threads_makes_the_same_bytes(
     np.savez(tmp_path / "sheet.npz", triangles=sheet.triangles, rest=sheet.rest, track=sheet.track)
     look = ClothDragRender.model_validate(LOOK).model_dump_json()
     done = subprocess.run(
-        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look],
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look], capture_output=True, text=True, check=True
     )
     _render(renderer, sheet, Texture.dots, viewpoint="right", substrate="ceramic", instants=(0,))
     video = _render(renderer, sheet)

@@ -36,16 +36,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     floor = RANDOM.uniform(0.5, 1.5, (height, width, 3)).astype(np.float32)
     pictures = np.empty((count, 2, height, width, 3), dtype=np.uint8)[:, 1]
     _raster.compose(
-        light.view(np.uint16),
-        ALBEDOS,
-        overall,
-        coverage,
-        seen,
-        window.place,
-        reflected,
-        around.place,
-        floor,
-        pictures,
+        light.view(np.uint16), ALBEDOS, overall, coverage, seen, window.place, reflected, around.place, floor, pictures
     )
 
     at = np.moveaxis(light.astype(np.float64), -1, 0)[..., None]

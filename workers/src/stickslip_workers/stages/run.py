@@ -22,10 +22,7 @@ class StageActor:
 
     def describe(self) -> dict[str, Any]:
         """Return the builds of each kind, and versions of libraries."""
-        return {
-            "builds": {name: builds.kind_builds(name) for name in KINDS},
-            "versions": builds.versions(),
-        }
+        return {"builds": {name: builds.kind_builds(name) for name in KINDS}, "versions": builds.versions()}
 
     def run(self, tasks: str) -> str:
         """Run tasks, see `run_tasks`."""

@@ -70,8 +70,7 @@ class ClipSpec(NamingSpec):
     """How many instants of the motion a trajectory holds."""
     instants_per_second: ClassVar[float]
     allow_uncertified: Bool = Field(
-        default=False,
-        description="make the dataset without a passing certificate of the preset",
+        default=False, description="make the dataset without a passing certificate of the preset"
     )
     frames: Int = Field(
         default=30,
@@ -109,10 +108,7 @@ class ClipSpec(NamingSpec):
         json_schema_extra={"x-cost": "at 0.5, half of the CPU time of rendering 30 frames, and more of fewer frames"},
     )
     creases: Float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="strength of the fine creases that the renderer adds; 1 is 0.5 mm",
+        default=0.0, ge=0, le=1, description="strength of the fine creases that the renderer adds; 1 is 0.5 mm"
     )
 
     @property

@@ -23,9 +23,7 @@ _CERTIFICATE: dict[str, Any] = {"application/json": {"schema": {"$ref": "#/compo
     openapi_extra=body_schema("Certificate"),
 )
 def post_certificate(
-    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))],
-    context: ContextDep,
-    response: Response,
+    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))], context: ContextDep, response: Response
 ) -> CertificateEntry:
     """Register a certificate; it may be sent twice. The newest full certificate of a preset and build counts."""
     entry = register_certificate(context.database, context.store, certificate, context.clock())

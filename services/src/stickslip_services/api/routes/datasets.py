@@ -69,12 +69,7 @@ def get_file(dataset: str, version: Version, path: str, request: Request, contex
     return _serve(request, context, dataset, version, path)
 
 
-@router.get(
-    "/v1/previews/{digest}",
-    response_class=Response,
-    responses=file_responses(_PICTURE, 422),
-    tags=["jobs"],
-)
+@router.get("/v1/previews/{digest}", response_class=Response, responses=file_responses(_PICTURE, 422), tags=["jobs"])
 def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     """Return the picture of a sample."""
     with context.database.read() as connection:

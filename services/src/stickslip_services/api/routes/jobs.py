@@ -95,9 +95,7 @@ def get_job(job_id: str, context: ContextDep) -> JobDetail:
 
 
 @router.patch(
-    "/v1/jobs/{job_id}",
-    responses=_CHANGED | problem_responses(*BODY_PROBLEMS),
-    openapi_extra=body_schema("JobPatch"),
+    "/v1/jobs/{job_id}", responses=_CHANGED | problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobPatch")
 )
 def patch_job(job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep) -> JobDetail:
     """Set the priority of a job, from its next task on. 409: it has ended."""

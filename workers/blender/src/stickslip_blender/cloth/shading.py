@@ -135,12 +135,7 @@ class Composer:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
 
     def _mirror(
-        self,
-        overall: Floats,
-        points: npt.NDArray[np.float64],
-        camera: Camera,
-        substrate: Substrate,
-        textures: Textures,
+        self, overall: Floats, points: npt.NDArray[np.float64], camera: Camera, substrate: Substrate, textures: Textures
     ) -> tuple[Floats, Window]:
         """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width, 3 textures)."""
         cloth, floor = self._geometry.cloth_triangles, self._geometry.surroundings.floor

@@ -139,12 +139,7 @@ def get_spec(opened: OpenedDep) -> Response:
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
 def get_picture(
-    opened: OpenedDep,
-    slot: Slot,
-    array: str,
-    index: Annotated[int, Path(ge=0)],
-    request: Request,
-    step: Step = 1,
+    opened: OpenedDep, slot: Slot, array: str, index: Annotated[int, Path(ge=0)], request: Request, step: Step = 1
 ) -> Response:
     """Return a picture or a frame of ground truth of a sample as PNG; `step` takes every `step`-th pixel."""
     data = opened.data
