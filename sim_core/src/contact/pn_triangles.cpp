@@ -35,15 +35,17 @@ PatchShape PNTriangles::shape(const Buffer<double>& x) const {
     }
   }
   for (Vector3d& normal : out.normals) normal.normalize();
-  // Of the circle that touches at a corner and goes through the next: 2 N . (P_i - P_j)/|P_i - P_j|^2.
+  // Of the circle that touches at a corner and goes through the next: 2 h/|P_i - P_j|^2, h = N . (P_i - P_j). Handles
+  // are h/3 off the triangle, and C is h/2: with their weights, which are largest in the middle, so is the patch by h/3.
   out.curvature.assign(mesh_.groups, {0.0, 0.0});
   for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
     for (int k = 0; k < 3; ++k) {
       for (int to : {next(k), after_next(k)}) {
         const Vector3d edge = at_node(x, mesh_.triangles[t][k]) - at_node(x, mesh_.triangles[t][to]);
-        const double bulge = 2.0 * out.normals[mesh_.group[t][k]].dot(edge) / edge.squaredNorm();
+        const double h = out.normals[mesh_.group[t][k]].dot(edge), curvature = 2.0 * h / edge.squaredNorm();
         auto& most = out.curvature[mesh_.group[t][k]];
-        most = {std::max(most[0], bulge), std::max(most[1], -bulge)};
+        most = {std::max(most[0], curvature), std::max(most[1], -curvature)};
+        out.bulge = std::max(out.bulge, std::abs(h) / 3.0);
       }
     }
   }

@@ -40,6 +40,7 @@ struct PatchShape {
   Buffer<double> x;
   std::vector<Eigen::Vector3d> normals;               // by group of corners
   std::vector<std::array<double, 2>> curvature = {};  // 1/m
+  double bulge = 0.0;                                 // m: how far patches are from their triangles at most
 };
 
 struct Foot {
