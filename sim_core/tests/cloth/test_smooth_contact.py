@@ -268,6 +268,18 @@ class TestCloth:
         assert height == pytest.approx(sinks + 0.25 * THICKNESS, rel=0.02)
         assert not len(cloth.pair_forces.forces)
 
+    def test_coarse_cloth_rests_alike_on_coarse_and_fine_triangles(self) -> None:
+        """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: they must be found from there."""
+        soft, found = isotropic(0.2, 200.0, 2e-6), []
+        for subdivisions in (1, 3):
+            x, triangles = ball(0.1, subdivisions)
+            cloth = over(Surface(triangles, x, 0.5), 0.12, meshes.grid(0.36, 0.36, 8, 8), soft)
+            for _ in range(60):
+                cloth.step(0.01, damping=10.0)
+            assert np.count_nonzero(cloth.contacts >= 0) == 25
+            found.append(cloth.positions)
+        assert found[0] == pytest.approx(found[1], abs=1e-3)
+
     def test_corner_of_a_floor_and_a_surface(self) -> None:
         """A wall that pushes a sheet over the floor: vertices bear on both."""
         wall = np.array([[0.0, -0.1, -0.01], [0.0, 0.1, -0.01], [0.0, 0.1, 0.1], [0.0, -0.1, 0.1]])
