@@ -52,11 +52,7 @@ void SmoothContact::take_shapes(const Buffer<double>& start, const Buffer<double
     return shape.x.size() == x.size() && std::equal(x.begin() + 4L * first_, x.end(), shape.x.begin() + 4L * first_);
   };
   if (!same(start_, start)) {
-    if (same(end_, start)) {
-      start_ = end_;
-    } else {
-      start_ = patches_.shape(start);
-    }
+    start_ = same(end_, start) ? end_ : patches_.shape(start);
     tree_.fit(start);
   }
   if (!same(end_, ends)) end_ = patches_.shape(ends);
