@@ -36,7 +36,7 @@ PatchShape PNTriangles::shape(const Buffer<double>& x) const {
   }
   for (Vector3d& normal : out.normals) normal.normalize();
   // Of the circle that touches at a corner and goes through the next: 2 h/|P_i - P_j|^2, h = N . (P_i - P_j). Handles
-  // are h/3 off the triangle, and C is h/2: with their weights, which are largest in the middle, so is the patch by h/3.
+  // are h/3 off the triangle and C is h/2: with the weights of these in the middle, the patch is h/3 off there.
   out.curvature.assign(mesh_.groups, {0.0, 0.0});
   for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
     for (int k = 0; k < 3; ++k) {

@@ -72,7 +72,7 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   for (int i = 0; i < free_nodes_; ++i) {
     if (track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const Vector3d p = at_node(start, i);
-    const double kept = thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // off triangles, at most
+    const double kept = thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
     const double reach = kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest found =
         tree_.nearest(p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
