@@ -269,7 +269,7 @@ class TestCloth:
         assert not len(cloth.pair_forces.forces)
 
     def test_coarse_cloth_rests_alike_on_coarse_and_fine_triangles(self) -> None:
-        """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: they must be found from there."""
+        """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: nodes must find them."""
         soft, found = isotropic(0.2, 200.0, 2e-6), []
         for subdivisions in (1, 3):
             x, triangles = ball(0.1, subdivisions)
