@@ -16,6 +16,7 @@ for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write i
     os.environ.pop(_name, None)
 
 os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: the other tests would starve those that use Ray
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of NumPy and torch wait by spinning, which the other tests pay
 
 SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql"}
 """Fixtures that start a server, and the group of the tests that share it. These tests are marked `real`."""
@@ -31,9 +32,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Let one process run all tests that share a server or a fixture of their module, and sort the modules.
 
-    What waits long or takes long comes first, so that no process is left with it when the others are done.
+    Long rows of tests come first, then what waits or takes long: no process is left with it when the others are done.
     """
-    turns: dict[Path, tuple[float, bool, bool]] = {}
+    turns: dict[Path, tuple[bool, float, bool, bool]] = {}
     for item in items:
         scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
         if "database" in scopes and "postgresql" in item.name:
@@ -41,8 +42,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         servers = [name for name in SERVERS if name in scopes]
         if servers:
             item.add_marker(pytest.mark.real)
+        mark = item.get_closest_marker("xdist_group")
         if hasattr(item.config, "workerinput"):  # of xdist
-            mark = item.get_closest_marker("xdist_group")
             shared = [SERVERS[name] for name in servers if scopes[name] == "session"]
             shared += [item.nodeid.partition("::")[0]] if "module" in scopes.values() else []
             if group := mark.args[0] if mark else next(iter(shared), None):
@@ -50,7 +51,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item._id = NodeId.parse(f"{item.nodeid}@{group}")
         patience = item.get_closest_marker("timeout")
         is_other = [item.get_closest_marker(name) is None for name in ("real", "physics")]
-        turn = (-patience.args[0] if patience else 0, *is_other)
+        turn = (mark is None, -patience.args[0] if patience else 0, *is_other)
         turns[item.path] = min(turn, turns.get(item.path, turn))
     items.sort(key=lambda item: turns[item.path])
 
