@@ -1,5 +1,6 @@
 """Steps of the controller's choice: they depend on the scene, and not on how often it is filmed."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -100,13 +101,14 @@ def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> N
     begin, size, dt = 0.5, 2e-3, 1e-5
 
     def floor(time: float) -> float:
-        return size * float(1.0 - np.cos(2.0 * np.pi * frequency * max(time - begin, 0.0)))
+        return size * (1.0 - math.cos(2.0 * math.pi * frequency * max(time - begin, 0.0)))
 
     cloth, path = watched(lambda time: [plane(1.0, origin=(floor(time), 0.0, 0.0))], 0.8)
-    x, v, block = 0.0, 0.0, []
+    x, v, before, block = 0.0, 0.0, floor(0.0), []
     for tick in range(1, 80_001):
-        u = (floor(tick * dt) - floor((tick - 1) * dt)) / dt
-        v += np.clip(u - v, -GRAVITY * dt, GRAVITY * dt)
+        now = floor(tick * dt)
+        u, before = (now - before) / dt, now
+        v += min(max(u - v, -GRAVITY * dt), GRAVITY * dt)
         x += v * dt
         if tick % 500 == 0:
             block.append(x)

@@ -1,5 +1,6 @@
 """Master curves against scipy's solvers, against limits, and against their own definitions."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -141,15 +142,14 @@ def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Flo
         ]
         return np.array([*(-d for d in along), du, gamma * x * np.cos(theta) * u])
 
-    def shoot(tip: float) -> Any:
+    def shoot(tip: float, rtol: float = 3e-14) -> Any:
         start = [tip, 0, 0, 0, 1, 1, 0]
-        return solve_ivp(rate, (0, 1), start, method="DOP853", rtol=3e-14, atol=1e-13, dense_output=True)
+        return solve_ivp(rate, (0, 1), start, method="DOP853", rtol=rtol, atol=3 * rtol, dense_output=True)
 
     # The branch from large weights: the angle at the free end is the least that brings the clamp upright.
-    tips = np.linspace(0.5, 5.0, 46)
-    ends = [shoot(tip).y[0, -1] for tip in tips]
-    first = next(i for i in range(45) if ends[i] < 0 < ends[i + 1])
-    found = shoot(brentq(lambda tip: shoot(tip).y[0, -1], tips[first], tips[first + 1], xtol=1e-15, rtol=1e-15))
+    ends = ((tip, shoot(tip, 1e-6).y[0, -1]) for tip in np.linspace(0.5, 5.0, 46))
+    low, high = next((a[0], b[0]) for a, b in pairwise(ends) if a[1] < 0 < b[1])
+    found = shoot(brentq(lambda tip: shoot(tip).y[0, -1], low, high, xtol=1e-15, rtol=1e-15))
     x = np.linspace(0, 1, 401)
     return found.sol(x)[4], found.sol(x)[5]
 
