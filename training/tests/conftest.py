@@ -294,21 +294,21 @@ def seen_rods(tmp_path_factory: pytest.TempPathFactory) -> MadeDataset:
     return write_rods(tmp_path_factory.mktemp("seen") / "v1", spec, rejected=(2,))
 
 
-@pytest.fixture
-def make_rods(tmp_path: Path) -> Callable[..., MadeDataset]:
+@pytest.fixture(scope="session")
+def make_rods(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., MadeDataset]:
     """Return a function that writes rods of `rod_spec(**changes)`."""
 
     def make(rejected: tuple[int, ...] = (), **changes: Any) -> MadeDataset:
-        return write_rods(tmp_path / f"rods-{len(list(tmp_path.iterdir()))}", rod_spec(**changes), rejected)
+        return write_rods(tmp_path_factory.mktemp("rods") / "v1", rod_spec(**changes), rejected)
 
     return make
 
 
-@pytest.fixture
-def make_clips(tmp_path: Path) -> Callable[..., MadeDataset]:
+@pytest.fixture(scope="session")
+def make_clips(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., MadeDataset]:
     """Return a function that writes clips of `cloth_spec(**changes)`."""
 
     def make(rejected: tuple[int, ...] = (), **changes: Any) -> MadeDataset:
-        return write_clips(tmp_path / f"clips-{len(list(tmp_path.iterdir()))}", cloth_spec(**changes), rejected)
+        return write_clips(tmp_path_factory.mktemp("clips") / "v1", cloth_spec(**changes), rejected)
 
     return make

@@ -8,9 +8,7 @@ from stickslip_training.cli.cloth import NO_ANSWER
 from stickslip_training.cloth.clips import read_clips
 from stickslip_training.cloth.crop import HEIGHT, WIDTH
 from stickslip_training.cloth.familiarity import ALARMS
-from stickslip_training.cloth.learner import ClothTraining, train_friction
-from stickslip_training.cloth.model import save_friction
-from stickslip_training.cloth.runs import load_runs
+from stickslip_training.cloth.model import WEIGHTS
 from stickslip_training.data.reader import DatasetReader
 from typer.testing import CliRunner
 
@@ -26,16 +24,6 @@ def packed(request):
 
 
 @pytest.fixture(scope="module")
-def model(packed, tmp_path_factory):
-    """A network after two steps: its answers have a form, and no worth."""
-    path = tmp_path_factory.mktemp("model") / "friction.safetensors"
-    runs = load_runs(packed)
-    some = [runs[np.arange(*bounds)] for bounds in ((0, 6), (6, 8))]
-    save_friction(path, train_friction(*some, ClothTraining(steps=2, batch_size=2, width=16), epoch=2))
-    return path
-
-
-@pytest.fixture
 def clips(make_clips):
     made = make_clips(rejected=(1,), axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0})
     made.edit_manifest(cameras=load_rig("drag"))
@@ -90,21 +78,21 @@ def test_the_clips_of_a_dataset_as_a_network_sees_them(clips):
     assert seen.mu.tolist() == [0.1, 0.1, 0.4]
 
 
-def test_what_cannot_be_measured_is_refused(model, clips, rods, make_clips):
+def test_what_cannot_be_measured_is_refused(clips, rods, make_clips):
     def refused(*command):
         result = runner.invoke(app, ["cloth", *command])
         assert result.exit_code == 1
         return result.stderr
 
     assert "kind of the dataset must be cloth_drag to measure friction: it is rod_hang" in refused(
-        "predict", str(rods.root), "--model", str(model)
+        "predict", str(rods.root), "--model", str(WEIGHTS)
     )
     short = make_clips(frames=2)
     assert "a clip must have a frame within 0.06 s of 25.00 s after the start; its nearest of 2 is" in refused(
-        "predict", str(short.root), "--model", str(model)
+        "predict", str(short.root), "--model", str(WEIGHTS)
     )
     assert "split must be one of train, validation, test, and is 'all'" in refused(
-        "predict", str(clips.root), "--model", str(model), "--split", "all"
+        "predict", str(clips.root), "--model", str(WEIGHTS), "--split", "all"
     )
     assert "splits train and validation must have simulations" in refused(
         "train", str(clips.root), "--out", str(clips.root / "out")

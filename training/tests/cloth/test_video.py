@@ -65,13 +65,18 @@ def film(shown, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def imported(film):
+    return import_video(film, LENS)
+
+
 def wanted_crops(run):
     direct = torch.from_numpy(pictures(run, np.array(INSTANTS) / RATE))[None]
     return cut(direct, holder_crops(Cameras.of([CAMERA]), INSTANTS))
 
 
-def test_start_shake_and_crops_are_found(film, run):
-    clip, found = import_video(film, LENS)
+def test_start_shake_and_crops_are_found(imported, run):
+    clip, found = imported
     assert found.start == pytest.approx(START, abs=0.03)
     assert found.residual < 0.3
     blind = (clip.crops - wanted_crops(run)).abs().mean()
@@ -135,9 +140,8 @@ def test_calibration_is_read_as_opencv_writes_it(tmp_path):
         load_camera(tmp_path / "camera.toml")
 
 
-def test_reasons_name_rule_and_value(film):
-    found = import_video(film, LENS)[1]
-    wrong = replace(found, residual=2.5, timing=math.nan, tilt=-9.0)
+def test_reasons_name_rule_and_value(imported):
+    wrong = replace(imported[1], residual=2.5, timing=math.nan, tilt=-9.0)
     assert [reason.split(" must")[0] for reason in wrong.refusals()] == [
         "the holders",
         "the start",

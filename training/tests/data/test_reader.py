@@ -106,6 +106,19 @@ def test_works_in_a_forked_child_after_use_in_the_parent(clips):
 # --- damage ---------------------------------------------------------------------------------------------------
 
 
+def is_told(root, shard):
+    """Return whether reading the array of a damaged shard, whole, raises."""
+    name = shard.relative_to(root).parts[0]
+    try:
+        reader = DatasetReader(root)
+        reader.read(name, reader.slots())
+        if name in reader.label_names:
+            reader.label(name)
+    except CorruptDataError:
+        return True
+    return False
+
+
 @pytest.mark.physics
 def test_no_flipped_bit_is_silent(clips, tmp_path):
     """Single flips anywhere in the files of shards and labels: 6 in each file, and 100 more."""
@@ -122,15 +135,7 @@ def test_no_flipped_bit_is_silent(clips, tmp_path):
         damaged = bytearray(intact)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
-        try:
-            reader = DatasetReader(made.root)
-            for name in reader.arrays:
-                reader.read(name, reader.slots())
-                if name in reader.label_names:
-                    reader.label(name)
-        except CorruptDataError:
-            pass
-        else:
+        if not is_told(made.root, path):
             silent.append((path.name, bit))
         path.write_bytes(intact)
     assert silent == []
@@ -265,16 +270,7 @@ def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
         a, b = pairs[place]
         a.write_bytes(content[b])
         b.write_bytes(content[a])
-        try:
-            reader = DatasetReader(made.root)
-            for name in reader.arrays:
-                reader.read(name, reader.slots())
-                if name in reader.label_names:
-                    reader.label(name)
-        except CorruptDataError:
-            pass
-        else:
-            silent += 1
+        silent += not (is_told(made.root, a) and is_told(made.root, b))
         a.write_bytes(content[a])
         b.write_bytes(content[b])
     assert len({path for pair in pairs for path in pair}) > 10
