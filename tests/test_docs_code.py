@@ -27,6 +27,7 @@ from stickslip_schemas.scene.document import Scene
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 RUN_ELSEWHERE = {"from-four-pngs.md"}  # test_docs.py runs it, and looks at what comes out
+LONG = {"README.md", "benchmark.md"}  # clips of two simulations, 245 rods; the tutorials make smaller datasets
 MOST_SKIPPED = 31  # deploy/, PostgreSQL and S3 need other machines; test_deploy.py checks commands of the first
 
 _RUN = ("python", "sh", "yaml")
@@ -78,8 +79,11 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if page.name not in RUN_ELSEWHERE and any(b.language in _RUN for b in blocks(page))],
-    ids=lambda page: page.name,
+    [
+        pytest.param(page, id=page.name, marks=pytest.mark.slow if page.name in LONG else ())
+        for page in PAGES
+        if page.name not in RUN_ELSEWHERE and any(b.language in _RUN for b in blocks(page))
+    ],
 )
 def test_every_block_runs(
     page: Path, service: Service, place: Path, monkeypatch: pytest.MonkeyPatch, rods: Path
