@@ -7,7 +7,7 @@ BLENDER_PY = .venv-blender/bin/python
 PIP_FLAGS = --quiet --disable-pip-version-check
 
 SOURCES = $(addsuffix /src,schemas services testing training workers workers/blender) sim_core/python examples benchmarks tools
-# One by one: test modules of different components have the same names. The other tests are not typed.
+# Modules of tests are named from here on: different components have some of the same name. The other tests are not typed.
 TESTS = $(addsuffix /tests,schemas services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml VERSION
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake sim_core/tests/core -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
@@ -88,7 +88,7 @@ check: setup
 	@for distribution in $(DISTRIBUTIONS); do (cd $$distribution && $(CURDIR)/$(PY) -m deptry --no-ansi .) || exit 1; done
 	@$(MAKE) --no-print-directory size
 	$(PY) -m mypy $(SOURCES)
-	@for tests in $(TESTS); do $(PY) -m mypy $$tests || exit 1; done
+	MYPYPATH=.:tests $(PY) -m mypy --explicit-package-bases $(TESTS)
 
 # The official library of LeRobot, which opens exports in a test; 8 GB.
 .venv-lerobot:
