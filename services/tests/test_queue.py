@@ -13,12 +13,12 @@ from stickslip_services.catalog.datasets import find_dataset
 from stickslip_services.database.paging import PageRequest
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
-from stickslip_services.queue.closing import held_tasks
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
+from stickslip_services.queue.ledger import LIVE, holds_alone
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
@@ -706,7 +706,7 @@ def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings
     with context.database.read() as connection:
         if connection.dialect.name == "sqlite":
             event.listen(connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3])))
-            assert held_tasks(connection, 1) == []
+            assert not holds_alone(connection, 1, LIVE)
             statement, values = asked[0]
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
             assert "INDEX ix_tasks_leased" in str(plan)

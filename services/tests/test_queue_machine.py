@@ -17,7 +17,7 @@ from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
-from stickslip_services.queue.ledger import runnable_tasks
+from stickslip_services.queue.ledger import RUNNABLE, live_jobs
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.sweep import start, sweep
@@ -261,7 +261,7 @@ class QueueMachine(RuleBasedStateMachine):
         """Return whether a job that may run needs the task."""
         with self.context.database.read() as connection:
             seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
-            return seq is not None and bool(runnable_tasks(connection, [seq]))
+            return seq is not None and bool(live_jobs(connection, [seq], RUNNABLE))
 
     def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
         """Return whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""

@@ -20,8 +20,7 @@ from stickslip_schemas.documents.responses import EventName, JobProgressEvent
 from stickslip_services.access.asker import this_asker
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import StoredEvent, read_events
-from stickslip_services.queue.jobs import show_job
+from stickslip_services.queue.jobs import StoredEvent, read_events, show_job
 
 RECONNECT_MILLISECONDS = 1000
 KEEP_ALIVE_SECONDS = 15.0

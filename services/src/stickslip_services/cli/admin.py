@@ -4,10 +4,13 @@ These commands open the database of a data directory, also while the coordinator
 may write the data directory may make keys.
 """
 
+import functools
 import time
 from collections.abc import Callable
+from typing import Any
 
 import click
+from sqlalchemy import Connection
 
 from stickslip_services.access import audit_log as audit
 from stickslip_services.access import keys as stored_keys
@@ -21,8 +24,14 @@ webhook_argument = click.argument("webhook", help="id, as `stickslip webhooks li
 
 
 def administers(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of a coordinator's database, and show its errors."""
-    return shows_errors(options("data", "database")(command))
+    """Give a command a write transaction on a coordinator's database, and show its errors."""
+
+    @functools.wraps(command)
+    def run(settings: Settings, **given: Any) -> None:
+        with audit.visited(settings) as connection:
+            command(connection, **given)
+
+    return shows_errors(options("data", "database")(run))
 
 
 @click.group()
@@ -43,10 +52,9 @@ def keys() -> None:
     "--project", default="", help="project of the jobs that it submits: projects share leases, and may have quotas"
 )
 @administers
-def create_key(settings: Settings, name: str, scope: tuple[Scope, ...], project: str) -> None:
+def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], project: str) -> None:
     """Make a key and print it. It is shown only once, because the database keeps only its digest."""
-    with audit.visited(settings) as connection:
-        key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
+    key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
     say(f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
     say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
@@ -54,10 +62,8 @@ def create_key(settings: Settings, name: str, scope: tuple[Scope, ...], project:
 
 @keys.command("list")
 @administers
-def list_keys(settings: Settings) -> None:
+def list_keys(connection: Connection) -> None:
     """List all keys, newest first, including revoked ones."""
-    with audit.visited(settings) as connection:
-        found = stored_keys.list_keys(connection)
     rows = (
         (
             key.id,
@@ -67,7 +73,7 @@ def list_keys(settings: Settings) -> None:
             key.project,
             f"{key.created_at:%Y-%m-%d %H:%M}",
         )
-        for key in found
+        for key in stored_keys.list_keys(connection)
     )
     print_table(("key", "name", "revoked", "scopes", "project", "made"), rows)
 
@@ -75,10 +81,9 @@ def list_keys(settings: Settings) -> None:
 @keys.command("revoke")
 @click.argument("key_id", metavar="KEY", help="id of a key, as `stickslip keys list` shows it")
 @administers
-def revoke_key(settings: Settings, key_id: str) -> None:
+def revoke_key(connection: Connection, key_id: str) -> None:
     """Revoke a key. A running coordinator refuses it within a second."""
-    with audit.visited(settings) as connection:
-        stored_keys.revoke_key(connection, key_id, time.time())
+    stored_keys.revoke_key(connection, key_id, time.time())
     click.echo(f"{key_id} is revoked")
 
 
@@ -89,12 +94,10 @@ def projects() -> None:
 
 @projects.command("list")
 @administers
-def list_projects(settings: Settings) -> None:
+def list_projects(connection: Connection) -> None:
     """List projects with their quotas, and the jobs and samples in progress that count against them."""
-    with audit.visited(settings) as connection:
-        found = stored_projects.list_projects(connection)
     rows = []
-    for project in found:
+    for project in stored_projects.list_projects(connection):
         limits = _limit(project.max_jobs), _limit(project.max_samples)
         rows.append((project.name or "(none)", f"{project.jobs:,}", limits[0], f"{project.samples:,}", limits[1]))
     print_table(("project", "jobs", "at most", "samples", "at most"), rows)
@@ -105,10 +108,9 @@ def list_projects(settings: Settings) -> None:
 @click.option("--samples", type=click.IntRange(0), help="most samples of jobs in progress; default: any number")
 @click.option("--jobs", type=click.IntRange(0), help="most jobs in progress; default: any number")
 @administers
-def set_quota(settings: Settings, name: str, samples: int | None, jobs: int | None) -> None:
+def set_quota(connection: Connection, name: str, samples: int | None, jobs: int | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
-    with audit.visited(settings) as connection:
-        stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
+    stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
     click.echo(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
 
@@ -125,7 +127,8 @@ def webhooks() -> None:
 @webhooks.command("create")
 @click.argument("url", help="receiver of the events: https://..., or http:// on this machine")
 @click.option("--project", default="", help="project whose jobs it hears of; default: jobs without one")
-@administers
+@shows_errors
+@options("data", "database")
 def create_webhook(settings: Settings, url: str, project: str) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
     with audit.visited(settings) as connection:
@@ -137,12 +140,10 @@ def create_webhook(settings: Settings, url: str, project: str) -> None:
 
 @webhooks.command("list")
 @administers
-def list_webhooks(settings: Settings) -> None:
+def list_webhooks(connection: Connection) -> None:
     """List webhooks, newest first, with their faults."""
-    with audit.visited(settings) as connection:
-        found = stored_webhooks.list_webhooks(connection, time.time())
     rows = []
-    for webhook in found:
+    for webhook in stored_webhooks.list_webhooks(connection, time.time()):
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
         made = f"{webhook.created_at:%Y-%m-%d %H:%M}"
         rows.append((webhook.id, webhook.url, str(webhook.failures), webhook.project, made, fault))
@@ -152,20 +153,18 @@ def list_webhooks(settings: Settings) -> None:
 @webhooks.command("retry")
 @webhook_argument
 @administers
-def retry_webhook(settings: Settings, webhook: str) -> None:
+def retry_webhook(connection: Connection, webhook: str) -> None:
     """Send again at once, also after the webhook was given up. No event since then is left out."""
-    with audit.visited(settings) as connection:
-        stored_webhooks.retry_webhook(connection, webhook, time.time())
+    stored_webhooks.retry_webhook(connection, webhook, time.time())
     click.echo(f"{webhook} is tried again")
 
 
 @webhooks.command("delete")
 @webhook_argument
 @administers
-def delete_webhook(settings: Settings, webhook: str) -> None:
+def delete_webhook(connection: Connection, webhook: str) -> None:
     """Delete a webhook."""
-    with audit.visited(settings) as connection:
-        stored_webhooks.delete_webhook(connection, webhook, time.time())
+    stored_webhooks.delete_webhook(connection, webhook, time.time())
     click.echo(f"{webhook} is deleted")
 
 
@@ -174,10 +173,9 @@ def delete_webhook(settings: Settings, webhook: str) -> None:
 @click.option("--limit", type=click.IntRange(1), default=100, help="most entries to show")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON document a line, for programs")
 @administers
-def audit_log(settings: Settings, subject: str | None, limit: int, as_json: bool) -> None:
+def audit_log(connection: Connection, subject: str | None, limit: int, as_json: bool) -> None:
     """Show who changed what and when, newest first."""
-    with audit.visited(settings) as connection:
-        entries = audit.read_audit_log(connection, subject=subject, limit=limit)
+    entries = audit.read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
             click.echo(entry.model_dump_json())

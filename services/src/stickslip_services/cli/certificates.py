@@ -4,7 +4,6 @@ from pathlib import Path
 
 import click
 from click.exceptions import Exit
-from stickslip_schemas.documents.responses import CertificateEntry
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_schemas.spec.jobs import PresetName
 
@@ -21,7 +20,7 @@ PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
 @click.option("--out", type=FILE, help="folder for the certificate (certificates/PRESET)")
 @click.option("--quick", is_flag=True, help="measure a few points only, in seconds; such a certificate does not count")
 @asks
-def certify(preset: str, out: Path | None, quick: bool, url: str) -> None:
+def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
     """Measure a preset on the physical protocols, and register the certificate with the coordinator.
 
     A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this build and preset
@@ -36,38 +35,36 @@ def certify(preset: str, out: Path | None, quick: bool, url: str) -> None:
         click.echo(f"A quick run does not count. To certify the preset: stickslip certify --preset {preset}")
     else:
         click.echo(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {written}")
+    client.patience = 1.0
     try:
-        with Client(url, patience=1.0) as client:
-            _say_registered(client.register(making.read_certificate(directory)), url)
+        _register(client, directory)
     except UnreachableError:
-        click.echo(f"no coordinator answers at {url}; later: stickslip register {directory}")
+        click.echo(f"no coordinator answers at {client.url}; later: stickslip register {directory}")
     raise Exit(0 if certificate.passed else 1)
 
 
 @click.command()
 @click.argument("directory", metavar="DIR", type=FILE, help="what `stickslip certify` wrote")
 @asks
-def register(directory: Path, url: str) -> None:
+def register(client: Client, directory: Path) -> None:
     """Register a certificate that was measured without a running coordinator."""
-    certificate = making.read_certificate(directory)
-    with Client(url) as client:
-        _say_registered(client.register(certificate), url)
+    _register(client, directory)
 
 
-def _say_registered(entry: CertificateEntry, url: str) -> None:
-    click.echo(f"certificate {entry.digest} is registered: {url.rstrip('/')}/certificates/{entry.digest}")
+def _register(client: Client, directory: Path) -> None:
+    entry = client.register(making.read_certificate(directory))
+    click.echo(f"certificate {entry.digest} is registered: {client.url}/certificates/{entry.digest}")
 
 
 @click.command()
 @json_option
 @asks
-def certificates(url: str, as_json: bool) -> None:
+def certificates(client: Client, as_json: bool) -> None:
     """List certificates, newest first, and compare their builds with those of the connected workers."""
-    with Client(url) as client:
-        found = list(client.certificates())
-        if as_json:
-            return print_json(found)
-        builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
+    found = list(client.certificates())
+    if as_json:
+        return print_json(found)
+    builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
     rows = (
         (
             entry.digest[:16],

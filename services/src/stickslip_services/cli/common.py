@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.specs import field_line
 from stickslip_services.client.errors import ClientError, MissingExtraError, ProblemError, UnreachableError
+from stickslip_services.client.http import Client
 from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")
@@ -30,7 +31,7 @@ ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "
 _LEAST_SENTENCE = 30
 """Least width of a column of sentences [characters]."""
 
-url_option = click.option("--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, help="where the coordinator is")
+_url_option = click.option("--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, help="where the coordinator is")
 json_option = click.option("--json", "as_json", is_flag=True, help="print JSON for programs")
 spec_argument = click.argument("file", type=FILE, help="a JobSpec, YAML or JSON")
 job_argument = click.argument("job_id", metavar="JOB", help="id of a job")
@@ -131,9 +132,15 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-def asks(command: Callable[P, R]) -> Callable[P, R]:
-    """Give a command the option `--url` of a coordinator, and show its errors."""
-    return url_option(shows_errors(command))
+def asks(command: Callable[..., R]) -> Callable[..., R]:
+    """Give a command a client of the coordinator at `--url`, and show its errors."""
+
+    @functools.wraps(command)
+    def run(url: str, **options: Any) -> R:
+        with Client(url) as client:
+            return command(client, **options)
+
+    return _url_option(shows_errors(run))
 
 
 def _print_error(message: str) -> None:

@@ -13,7 +13,6 @@ from click.exceptions import Exit
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
-from stickslip_services.addresses import coordinator_url
 from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table, say, shows_errors
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.http import Client
@@ -31,10 +30,9 @@ allowed_signers_option = click.option(
 @click.command()
 @json_option
 @asks
-def datasets(url: str, as_json: bool) -> None:
+def datasets(client: Client, as_json: bool) -> None:
     """List datasets and their versions, newest first."""
-    with Client(url) as client:
-        found = list(client.datasets())
+    found = list(client.datasets())
     if as_json:
         return print_json(found)
     rows = (
@@ -62,13 +60,13 @@ def datasets(url: str, as_json: bool) -> None:
 @allowed_signers_option
 @asks
 def pull_dataset(
+    client: Client,
     dataset: str,
     target: Path,
     arrays: str | None,
     split: str | None,
     where: tuple[str, ...],
     allowed_signers: Path | None,
-    url: str,
 ) -> None:
     """Download a dataset or a part of it. Every file is checked, and intact files are not downloaded again.
 
@@ -79,25 +77,24 @@ def pull_dataset(
         selection = Selection.of_options(arrays, split, where)
     except ValueError as error:
         raise ClientError(str(error)) from error
-    with Client(url) as client:
-        name, version = _resolve(client, dataset)
-        counting = Lock()  # files are downloaded by several threads
-        with click.progressbar(length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr) as bar:
+    name, version = _resolve(client, dataset)
+    counting = Lock()  # files are downloaded by several threads
+    with click.progressbar(length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr) as bar:
 
-            def on_bytes(count: int) -> None:
-                with counting:
-                    bar.update(count)
+        def on_bytes(count: int) -> None:
+            with counting:
+                bar.update(count)
 
-            done = pull(
-                client,
-                name,
-                version,
-                target,
-                selection=selection,
-                allowed_signers=allowed_signers,
-                on_plan=lambda _files, count: setattr(bar, "length", count),
-                on_bytes=on_bytes,
-            )
+        done = pull(
+            client,
+            name,
+            version,
+            target,
+            selection=selection,
+            allowed_signers=allowed_signers,
+            on_plan=lambda _files, count: setattr(bar, "length", count),
+            on_bytes=on_bytes,
+        )
     there = done.files - done.downloaded_files
     click.echo(
         f"{name}:v{version} is in {target}: {done.downloaded_files} files downloaded "
@@ -107,16 +104,16 @@ def pull_dataset(
 
 
 @click.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
-@click.pass_context
 @asks
-def export(context: click.Context, url: str) -> None:
+def export(client: Client) -> None:
     """Export a dataset to a format of another library.
 
     Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes the URL of a version.
     """
     if find_spec("stickslip_training") is None:
         raise ClientError("`stickslip export` needs the training package: pip install 'stickslip-training[export]'")
-    arguments = [_version_url(argument, url) if _ID.match(argument) else argument for argument in context.args]
+    given = click.get_current_context().args
+    arguments = [_version_url(client, argument) if _ID.match(argument) else argument for argument in given]
     key = os.environ.get("STICKSLIP_KEY")
     ended = subprocess.run(
         [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
@@ -126,10 +123,9 @@ def export(context: click.Context, url: str) -> None:
     raise Exit(ended.returncode)
 
 
-def _version_url(dataset: str, url: str) -> str:
-    with Client(url) as client:
-        name, version = _resolve(client, dataset)
-    return f"{coordinator_url(url)}/v1/datasets/{name}/versions/{version}"
+def _version_url(client: Client, dataset: str) -> str:
+    name, version = _resolve(client, dataset)
+    return f"{client.url}/v1/datasets/{name}/versions/{version}"
 
 
 _ID = re.compile(r"ds-[0-9a-f]{16}(:|$)")

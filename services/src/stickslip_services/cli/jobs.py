@@ -55,16 +55,15 @@ PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of on
 @spec_argument
 @json_option
 @asks
-def validate(file: Path, url: str, as_json: bool) -> None:
+def validate(client: Client, file: Path, as_json: bool) -> None:
     """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused. Works offline."""
     document, files = read_job(file)
     spec = check_spec(document, file)
     try:
-        with Client(url) as client:
-            _upload(client, spec, files)
-            answer = client.validate(document)
+        _upload(client, spec, files)
+        answer = client.validate(document)
     except UnreachableError:
-        return _validate_offline(spec, url, as_json=as_json)
+        return _validate_offline(spec, client.url, as_json=as_json)
     refused = answer.refusal is not None
     if as_json:
         print_json(answer)
@@ -116,18 +115,17 @@ def _counts(counts: Counts | Validation, spec: JobSpec) -> Iterator[tuple[str, s
 @click.option("--idempotency-key", help="a key that you choose; two submissions with the same key make one job")
 @click.option("--priority", type=PRIORITY, default=0, help=PRIORITY_HELP)
 @asks
-def submit(file: Path, url: str, then_watch: bool, idempotency_key: str | None, priority: int) -> None:
+def submit(client: Client, file: Path, then_watch: bool, idempotency_key: str | None, priority: int) -> None:
     """Submit a job and print its id."""
     document, files = read_job(file)
-    with Client(url) as client:
-        if files:
-            _upload(client, check_spec(document, file), files)
-        job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
-        click.echo(job.id)
-        if not then_watch:
-            say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
-        else:
-            raise Exit(0 if watch(client, job.id) in GOOD else 1)
+    if files:
+        _upload(client, check_spec(document, file), files)
+    job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
+    click.echo(job.id)
+    if not then_watch:
+        say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
+    else:
+        raise Exit(0 if watch(client, job.id) in GOOD else 1)
 
 
 @click.command()
@@ -137,10 +135,9 @@ def submit(file: Path, url: str, then_watch: bool, idempotency_key: str | None, 
 @click.option("--state", type=click.Choice(JobState), help="only jobs in this state")
 @click.option("--project", default="", help="only jobs of this project")
 @asks
-def jobs(url: str, as_json: bool, limit: int, search: str, state: JobState | None, project: str) -> None:
+def jobs(client: Client, as_json: bool, limit: int, search: str, state: JobState | None, project: str) -> None:
     """List jobs, newest first."""
-    with Client(url) as client:
-        found = list(islice(client.jobs(search=search, state=state, project=project), limit))
+    found = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
         return print_json(found)
     rows = (
@@ -164,14 +161,13 @@ def jobs(url: str, as_json: bool, limit: int, search: str, state: JobState | Non
 @job_argument
 @json_option
 @asks
-def show(job_id: str, url: str, as_json: bool) -> None:
+def show(client: Client, job_id: str, as_json: bool) -> None:
     """Show the state and progress of a job, and its rejected samples with reasons."""
-    with Client(url) as client:
-        job = client.job(job_id)
-        if as_json:
-            return print_json(job)
-        rejects = client.samples(job_id, state=TaskState.rejected) if job.rejected_count else iter(())
-        shown = list(islice(rejects, SHOWN_REJECTS))
+    job = client.job(job_id)
+    if as_json:
+        return print_json(job)
+    rejects = client.samples(job_id, state=TaskState.rejected) if job.rejected_count else iter(())
+    shown = list(islice(rejects, SHOWN_REJECTS))
     print_fields(_fields(job))
     if shown:
         click.secho(f"rejected samples ({job.rejected_count})", italic=True)
@@ -216,38 +212,33 @@ def _fields(job: JobDetail) -> Iterator[tuple[str, str]]:
 @click.command()
 @job_argument
 @asks
-def watch_job(job_id: str, url: str) -> None:
+def watch_job(client: Client, job_id: str) -> None:
     """Watch a job until it ends; exit with 0 if it succeeded, else 1."""
-    with Client(url) as client:
-        state = watch(client, job_id)
-    raise Exit(0 if state in GOOD else 1)
+    raise Exit(0 if watch(client, job_id) in GOOD else 1)
 
 
 def watch(client: Client, job_id: str) -> JobState:
     """Show the progress of a job until it ends; return its final state."""
     job = client.job(job_id)
+    view, state = _Lines(job.sample_count), job.state
     try:
-        return _follow(client, job_id, _Lines(job.sample_count), job.state)
+        for event in client.events(job_id):
+            match event:
+                case JobProgressEvent():
+                    view.progress(event.progress)
+                case JobStateEvent():
+                    state = event.state
+                    view.line(f"{job_id}: {wording.state(state)}{_because(event.message)}")
+                case TaskStateEvent():
+                    view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
+                case DatasetPublishedEvent():
+                    name = wording.dataset(event.dataset)
+                    view.line(f"published {click.style(name, bold=True)}")
+                    view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
+                    view.line(f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}")
     except KeyboardInterrupt:
         say(f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}")
         raise Exit(130) from None
-
-
-def _follow(client: Client, job_id: str, view: "_Lines", state: JobState) -> JobState:
-    for event in client.events(job_id):
-        match event:
-            case JobProgressEvent():
-                view.progress(event.progress)
-            case JobStateEvent():
-                state = event.state
-                view.line(f"{job_id}: {wording.state(state)}{_because(event.message)}")
-            case TaskStateEvent():
-                view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
-            case DatasetPublishedEvent():
-                name = wording.dataset(event.dataset)
-                view.line(f"published {click.style(name, bold=True)}")
-                view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
-                view.line(f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}")
     return state
 
 
@@ -278,30 +269,27 @@ class _Lines:
 @click.command()
 @job_argument
 @asks
-def cancel(job_id: str, url: str) -> None:
+def cancel(client: Client, job_id: str) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
-    with Client(url) as client:
-        job = client.cancel(job_id)
+    job = client.cancel(job_id)
     click.echo(f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: results are cached")
 
 
 @click.command()
 @job_argument
 @asks
-def pause(job_id: str, url: str) -> None:
+def pause(client: Client, job_id: str) -> None:
     """Pause a job: no further task is started, and running tasks finish."""
-    with Client(url) as client:
-        job = client.pause(job_id)
+    job = client.pause(job_id)
     click.echo(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
 
 
 @click.command()
 @job_argument
 @asks
-def resume(job_id: str, url: str) -> None:
+def resume(client: Client, job_id: str) -> None:
     """Resume a paused job."""
-    with Client(url) as client:
-        job = client.resume(job_id)
+    job = client.resume(job_id)
     click.echo(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")
 
 
@@ -309,10 +297,9 @@ def resume(job_id: str, url: str) -> None:
 @job_argument
 @click.argument("priority", type=PRIORITY, help=PRIORITY_HELP)
 @asks
-def prioritise(job_id: str, priority: int, url: str) -> None:
+def prioritise(client: Client, job_id: str, priority: int) -> None:
     """Change the priority of a job, from its next task on. Running tasks continue."""
-    with Client(url) as client:
-        job = client.prioritise(job_id, priority)
+    job = client.prioritise(job_id, priority)
     click.echo(f"{job.id} has priority {job.priority}")
 
 
@@ -329,20 +316,19 @@ def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
 @click.argument("files", type=FILE, nargs=-1, required=True, help="PNG or JPEG files; files of scenes")
 @json_option
 @asks
-def upload(files: tuple[Path, ...], url: str, as_json: bool) -> None:
+def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
     """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes; print the references that specs use."""
     found: list[TextureEntry | FileUpload] = []
-    with Client(url) as client:
-        for file in files:
-            try:
-                data = file.read_bytes()
-            except OSError as error:
-                raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
-            is_scene_file = file.suffix.lower() in (".obj", ".npz", ".csv")
-            try:
-                found.append(client.upload_file(data) if is_scene_file else client.upload_texture(data))
-            except ClientError as error:
-                raise ClientError(f"{file} was refused: {error}") from error
+    for file in files:
+        try:
+            data = file.read_bytes()
+        except OSError as error:
+            raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
+        is_scene_file = file.suffix.lower() in (".obj", ".npz", ".csv")
+        try:
+            found.append(client.upload_file(data) if is_scene_file else client.upload_texture(data))
+        except ClientError as error:
+            raise ClientError(f"{file} was refused: {error}") from error
     if as_json:
         return print_json(found)
     say("In a spec, under any names:")

@@ -12,10 +12,9 @@ from stickslip_services.units import duration
 @click.command()
 @json_option
 @asks
-def workers(url: str, as_json: bool) -> None:
+def workers(client: Client, as_json: bool) -> None:
     """List the registered workers, newest first."""
-    with Client(url) as client:
-        found = client.workers()
+    found = client.workers()
     if as_json:
         return print_json(found)
     rows, now = [], datetime.now(UTC)

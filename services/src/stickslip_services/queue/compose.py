@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, select
@@ -24,7 +23,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
 from stickslip_services.queue.ids import task_id, task_key
-from stickslip_services.queue.ledger import KeyedTask
+from stickslip_services.queue.ledger import TASK
 from stickslip_services.queue.recompute import check_results, check_samples, read_plan
 
 UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError, TypeError)
@@ -34,29 +33,24 @@ Publish = Callable[[bytes], Sha256]
 """Stores an artifact and returns its digest."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoredTask(KeyedTask):
-    """A task with all that defines its document."""
-
-    build: str
-    payload: str
-    preview: bool
+STORED_TASK = [*TASK, *(tasks.c[name] for name in ("key", "build", "payload", "preview"))]
+"""Columns of a task from which its document is composed."""
 
 
-def compose_tasks(connection: Connection, stored: Sequence[StoredTask], publish: Publish) -> dict[int, AnyTask]:
+def compose_tasks(connection: Connection, stored: Sequence[Any], publish: Publish) -> dict[int, AnyTask]:
     """Return the documents of tasks by `seq`; all their dependencies must be settled.
 
     Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with `publish`, which takes a
     while: do not call this in a write transaction.
     """
-    renders = [task for task in stored if task.stage is Stage.render]
+    renders = [task for task in stored if task.stage == Stage.render]
     composed = _render_tasks(connection, renders) if renders else {}
     for task in stored:
-        if task.stage is Stage.simulate:
+        if task.stage == Stage.simulate:
             composed[task.seq] = _simulate_task(task)
-        elif task.stage is Stage.pack:
+        elif task.stage == Stage.pack:
             composed[task.seq] = _pack_task(connection, task)
-        elif task.stage is Stage.publish:
+        elif task.stage == Stage.publish:
             composed[task.seq] = _publish_task(connection, task, publish)
     return composed
 
@@ -73,21 +67,21 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:
         raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
-    return compose_tasks(connection, [StoredTask.of(row)], publish)[row.seq]
+    return compose_tasks(connection, [row], publish)[row.seq]
 
 
-def _simulate_task(task: StoredTask) -> AnyTask:
+def _simulate_task(task: Any) -> AnyTask:
     _check_key(task, content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}))
     return task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}')
 
 
-def _check_key(task: StoredTask, key: Sha256) -> None:
+def _check_key(task: Any, key: Sha256) -> None:
     """Raise DamagedRowsError where a task is not what its content key says."""
     if task.key.hex() != key:
         raise DamagedRowsError
 
 
-def _render_tasks(connection: Connection, group: list[StoredTask]) -> dict[int, AnyTask]:
+def _render_tasks(connection: Connection, group: list[Any]) -> dict[int, AnyTask]:
     seqs = [task.seq for task in group]
     edges = [
         (row.task, row.depends_on)
@@ -138,7 +132,7 @@ def _samples(connection: Connection, job: int, first: int, end: int) -> list[Any
     return rows
 
 
-def _pack_task(connection: Connection, task: StoredTask) -> PackTask:
+def _pack_task(connection: Connection, task: Any) -> PackTask:
     payload = json.loads(task.payload)
     spec, terms = read_plan(connection, payload["job"])
     first = payload["shard"] * spec.samples_per_shard
@@ -171,7 +165,7 @@ def _slots(connection: Connection, rows: Sequence[Any]) -> list[dict[str, Any]]:
     return slots
 
 
-def _publish_task(connection: Connection, task: StoredTask, publish: Publish) -> PublishTask:
+def _publish_task(connection: Connection, task: Any, publish: Publish) -> PublishTask:
     payload = json.loads(task.payload)
     job = payload["job"]
     spec, terms = read_plan(connection, job)
@@ -229,7 +223,7 @@ def _rejection(sample: Any, task: Any) -> dict[str, Any]:
     }
 
 
-def reserve_version(connection: Connection, task: StoredTask) -> None:
+def reserve_version(connection: Connection, task: Any) -> None:
     """Reserve the version number of a publish task, for good, so that no other task takes it."""
     with suppress(*UNSOUND):  # composing it finds the damage
         if find_reserved(connection, task.seq) is None:

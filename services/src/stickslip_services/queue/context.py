@@ -12,8 +12,7 @@ from stickslip_schemas.store import Store, open_store
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import connect
-from stickslip_services.queue.closing import ledger
-from stickslip_services.queue.ledger import Ledger
+from stickslip_services.queue.ledger import Ledger, ledger
 from stickslip_services.queue.store_watch import StoreWatch
 from stickslip_services.settings import Settings
 

@@ -1,6 +1,6 @@
 """Control of jobs: cancel, pause, resume and prioritise them. Each change is one transaction with an audit entry.
 
-Only the tasks of a cancelled job are given up in more transactions, since a job of a million has millions.
+Only the tasks of a job that ends are given up in more transactions, since a job of a million has millions.
 """
 
 import time
@@ -17,9 +17,8 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import find_job, show_job
-from stickslip_services.queue.ledger import RUNNABLE, Ledger, charge_waiting_tasks, give_up_piece
+from stickslip_services.queue.ledger import RUNNABLE, Ledger, give_up, reassign_waiting
 from stickslip_services.queue.planner import plan_waiting_jobs
 from stickslip_services.queue.workers import NO_WORKER, note_stranded
 
@@ -31,8 +30,8 @@ def cancel_job(context: Context, job_id: str) -> JobDetail:
             if not JobState(job.state).is_open:
                 raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
             message = "tasks that are running are being stopped"
-            set_job_state(book, job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
-            _give_up_more(book, job.seq, 0)
+            book.set_state(job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
+            give_up(book, job.seq)
     return _shown(context, job.seq)
 
 
@@ -40,7 +39,7 @@ _TO_GIVE_UP = Prepared(select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up
 
 
 def give_up_waiting(context: Context) -> None:
-    """Give up the remaining waiting tasks of cancelled jobs, piece by piece, with pauses for other writers."""
+    """Give up the remaining waiting tasks of jobs that end, piece by piece, with pauses for other writers."""
     while not context.is_closing:
         with context.database.read() as connection:
             if not _TO_GIVE_UP.tuples(connection):
@@ -48,13 +47,8 @@ def give_up_waiting(context: Context) -> None:
         began = time.monotonic()
         with context.ledger() as book:
             for job, after in _TO_GIVE_UP.tuples(book.connection):
-                _give_up_more(book, job, after)
+                give_up(book, job, after)
         time.sleep(time.monotonic() - began)
-
-
-def _give_up_more(book: Ledger, job: int, after: int) -> None:
-    last = give_up_piece(book, job, after)
-    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
 
 
 def pause_job(context: Context, job_id: str) -> JobDetail:
@@ -67,8 +61,8 @@ def pause_job(context: Context, job_id: str) -> JobDetail:
             )
         if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
             message = "nothing more is started; tasks that are running finish"
-            set_job_state(book, job.seq, JobState.pausing, message=message)
-            charge_waiting_tasks(book.connection, job.seq)
+            book.set_state(job.seq, JobState.pausing, message=message)
+            reassign_waiting(book, job.seq)
     return _shown(context, job.seq)
 
 
@@ -92,7 +86,7 @@ def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
         if not JobState(job.state).is_open:
             raise ConflictError(f"job {job_id} has ended ({job.state}); its priority cannot be changed")
         book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
-        charge_waiting_tasks(book.connection, job.seq)
+        reassign_waiting(book, job.seq)
     return _shown(context, job.seq)
 
 
@@ -100,8 +94,8 @@ def hold_jobs(book: Ledger, trouble: str) -> None:
     """Pause all runnable jobs because the store takes no results."""
     message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
     for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
-        set_job_state(book, seq, JobState.pausing, reason=Reason.store_unavailable, message=message)
-        charge_waiting_tasks(book.connection, seq)
+        book.set_state(seq, JobState.pausing, reason=Reason.store_unavailable, message=message)
+        reassign_waiting(book, seq)
 
 
 def release_jobs(book: Ledger) -> None:
@@ -140,8 +134,8 @@ def _resume(book: Ledger, job: Row[Any]) -> None:
     if job.builds is not None and job.planned < job.sample_count:
         state = JobState.planning
     reason, message = (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
-    set_job_state(book, job.seq, state, reason=reason, message=message)
-    charge_waiting_tasks(book.connection, job.seq)
+    book.set_state(job.seq, state, reason=reason, message=message)
+    reassign_waiting(book, job.seq)
 
 
 def _shown(context: Context, job: int) -> JobDetail:

@@ -16,9 +16,10 @@ from stickslip_schemas.base.states import Stage, TaskState
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, jobs, tasks
-from stickslip_services.queue.compose import StoredTask, reserve_version
+from stickslip_services.queue.compose import STORED_TASK, reserve_version
 from stickslip_services.queue.eta import Cost, Group, limit_seconds, long_groups, read_costs
-from stickslip_services.queue.ledger import LIVE, READY, RUNNABLE, Ledger
+from stickslip_services.queue.ids import task_id
+from stickslip_services.queue.ledger import LIVE, ON_LEASE, READY, RUNNABLE, Ledger
 from stickslip_services.queue.workers import RegisteredWorker
 from stickslip_services.settings import Settings
 
@@ -35,9 +36,7 @@ _READY_TASK = Prepared(
     .limit(1)
 )
 _READY_TASKS = Prepared(
-    select(
-        *StoredTask.columns(), *(tasks.c[name] for name in ("job", "kind", "cost_group", "tries", "token", "attempts"))
-    )
+    select(*STORED_TASK, *(tasks.c[name] for name in ("kind", "cost_group", "tries", "token", "attempts")))
     .where(*_OF_GROUP, tasks.c.job == bindparam("b_job"))
     .order_by(tasks.c.seq)
     .limit(bindparam("b_count"))
@@ -47,9 +46,7 @@ _JOBS_WITH_PENDING = Prepared(
         job_counts.c.job,
         jobs.c.project,
         jobs.c.priority,
-        func.coalesce(
-            func.sum(job_counts.c.count).filter(job_counts.c.state.in_((TaskState.leased, TaskState.running))), 0
-        ),
+        func.coalesce(func.sum(job_counts.c.count).filter(job_counts.c.state.in_(ON_LEASE)), 0),
     )
     .join(jobs, jobs.c.seq == job_counts.c.job)
     .where(jobs.c.state.in_(RUNNABLE), job_counts.c.stage == bindparam("b_stage"))
@@ -59,11 +56,7 @@ _JOBS_WITH_PENDING = Prepared(
 _ON_LEASE = Prepared(
     select(jobs.c.project, func.sum(job_counts.c.count))
     .join(jobs, jobs.c.seq == job_counts.c.job)
-    .where(
-        jobs.c.state.in_(LIVE),
-        job_counts.c.stage == bindparam("b_stage"),
-        job_counts.c.state.in_((TaskState.leased, TaskState.running)),
-    )
+    .where(jobs.c.state.in_(LIVE), job_counts.c.stage == bindparam("b_stage"), job_counts.c.state.in_(ON_LEASE))
     .group_by(jobs.c.project)
 )
 _LEASE = Prepared(
@@ -101,10 +94,10 @@ def has_ready_task(
 
 def grant_leases(
     book: Ledger, worker: RegisteredWorker, wanted: dict[Stage, int], settings: Settings, *, at_most: float | None
-) -> list[tuple[StoredTask, dict[str, Any]]]:
+) -> list[tuple[Any, dict[str, Any]]]:
     """Lease up to the wanted number of tasks of each stage to `worker`; none known to take over `at_most` seconds.
 
-    Return the tasks, each with the other fields of its `Lease`.
+    Return the tasks (see `STORED_TASK`), each with the other fields of its `Lease`.
     """
     granted: list[Any] = []
     costs = read_costs(book.connection)
@@ -114,15 +107,15 @@ def grant_leases(
             granted.extend(_pick(book.connection, worker, stage, count, costs, at_most))
     lease = {"b_owner": worker.id, "b_expires_at": book.now + settings.lease_seconds}
     _LEASE.run_all(book.connection, [{"b_seq": row.seq, "b_token": row.token + 1, **lease} for row in granted])
+    book.moved(granted, TaskState.leased)
     grants = []
     for row in granted:
-        task, cost = StoredTask.of(row), costs.get((row.stage, row.kind, row.cost_group))
+        cost = costs.get((row.stage, row.kind, row.cost_group))
         limit = limit_seconds(cost, row.tries, floor=settings.limit_floor_seconds)
-        terms = {"task_id": task.name, "token": row.token + 1, "attempt": row.attempts + 1, "limit_seconds": limit}
-        grants.append((task, terms))
-        book.moved(task, TaskState.leased)
-        if task.stage is Stage.publish:
-            reserve_version(book.connection, task)
+        terms = {"token": row.token + 1, "attempt": row.attempts + 1, "limit_seconds": limit}
+        grants.append((row, terms | {"task_id": task_id(row.stage, row.key)}))
+        if row.stage == Stage.publish:
+            reserve_version(book.connection, row)
     return grants
 
 

@@ -1,27 +1,36 @@
-"""Jobs as they are shown: lists, details, samples and previews."""
+"""Jobs as they are shown: lists, details, samples, previews and events."""
 
 import json
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, or_, select
 from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.documents.responses import DatasetRef, Job, JobDetail, Page, Preview, SampleState
+from stickslip_schemas.documents.responses import (
+    DatasetRef,
+    EventName,
+    Job,
+    JobDetail,
+    JobStateEvent,
+    Page,
+    Preview,
+    SampleState,
+)
 
 from stickslip_services.access.asker import own, own_task
 from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import job_stages, job_tasks, jobs, previews, samples, tasks
+from stickslip_services.database.tables import events, job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageTimings, read_costs
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import RUNNABLE
+from stickslip_services.queue.ledger import RUNNABLE, SETTLED
 from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.recompute import check_results, check_samples, terms_of
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
-_UNSETTLED = [state for state in TaskState if not state.is_settled]
 _RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1))
 
 
@@ -102,7 +111,7 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
         planned = connection.execute(select(jobs.c.planned).where(jobs.c.seq == job)).scalar_one()
         page_slots = range(first, min(first + page.size, planned))
         check_samples(rows, page_slots if state is None else [row.slot for row in rows])
-        settled = [row.seq for row in rows if row.state not in _UNSETTLED]
+        settled = [row.seq for row in rows if row.state in SETTLED]
         check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
         return [document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels)) for row in rows]
 
@@ -127,6 +136,26 @@ _PREVIEWS = select(samples.c.slot, samples.c.labels, previews.c.digest).join(
 def _previews(connection: Connection, query: Select[Any]) -> list[Preview]:
     rows = connection.execute(query)
     return [Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}") for row in rows]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredEvent:
+    """An event as the stream sends it; `data` is JSON."""
+
+    id: int
+    name: EventName
+    data: str
+
+    @property
+    def is_last(self) -> bool:
+        return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
+
+
+def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
+    """Return the events of a job after the one with the id `after`."""
+    query = select(events.c.id, events.c.name, events.c.data).where(events.c.job == job, events.c.id > after)
+    rows = connection.execute(query.order_by(events.c.id).limit(limit))
+    return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
 
 
 def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTimings]:

@@ -5,10 +5,9 @@ has lost its lease is recognised.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, select, text, update
+from sqlalchemy import Connection, bindparam, select, update
 from stickslip_schemas.base.states import Reason, TaskState
 from stickslip_schemas.documents.tasks import AnyTask, PublishTask
 from stickslip_schemas.documents.worker_api import (
@@ -25,21 +24,12 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
-from stickslip_services.queue.compose import UNSOUND, Publish, StoredTask, compose_tasks
+from stickslip_services.queue.compose import UNSOUND, Publish, compose_tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.grants import grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.jobs import has_runnable_job
-from stickslip_services.queue.ledger import (
-    RUNNABLE,
-    HeldTask,
-    Ledger,
-    cancel_tasks,
-    live_jobs,
-    release,
-    runnable_tasks,
-    start_tasks,
-)
+from stickslip_services.queue.ledger import HELD, RUNNABLE, Ledger, cancel, live_jobs
 from stickslip_services.queue.planner import plan_waiting_jobs
 from stickslip_services.queue.recompute import mend
 from stickslip_services.queue.retries import fail_tries, find_held, is_sweep_due, lose, take_back
@@ -62,7 +52,7 @@ def register_worker(context: Context, registration: WorkerRegistration) -> Worke
         old = list(book.connection.scalars(select(workers.c.id).where(workers.c.name == registration.name)))
         worker = insert_worker(book.connection, registration, book.now)
         message = f"worker {registration.name} was started anew"
-        lose(book, find_held(book, old), context.settings, message=message)
+        lose(book, find_held(book.connection, old), context.settings, message=message)
     for earlier in old:
         context.frames_by_worker.pop(earlier, None)
     plan_waiting_jobs(context)
@@ -142,23 +132,17 @@ def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -
     with context.ledger() as book:
         worker = find_worker(book.connection, message.worker_id)
         note_seen(book.connection, worker.id, book.now, message.condition)
-        held = {(task.key, task.token): task for task in find_held(book, [worker.id])}
+        held = {(task.key, task.token): task for task in find_held(book.connection, [worker.id])}
         names = [(lease, (task_key(lease.task_id), lease.token)) for lease in left]
-        mine = [(lease, held[name]) for lease, name in names if name in held]
-        unneeded = _unneeded(book, mine)
-        cancel_tasks(book, [task for _, task in mine if task.seq in unneeded])
-        waiting = {task.seq for lease, task in mine if task.seq not in unneeded and not _is_started(lease, task)}
-        # Those that only paused jobs need, and that have not been started, are given back.
-        halted = live_jobs(book.connection, waiting).keys() - runnable_tasks(book.connection, waiting)
-        for _, task in mine:
-            if task.seq in halted:
-                release(book, task, TaskState.pending)
-        started = [task for lease, task in mine if lease.started and task.state is TaskState.leased]
-        start_tasks(book, [task for task in started if task.seq not in unneeded | halted])
+        has_started = {name: lease.started for lease, name in names if name in held}
+        started = {held[name].seq for name, yes in has_started.items() if yes or held[name].state == TaskState.running}
+        dropped = _drop(book, [held[name] for name in has_started], started)
+        fresh = [held[name] for name, yes in has_started.items() if yes and held[name].state == TaskState.leased]
+        book.start([task for task in fresh if task.seq not in dropped])
         listed = {task_key(lease.task_id) for lease in message.leases}
         unlisted = [task for task in held.values() if task.key not in listed and task.expires_at <= book.now]
         lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
-    drop = [lease.task_id for lease, name in names if name not in held or held[name].seq in unneeded | halted]
+    drop = [lease.task_id for lease, name in names if name not in held or held[name].seq in dropped]
     return HeartbeatAnswer(drop=tuple(drop))
 
 
@@ -172,7 +156,7 @@ _RUNNABLE_JOB = (
 )
 _HELD = Prepared(
     select(tasks.c.owner, tasks.c.key, tasks.c.token, tasks.c.state, tasks.c.expires_at, _RUNNABLE_JOB).where(
-        text("tasks.owner IS NOT NULL"), tasks.c.owner.in_(bindparam("b_workers", expanding=True))
+        HELD, tasks.c.owner.in_(bindparam("b_workers", expanding=True))
     )
 )
 _GONE = None, None, None
@@ -188,7 +172,7 @@ def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
 
 
 def _compose_leases(
-    connection: Connection, grants: Sequence[tuple[StoredTask, dict[str, Any]]], publish: Publish
+    connection: Connection, grants: Sequence[tuple[Any, dict[str, Any]]], publish: Publish
 ) -> tuple[tuple[Lease, ...], dict[int, Sequence[int]]]:
     """Return the leases of granted tasks, and by task the damaged results where rows that it needs are damaged."""
     composed: dict[int, AnyTask] = {}
@@ -207,35 +191,34 @@ def _compose_leases(
 def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -> None:
     """Mend the rows that leased tasks need, and retry these, as after a report of damaged artifacts."""
     with context.ledger() as book:
-        held = [task for task in find_held(book, [worker_id]) if task.seq in damaged]
-        start_tasks(book, held)
+        held = [task for task in find_held(book.connection, [worker_id]) if task.seq in damaged]
+        book.start(held)
         why = Reason.storage_error, str(DamagedRowsError())
-        fail_tries(book, [(replace(task, state=TaskState.running), *why) for task in held], context.settings)
+        fail_tries(book, [(task._replace(state=TaskState.running), *why) for task in held], context.settings)
         for task in held:
             mend(book, task.seq, damaged[task.seq])
 
 
 def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:
     """Renew every lease: while the coordinator was down, no heartbeat could arrive."""
-    connection.execute(update(tasks).where(text("tasks.owner IS NOT NULL")).values(expires_at=now + lease_seconds))
+    connection.execute(update(tasks).where(HELD).values(expires_at=now + lease_seconds))
     ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
     connection.execute(update(workers).where(ahead).values(last_seen_at=now))
 
 
-def _unneeded(book: Ledger, held: Sequence[tuple[LeaseState, HeldTask]]) -> set[int]:
-    """Return the tasks to cancel: those of `cancelling` jobs, and of ended jobs those that have not been started.
+def _drop(book: Ledger, held: Sequence[Any], started: set[int]) -> set[int]:
+    """Cancel or give back leased tasks that the worker is to drop; return them.
 
-    Tasks that a failed job has started finish, and their results are kept for the next submission.
+    Dropped are those of `cancelling` jobs and, unless they are `started`, those of ended and of paused jobs. What a
+    failed job has started finishes, and its results are kept for the next submission.
     """
-    seqs = [task.seq for _, task in held]
-    needed = live_jobs(book.connection, seqs)
-    cancelling = book.holders(seq for seq in seqs if seq not in needed)
-    return {
-        task.seq
-        for lease, task in held
-        if task.seq not in needed and (task.seq in cancelling or not _is_started(lease, task))
-    }
-
-
-def _is_started(lease: LeaseState, task: HeldTask) -> bool:
-    return lease.started or task.state is TaskState.running
+    seqs = [task.seq for task in held]
+    needed, running = live_jobs(book.connection, seqs), live_jobs(book.connection, seqs, RUNNABLE)
+    unneeded = [task for task in held if task.seq not in needed]
+    unneeded = [
+        task for task in unneeded if task.seq not in started or book.jobs_of(task.seq)
+    ]  # an open job cancels it
+    halted = [task for task in held if task.seq in needed and task.seq not in started | running.keys()]
+    cancel(book, unneeded)
+    book.move(halted, TaskState.pending)
+    return {task.seq for task in (*unneeded, *halted)}

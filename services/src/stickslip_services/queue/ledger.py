@@ -1,23 +1,42 @@
-"""The ledger of a write transaction: its changes of tasks, and the jobs that it ends.
+"""The ledger of a write transaction: how the states of tasks and jobs change, and what follows from that.
 
-Who changes `tasks.state` tells the ledger. `closing.close` then brings counters and jobs up to date, in the same
-transaction.
+Between any two transactions (`stickslip_testing.invariants` looks at all of it):
+
+1. A task has an owner exactly while it is `leased` or `running`, and a retry time exactly while it is `soft_failed`.
+2. The counters, those of all tasks and those of each open job, say what the rows say.
+3. A task that waits is charged to the job that it will run for: of the live jobs that need it a runnable one, if there
+   is any, of these the one with the highest priority, and of these the oldest. No task waits that no live job needs.
+4. A `queued` job has no task on lease. A `pausing` job has one that no runnable job needs, and a `cancelling` job one
+   that no live job needs. A job of which only quarantined tasks and their dependents are left has failed.
+
+`move` keeps the first, `reassign` the third, and `close`, at the end of the transaction, the second and the fourth.
+A job of a million tasks that ends would keep other writers waiting: its tasks are given up in pieces (`give_up`).
+
+Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were before the transaction changed them.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from sqlalchemy import Column, Connection, Row, bindparam, case, select, text, update
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
-from stickslip_schemas.documents.responses import DatasetRef, TaskStateEvent
+from sqlalchemy import Connection, Row, bindparam, case, exists, func, insert, or_, select, text, update
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.base.states import JobState, Reason, TaskState
+from stickslip_schemas.documents.responses import (
+    DatasetPublishedEvent,
+    DatasetRef,
+    EventName,
+    JobStateEvent,
+    TaskStateEvent,
+)
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.paging import document_of
 from stickslip_services.database.prepared import Counters, Prepared
-from stickslip_services.database.tables import job_counts, job_groups, job_tasks, jobs, task_counts, tasks
-from stickslip_services.queue.eta import Run
+from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
+from stickslip_services.queue.eta import Run, add_costs
 from stickslip_services.queue.ids import task_id
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
@@ -26,26 +45,34 @@ RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
 LIVE = (*RUNNABLE, JobState.pausing, JobState.paused)
 """States of a job that needs its tasks."""
 
-PIECE_TASKS = 250
-"""Tasks of a cancelled job that one transaction gives up: it takes 10 to 30 ms, for which other writers wait."""
-
-_WAITING = (TaskState.pending, TaskState.soft_failed)
-
-READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")
-"""The condition of tasks that can be leased, in the words of the partial index."""
-
+WAITING = (TaskState.pending, TaskState.soft_failed)
+ON_LEASE = (TaskState.leased, TaskState.running)
+SETTLED = tuple(state for state in TaskState if state.is_settled)
+"""States of a task with a result."""
 OVER = tuple(state for state in TaskState if state.is_over)
 """States of a finished task."""
 
+READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")
+"""The condition of tasks that can be leased, in the words of the partial index."""
+HELD = text("tasks.owner IS NOT NULL")
+"""The condition of tasks on lease, likewise."""
 
-@dataclass(frozen=True, slots=True)
-class Holder:
-    """A job that has a task, and whether the task was settled before the job was submitted."""
+PIECE_TASKS = 250
+"""Tasks of an ended job that one transaction gives up: it takes 10 to 30 ms, for which other writers wait."""
 
-    job: int
-    cached: bool
-    cost_group: str
-    """Cost group of the task."""
+FRESH: Mapping[str, Any] = {"reason": None, "message": "", "tries": 0, "losses": 0}
+"""Values of a task that has all its tries."""
+
+
+class Task(NamedTuple):
+    """What the ledger needs to know of a task."""
+
+    seq: int
+    stage: str
+    state: str
+
+
+TASK = [tasks.c[name] for name in Task._fields]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,56 +95,20 @@ class Ending:
         return Ending(JobState.succeeded_with_rejects, None, message, reference, lost)
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """A task in a state."""
-
-    seq: int
-    stage: Stage
-    state: TaskState
-
-    @classmethod
-    def columns(cls) -> list[Column[Any]]:
-        """Return the columns of `tasks` from which `of` makes one."""
-        return [tasks.c[field.name] for field in fields(cls)]
-
-    @classmethod
-    def of(cls, row: Any) -> Self:
-        """Return the task of a row with `columns`."""
-        rest = (getattr(row, field.name) for field in fields(cls)[3:])
-        return cls(row.seq, Stage(row.stage), TaskState(row.state), *rest)
-
-
-@dataclass(frozen=True, slots=True)
-class KeyedTask(Task):
-    """A task with its content key."""
-
-    key: bytes
-
-    @property
-    def name(self) -> str:
-        """Name of the task outside the database."""
-        return task_id(self.stage, self.key)
-
-
-@dataclass(frozen=True, slots=True)
-class HeldTask(KeyedTask):
-    """A leased task, or one whose lease has just ended."""
-
-    tries: int
-    losses: int
-    token: int
-    expires_at: float
-
-
+_OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
 _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
     .join(jobs, jobs.c.seq == job_tasks.c.job)
     .join(tasks, tasks.c.seq == job_tasks.c.task)
     .where(
         job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)),
-        jobs.c.state.in_([state for state in JobState if state.is_open]),
+        or_(_OPEN, jobs.c.seq.in_(bindparam("b_given_up", expanding=True))),
     )
+)
+_ADD_TO_JOB_STAGES = Prepared(
+    "UPDATE job_stages SET cpu_seconds = cpu_seconds + :b_cpu, wall_count = wall_count + 1, "
+    "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_wall * :b_wall "
+    "WHERE job = :b_job AND stage = :b_stage"
 )
 TASK_COUNTS, JOB_COUNTS, JOB_GROUPS = Counters(task_counts), Counters(job_counts), Counters(job_groups)
 
@@ -128,186 +119,239 @@ class Ledger:
     def __init__(self, connection: Connection, now: float) -> None:
         self.connection = connection
         self.now = now
-        self.moves: list[tuple[Task, TaskState]] = []
-        """Tasks, and their new states."""
-        self.runs: list[Run] = []
-        self.inserted: Counter[tuple[Stage, TaskState]] = Counter()
-        """New tasks by stage and state."""
-        self.news: list[tuple[int, TaskStateEvent]] = []
-        self.endings: dict[int, Ending] = {}
+        self._moves: list[tuple[Any, TaskState]] = []
+        self._runs: list[Run] = []
+        self.given_up: set[int] = set()
+        """Jobs whose tasks this transaction gives up: their counters follow, also after they have ended."""
 
-    def moved(self, task: Task, state: TaskState) -> None:
-        """Note the new state of a task."""
-        self.moves.append((task, state))
+    def move(self, rows: Collection[Any], state: TaskState, **values: Any) -> None:
+        """Put tasks into a state, and write other values of their columns."""
+        if state not in ON_LEASE:
+            values |= {"owner": None, "expires_at": None}
+        if state is not TaskState.soft_failed:
+            values["retry_at"] = None
+        values["finished_at"] = self.now if state in OVER else None
+        for batch in batches(rows):
+            own = tasks.c.seq.in_([row.seq for row in batch])
+            self.connection.execute(update(tasks).where(own).values(state=state, **values))
+        self.moved(rows, state)
+
+    def moved(self, rows: Iterable[Any], state: TaskState) -> None:
+        """Note that tasks were put into a state by other means."""
+        self._moves += [(row, state) for row in rows]
+
+    def start(self, rows: Collection[Any]) -> None:
+        """Note that leased tasks have been started: from here on they may fail."""
+        self.move(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
 
     def ran(self, run: Run) -> None:
         """Note the cost of a task."""
-        self.runs.append(run)
+        self._runs.append(run)
 
-    def emit(self, task: HeldTask, state: TaskState, reason: Reason, message: str) -> None:
-        """Note an event of all jobs of a task."""
-        event = TaskStateEvent(task_id=task.name, stage=task.stage, state=state, reason=reason, message=message)
-        self.news.append((task.seq, event))
+    def tell(self, task: Any, state: TaskState, reason: Reason, message: str) -> None:
+        """Store an event of a task, whose row has its `key`, for each of its open jobs."""
+        name = task_id(task.stage, task.key)
+        event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
+        for job in self.jobs_of(task.seq):
+            self._append_event(job, EventName.task_state, event)
 
-    def end_job(self, job: int, ending: Ending) -> None:
-        """Note that a live job ends; the first ending counts."""
-        self.endings.setdefault(job, ending)
+    def set_state(self, job: int, state: JobState, *, reason: Reason | None = None, message: str = "") -> None:
+        """Set the state of a job with its reason and message, and store the event."""
+        values: dict[str, object] = {"state": state, "reason": reason, "message": message}
+        if state is JobState.running:
+            values["started_at"] = func.coalesce(jobs.c.started_at, self.now)
+        if not state.is_open:
+            values["finished_at"] = self.now
+        self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
+        self._append_event(job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message))
 
-    def holders(self, task_seqs: Iterable[int]) -> dict[int, list[Holder]]:
-        """Return the open jobs of each task."""
-        found: dict[int, list[Holder]] = {}
-        for batch in batches(set(task_seqs)):
-            for task, job, cached, cost_group in _HOLDERS.tuples(self.connection, {"b_tasks": batch}):
-                found.setdefault(task, []).append(Holder(job, bool(cached), cost_group))
+    def end(self, job: int, ending: Ending) -> None:
+        """End a job, unless it is not live any more, and give up what only it needs."""
+        own = jobs.c.seq == job
+        if self.connection.scalar(select(jobs.c.seq).where(own, jobs.c.state.in_(LIVE))) is None:
+            return
+        self.count()
+        if ending.dataset is not None:
+            values = {**ending.dataset.model_dump(), "rejected_count": ending.rejected_count}
+            self.connection.execute(update(jobs).where(own).values(values))
+            self._append_event(job, EventName.dataset_published, DatasetPublishedEvent(dataset=ending.dataset))
+        self.set_state(job, ending.state, reason=ending.reason, message=ending.message)
+        waiting = (job_counts.c.job == job, job_counts.c.state.in_(WAITING), job_counts.c.count > 0)
+        if self.connection.scalar(select(job_counts.c.count).where(*waiting).limit(1)):
+            give_up(self, job)
+
+    def jobs_of(self, task: int) -> list[int]:
+        """Return the open jobs of a task."""
+        return [holder.job for holder in self._holders([task]).get(task, ())]
+
+    def count(self) -> None:
+        """Bring the counters up to date."""
+        moves, self._moves = self._moves, []
+        runs, self._runs = self._runs, []
+        if not moves and not runs:
+            return
+        holders = self._holders({*(task.seq for task, _ in moves), *(run.task for run in runs)})
+        overall, by_job, left = Counter[Any](), Counter[Any](), Counter[Any]()
+        for task, new in moves:
+            for state, change in ((task.state, -1), (new, 1)):
+                overall[task.stage, state] += change
+                for holder in holders.get(task.seq, ()):
+                    by_job[holder.job, task.stage, state] += change
+                    left[holder.job, task.stage, holder.cost_group] += change * (state not in OVER)
+        TASK_COUNTS.add(self.connection, overall)
+        JOB_COUNTS.add(self.connection, by_job)
+        JOB_GROUPS.add(self.connection, {group: change for group, change in left.items() if change})
+        spent = [
+            {"b_job": holder.job, "b_stage": run.stage, "b_cpu": run.cpu_seconds, "b_wall": run.wall_seconds}
+            for run in runs
+            for holder in holders.get(run.task, ())
+            if not holder.cached
+        ]
+        _ADD_TO_JOB_STAGES.run_all(self.connection, spent)
+        add_costs(self.connection, runs)
+
+    def _holders(self, task_seqs: Collection[int]) -> dict[int, list[Any]]:
+        """Return the open jobs of each task, rows of `_HOLDERS`."""
+        found: dict[int, list[Any]] = {}
+        for batch in batches(task_seqs):
+            for row in _HOLDERS.rows(self.connection, {"b_tasks": batch, "b_given_up": list(self.given_up)}):
+                found.setdefault(row.task, []).append(row)
         return found
 
-
-def give_up_tasks(book: Ledger, job: int, *, ending: Collection[int] = ()) -> None:
-    """Cancel the waiting tasks of a job that is ending; leave those that another live job, not `ending`, needs.
-
-    Tasks that are leased are left: they end by themselves, or the next heartbeat drops them.
-    """
-    for batch in batches(_waiting_tasks(book.connection, job)):
-        _give_up(book, batch, ending)
+    def _append_event(self, job: int, name: EventName, data: Document) -> None:
+        row = {"job": job, "name": name, "data": data.model_dump_json(), "created_at": self.now}
+        self.connection.execute(insert(events).values(row))
 
 
-def give_up_piece(book: Ledger, job: int, after: int) -> int | None:
-    """Do as `give_up_tasks` for the next `PIECE_TASKS` tasks after the one with the seq `after`.
-
-    Return the seq of the last one; None if there is no other.
-    """
-    piece = select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task > after)
-    seqs = list(book.connection.scalars(piece.order_by(job_tasks.c.task).limit(PIECE_TASKS)))
-    rows = book.connection.execute(select(*Task.columns()).where(tasks.c.seq.in_(seqs), tasks.c.state.in_(_WAITING)))
-    _give_up(book, list(map(Task.of, rows)), ())
-    return seqs[-1] if len(seqs) == PIECE_TASKS else None
-
-
-def _give_up(book: Ledger, waiting: Collection[Task], ending: Collection[int]) -> None:
-    chargeable = live_jobs(book.connection, [task.seq for task in waiting], but=ending)
-    _charge(book.connection, chargeable)
-    cancel_tasks(book, [task for task in waiting if task.seq not in chargeable])
-
-
-def charge_waiting_tasks(connection: Connection, job: int) -> None:
-    """Charge each waiting task of a live job to the job that it will run for, preferably a runnable one.
-
-    Called whenever a job starts or stops being runnable, or changes its priority, for a task is leased only on behalf
-    of the job it is charged to.
-    """
-    kind = select(jobs.c.kind).where(jobs.c.seq == job).scalar_subquery()
-    others = select(jobs.c.seq).where(jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE))
-    if connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
-        charge_tasks(connection, (task.seq for task in _waiting_tasks(connection, job)))
-
-
-def charge_tasks(connection: Connection, waiting: Iterable[int]) -> None:
-    """Charge waiting tasks to the jobs that they will run for."""
-    for batch in batches(waiting):
-        _charge(connection, live_jobs(connection, batch))
-
-
-def _waiting_tasks(connection: Connection, job: int) -> list[Task]:
-    """Return the tasks of a job that wait to be leased."""
-    rows = connection.execute(
-        select(*Task.columns())
-        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-        .where(job_tasks.c.job == job, tasks.c.state.in_(_WAITING))
-    )
-    return list(map(Task.of, rows))
-
-
-def _charge(connection: Connection, job_of: dict[int, int]) -> None:
-    charges = [{"b_seq": task, "b_job": job} for task, job in job_of.items()]
-    if charges:
-        connection.execute(
-            update(tasks).where(tasks.c.seq == bindparam("b_seq")).values(job=bindparam("b_job")), charges
-        )
-
-
-def cancel_tasks(book: Ledger, needless: Collection[Task]) -> None:
-    """Cancel tasks, leased ones included."""
-    if not needless:
-        return
-    book.connection.execute(
-        update(tasks)
-        .where(tasks.c.seq.in_([task.seq for task in needless]))
-        .values(
-            state=TaskState.cancelled,
-            reason=Reason.cancelled,
-            message="no job needs it",
-            owner=None,
-            expires_at=None,
-            retry_at=None,
-            finished_at=book.now,
-        )
-    )
-    for task in needless:
-        book.moved(task, TaskState.cancelled)
-
-
-def release(book: Ledger, task: HeldTask, state: TaskState, **values: object) -> None:
-    """Take a task off its lease into another state; `values` are further columns to write."""
-    book.connection.execute(
-        update(tasks).where(tasks.c.seq == task.seq).values(state=state, owner=None, expires_at=None, **values)
-    )
-    book.moved(task, state)
-
-
-def reset_tasks(book: Ledger, ended: Collection[Task], job_of: Mapping[int, int]) -> None:
-    """Let ended tasks run again, with all their tries, each charged to a job."""
-    values = {"reason": None, "message": "", "tries": 0, "losses": 0, "retry_at": None, "finished_at": None}
-    if ended:
-        book.connection.execute(
-            update(tasks)
-            .where(tasks.c.seq == bindparam("b_seq"))
-            .values(state=TaskState.pending, job=bindparam("b_job"), **values),
-            [{"b_seq": task.seq, "b_job": job_of[task.seq]} for task in ended],
-        )
-    for task in ended:
-        book.moved(task, TaskState.pending)
-
-
-_START = Prepared(
-    update(tasks)
-    .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
-    .values(state=TaskState.running, attempts=tasks.c.attempts + 1, started_at=bindparam("b_now"))
-)
-
-
-def start_tasks(book: Ledger, leased: Collection[Task]) -> None:
-    """Note that leased tasks have been started: from here on they may fail."""
-    for batch in batches(leased):
-        _START.run(book.connection, {"b_tasks": [task.seq for task in batch], "b_now": book.now})
-    for task in leased:
-        book.moved(task, TaskState.running)
-
-
-_OF_TASKS = job_tasks.c.task.in_(bindparam("b_tasks", expanding=True))
 _LIVE_JOBS = Prepared(
     select(job_tasks.c.task, case((jobs.c.state.in_(RUNNABLE), 0), else_=1), jobs.c.priority, job_tasks.c.job)
     .join(jobs, jobs.c.seq == job_tasks.c.job)
-    .where(_OF_TASKS, jobs.c.state.in_(LIVE))
+    .where(
+        job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)),
+        jobs.c.state.in_(bindparam("b_states", expanding=True)),
+    )
 )
-_RUNNABLE_TASKS = Prepared(
-    select(job_tasks.c.task).join(jobs, jobs.c.seq == job_tasks.c.job).where(_OF_TASKS, jobs.c.state.in_(RUNNABLE))
-)
 
 
-def live_jobs(connection: Connection, task_seqs: Iterable[int], *, but: Collection[int] = ()) -> dict[int, int]:
-    """Return the first runnable job of each task, or else its first live one; tasks without any are left out.
-
-    First is the one of the highest priority, and of these the oldest. Jobs in `but` are left out.
-    """
+def live_jobs(connection: Connection, task_seqs: Iterable[int], states: Sequence[JobState] = LIVE) -> dict[int, int]:
+    """Return the job that each task is to be charged to, of those in some states; tasks without any are left out."""
     found: dict[int, tuple[int, int, int]] = {}
     for batch in batches(task_seqs):
-        for task, halted, priority, job in _LIVE_JOBS.tuples(connection, {"b_tasks": batch}):
-            if job not in but:
-                mine = (halted, -priority, job)
-                found[task] = min(mine, found.get(task, mine))
+        for task, halted, priority, job in _LIVE_JOBS.tuples(connection, {"b_tasks": batch, "b_states": list(states)}):
+            mine = (halted, -priority, job)
+            found[task] = min(mine, found.get(task, mine))
     return {task: job for task, (_, _, job) in found.items()}
 
 
-def runnable_tasks(connection: Connection, task_seqs: Iterable[int]) -> set[int]:
-    """Return the tasks that a runnable job needs."""
-    return {task for batch in batches(task_seqs) for (task,) in _RUNNABLE_TASKS.tuples(connection, {"b_tasks": batch})}
+def charge(connection: Connection, job_of: Mapping[int, int]) -> None:
+    """Charge tasks to jobs."""
+    charges = [{"b_seq": task, "b_job": job} for task, job in job_of.items()]
+    if charges:
+        own = update(tasks).where(tasks.c.seq == bindparam("b_seq"))
+        connection.execute(own.values(job=bindparam("b_job")), charges)
+
+
+def reassign(book: Ledger, rows: Sequence[Any]) -> list[Any]:
+    """Charge unfinished tasks to the jobs that they will run for; cancel the needless, and return the others."""
+    job_of = live_jobs(book.connection, [row.seq for row in rows])
+    charge(book.connection, job_of)
+    cancel(book, [row for row in rows if row.seq not in job_of])
+    return [row for row in rows if row.seq in job_of]
+
+
+def cancel(book: Ledger, rows: Collection[Any]) -> None:
+    """Cancel tasks, leased ones included."""
+    book.move(rows, TaskState.cancelled, reason=Reason.cancelled, message="no job needs it")
+
+
+def reassign_waiting(book: Ledger, job: int) -> None:
+    """Reassign the waiting tasks of a job that starts or stops being runnable, or that changes its priority."""
+    kind = select(jobs.c.kind).where(jobs.c.seq == job).scalar_subquery()
+    others = select(jobs.c.seq).where(jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE))
+    if book.connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
+        reassign(book, _waiting(book.connection, job_tasks.c.job == job))
+
+
+def give_up(book: Ledger, job: int, after: int = 0) -> None:
+    """Reassign the next `PIECE_TASKS` tasks of a job that is not live any more, and store where to go on."""
+    book.given_up.add(job)
+    piece = select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task > after)
+    seqs = list(book.connection.scalars(piece.order_by(job_tasks.c.task).limit(PIECE_TASKS)))
+    reassign(book, _waiting(book.connection, job_tasks.c.job == job, job_tasks.c.task.in_(seqs)))
+    last = seqs[-1] if len(seqs) == PIECE_TASKS else None
+    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
+
+
+def _waiting(connection: Connection, *which: Any) -> Sequence[Any]:
+    query = select(*TASK).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    return connection.execute(query.where(tasks.c.state.in_(WAITING), *which)).all()
+
+
+@contextmanager
+def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
+    """Open a ledger and close it, unless the block raises."""
+    book = Ledger(connection, now)
+    yield book
+    _close(book)
+
+
+def _sum_of(*states: TaskState) -> Any:
+    return func.coalesce(func.sum(job_counts.c.count).filter(job_counts.c.state.in_(states)), 0)
+
+
+_OPEN_JOBS = Prepared(
+    select(
+        *(jobs.c[name] for name in ("seq", "state", "started_at", "given_up")),
+        _sum_of(*ON_LEASE).label("on_lease"),
+        _sum_of(TaskState.soft_failed).label("retried"),
+        _sum_of(TaskState.failed).label("failed"),
+    )
+    .outerjoin(job_counts, job_counts.c.job == jobs.c.seq)
+    .where(_OPEN)
+    .group_by(jobs.c.seq)
+)
+
+
+def _close(book: Ledger) -> None:
+    """Bring the counters up to date, and let the states of the jobs follow."""
+    book.count()
+    for job in _OPEN_JOBS.rows(book.connection):
+        if job.state == JobState.queued and job.on_lease:
+            book.set_state(job.seq, JobState.running)
+        elif job.state == JobState.planning and job.on_lease and job.started_at is None:  # it runs when it is planned
+            book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(started_at=book.now))
+        elif job.state in (JobState.queued, JobState.running) and job.failed and not (job.on_lease or job.retried):
+            _end_if_blocked(book, job.seq)
+        elif job.state == JobState.pausing and not (job.on_lease and holds_alone(book.connection, job.seq, RUNNABLE)):
+            why = book.connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job.seq)).one()
+            message = why.message if why.reason else "paused; resume it to go on"
+            book.set_state(job.seq, JobState.paused, reason=why.reason, message=message)
+        elif job.state == JobState.cancelling and not (
+            job.given_up or (job.on_lease and holds_alone(book.connection, job.seq, LIVE))
+        ):
+            message = "cancelled; what had been finished is kept and will not be done again"
+            book.set_state(job.seq, JobState.cancelled, reason=Reason.cancelled, message=message)
+    book.count()
+
+
+def holds_alone(connection: Connection, job: int, states: Sequence[JobState]) -> bool:
+    """Return whether a job has a task on lease that no job in some states needs."""
+    # Looked for among all tasks on lease, which are fewer than a job has.
+    is_of_job = exists().where(job_tasks.c.job == job, job_tasks.c.task == tasks.c.seq)
+    held = set(connection.scalars(select(tasks.c.seq).where(HELD, is_of_job)))
+    return bool(held - live_jobs(connection, held, states).keys())
+
+
+def _end_if_blocked(book: Ledger, job: int) -> None:
+    """End a job with quarantined tasks of which nothing runs, unless one can be leased."""
+    own = select(*TASK, tasks.c.key, tasks.c.message).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    own = own.where(job_tasks.c.job == job)
+    if book.connection.execute(own.where(READY).limit(1)).first() is not None:
+        return
+    failed = book.connection.execute(own.where(tasks.c.state == TaskState.failed).order_by(tasks.c.seq)).all()
+    message = (
+        f"everything else is done, but {len(failed)} of its tasks were quarantined; the first is "
+        f"{task_id(failed[0].stage, failed[0].key)}: {failed[0].message}. What is done is kept; submit the job again "
+        "to try again"
+    )
+    book.end(job, Ending(JobState.failed, Reason.quarantined, message))

@@ -17,7 +17,6 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import unplanned_jobs
 from stickslip_services.queue.ledger import Ending
@@ -58,7 +57,7 @@ def plan_waiting_jobs(context: Context) -> None:
             if row.seq not in {other.seq for other in unplanned_jobs(book.connection)}:
                 continue  # cancelled, or planned by another coordinator
             if terms is None:
-                set_job_state(book, row.seq, JobState.failed, reason=reason, message=refusal)
+                book.set_state(row.seq, JobState.failed, reason=reason, message=refusal)
                 continue
             begin_planning(book, row.seq, terms, plan)
 
@@ -150,7 +149,7 @@ class Planner:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
         with self._context.ledger() as book:
             if book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                book.end_job(row.seq, Ending(JobState.failed, Reason.internal_error, message))
+                book.end(row.seq, Ending(JobState.failed, Reason.internal_error, message))
 
 
 def _pack_keys(connection: Connection, job: int) -> list[str]:

@@ -31,9 +31,8 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
-from stickslip_services.queue.ledger import LIVE, Ending, Ledger, Task, live_jobs, reset_tasks
+from stickslip_services.queue.ledger import FRESH, LIVE, OVER, SETTLED, TASK, Ending, Ledger, Task, charge, live_jobs
 from stickslip_services.queue.plan import Terms
 
 logger = logging.getLogger(__name__)
@@ -49,14 +48,14 @@ def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> None:
     remake(book, consumer, _find_makers(book, consumer, set(digests)))
 
 
-def remake(book: Ledger, consumer: int, makers: Sequence[Task]) -> None:
+def remake(book: Ledger, consumer: int, makers: Sequence[Any]) -> None:
     """Reset tasks, and let `consumer` wait for them."""
     known = set(
         book.connection.scalars(select(task_dependencies.c.depends_on).where(task_dependencies.c.task == consumer))
     )
     new = [maker for maker in makers if maker.seq not in known]
     insert_rows(book.connection, task_dependencies, ("task", "depends_on"), ((consumer, maker.seq) for maker in new))
-    wait_for(book, {consumer: sum(not maker.state.is_settled for maker in new)})
+    wait_for(book, {consumer: sum(maker.state not in SETTLED for maker in new)})
     reopen(book, makers)
 
 
@@ -105,38 +104,39 @@ def end_made(book: Ledger, made: Any, damaged: Mapping[str, Sha256] | None) -> N
         own = dataset_versions.c.publish_task == made.publish_task
         book.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=book.now, damaged=0))
         ending = Ending.published(find_committed(book.connection, made.publish_task))
-        book.end_job(made.seq, replace(ending, message=ending.message or "every result was cached"))
+        book.end(made.seq, replace(ending, message=ending.message or "every result was cached"))
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
-    set_job_state(book, made.seq, JobState.queued, message=message)
+    book.set_state(made.seq, JobState.queued, message=message)
     reopen(book, [Task(made.publish_task, Stage.publish, TaskState.succeeded)])
     recompute(book, made.publish_task, damaged.values() if damaged else ())
 
 
-def reopen(book: Ledger, makers: Iterable[Task]) -> None:
-    """Reset ended tasks that a live job needs. Their outputs stay until there are new ones."""
-    ended = [maker for maker in makers if maker.state.is_over]
+def reopen(book: Ledger, makers: Iterable[Any]) -> None:
+    """Let ended tasks that a live job needs run again, with all their tries. Their outputs stay until then."""
+    ended = [maker for maker in makers if maker.state in OVER]
     job_of = live_jobs(book.connection, [maker.seq for maker in ended])
     ended = [maker for maker in ended if maker.seq in job_of]
-    settled = [maker.seq for maker in ended if maker.state.is_settled]
+    settled = [maker.seq for maker in ended if maker.state in SETTLED]
     edges = rows_with(book.connection, select(task_dependencies.c.task), task_dependencies.c.depends_on, settled)
     wait_for(book, Counter(edge.task for edge in edges))
-    reset_tasks(book, ended, job_of)
+    charge(book.connection, job_of)
+    book.move(ended, TaskState.pending, **FRESH)
 
 
-def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Task]:
+def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Any]:
     """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
     edge = task_dependencies.c.depends_on == tasks.c.seq
-    needed = select(*Task.columns(), tasks.c.output).join(task_dependencies, edge).distinct()
-    makers: list[Task] = []
+    needed = select(*TASK, tasks.c.output).join(task_dependencies, edge).distinct()
+    makers: list[Any] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
         below: set[int] = set()
         for row in rows_with(book.connection, needed, task_dependencies.c.task, level):
             made = digests.intersection(_DIGEST.findall(row.output or ""))
             if row.seq not in seen and made:
-                makers.append(Task.of(row))
+                makers.append(row)
                 digests = digests - made
             below.add(row.seq)
         level = below - seen
@@ -195,7 +195,7 @@ def fail_damaged_jobs(context: Context) -> None:
     if damaged:
         with context.ledger() as book:
             for job in damaged:
-                book.end_job(job, Ending(JobState.failed, Reason.storage_error, str(DamagedRowsError())))
+                book.end(job, Ending(JobState.failed, Reason.storage_error, str(DamagedRowsError())))
 
 
 def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:
@@ -207,8 +207,8 @@ def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:
     rejecting = tasks.c.seq.in_(needed), tasks.c.state == TaskState.rejected
     makers = []
     for row in book.connection.execute(select(tasks).where(or_(tasks.c.seq.in_(results), and_(*rejecting)))).all():
-        whole = [state for state in TaskState if state.is_settled and result_digest(row, state) == row.digest]
+        whole = [state for state in SETTLED if result_digest(row, state) == row.digest]
         state = [*whole, *(state for state in TaskState if state == row.state), TaskState.succeeded][0]
         book.connection.execute(update(tasks).where(tasks.c.seq == row.seq).values(state=state))
-        makers.append(Task(row.seq, Stage(row.stage), state))
+        makers.append(Task(row.seq, row.stage, state))
     remake(book, consumer, makers)

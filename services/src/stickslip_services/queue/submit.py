@@ -6,7 +6,7 @@ from itertools import islice
 
 from sqlalchemy import Connection, func, insert, select
 from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents.responses import JobDetail, Validation
 from stickslip_schemas.format.layout import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
@@ -22,11 +22,10 @@ from stickslip_services.database.database import Database, batches
 from stickslip_services.database.paging import document_of
 from stickslip_services.database.tables import dataset_versions, idempotency_keys, job_stages, jobs, tasks
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
-from stickslip_services.queue.closing import ledger
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.jobs import show_job
+from stickslip_services.queue.ledger import SETTLED, ledger
 from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, terms_for
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
 from stickslip_services.queue.workers import NO_WORKER, alive_workers
@@ -34,8 +33,6 @@ from stickslip_services.queue.write_plan import begin_planning, insert_job
 
 LOOKED_UP = 10_000
 """The largest grid whose tasks are looked up one by one for existing results."""
-
-_SETTLED = [state for state in TaskState if state.is_settled]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +79,7 @@ def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> 
             with ledger(connection, now) as book:
                 job = insert_job(book, spec, priority=priority, project=project)
                 if terms is None:
-                    set_job_state(book, job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
+                    book.set_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
                 else:
                     begin_planning(book, job, terms, plan)
             shown = show_job(context, connection, job)
@@ -180,7 +177,7 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
         plan = expand(spec, terms)
         with database.read() as connection:
             found = (
-                connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(_SETTLED)))
+                connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(SETTLED)))
                 for batch in batches(plan.tasks)
             )
             return sum(number or 0 for number in found)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, insert, select, text, update
+from sqlalchemy import Connection, bindparam, insert, select, update
 from stickslip_schemas.base.states import JobState, Reason, Stage
 from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
@@ -20,9 +20,8 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import new_id, task_id
-from stickslip_services.queue.ledger import RUNNABLE
+from stickslip_services.queue.ledger import HELD, RUNNABLE
 
 NO_WORKER = "no worker has told its builds yet; the job is planned when one does (see the workers page)"
 
@@ -143,7 +142,7 @@ def running_tasks(
     rows = connection.execute(
         select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
-        .where(text("tasks.owner IS NOT NULL"), own(jobs.c.project))
+        .where(HELD, own(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
     found: dict[str, list[responses.RunningTask]] = {}
@@ -204,7 +203,7 @@ def note_stranded(context: Context) -> None:
     with context.ledger() as book:
         for (job, state), message in _find_stranded(context, book.connection).items():
             reason = Reason.waiting_for_worker if message else None
-            set_job_state(book, job, JobState(state), reason=reason, message=message)
+            book.set_state(job, JobState(state), reason=reason, message=message)
 
 
 def _find_stranded(context: Context, connection: Connection) -> dict[tuple[int, str], str]:

@@ -7,10 +7,9 @@ wait for it; if it failed or was cancelled, the new job starts it again.
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, func, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 from stickslip_schemas.base.states import JobState, Stage, TaskState
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -24,14 +23,20 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.events import set_job_state
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
-from stickslip_services.queue.ledger import JOB_COUNTS, JOB_GROUPS, OVER, KeyedTask, Ledger, charge_tasks, reset_tasks
+from stickslip_services.queue.ledger import (
+    FRESH,
+    JOB_COUNTS,
+    JOB_GROUPS,
+    OVER,
+    SETTLED,
+    TASK,
+    TASK_COUNTS,
+    Ledger,
+    reassign,
+)
 from stickslip_services.queue.plan import Plan, PlannedTask, Terms
 
-_STARTED = select(func.sum(job_counts.c.count)).where(
-    job_counts.c.job == bindparam("b_job"), job_counts.c.state.in_((TaskState.leased, TaskState.running))
-)
 _LOST = (TaskState.failed, TaskState.cancelled)
 
 
@@ -66,13 +71,13 @@ def begin_planning(book: Ledger, job: int, terms: Terms, plan: Plan | None = Non
     rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
     insert_rows(book.connection, job_counts, ("job", "stage", "state", "count"), rows)
     insert_rows(book.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
-    set_job_state(book, job, JobState.planning if plan is None else JobState.queued)
+    book.set_state(job, JobState.planning if plan is None else JobState.queued)
     if plan is not None:
         write_plan(book, job, plan)
 
 
 def write_plan(book: Ledger, job: int, piece: Plan) -> None:
-    """Insert the tasks of a piece of a job; the last piece makes a `planning` job `queued` or `running`.
+    """Insert the tasks of a piece of a job; the last piece makes a `planning` job `queued`.
 
     If its dataset exists already, the job ends once the dataset has been checked (`recompute`).
     """
@@ -83,25 +88,18 @@ def write_plan(book: Ledger, job: int, piece: Plan) -> None:
     publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == piece.publish_key))
     done = {"publish_task": publish_task, "planner": None, "planner_until": None}
     book.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
-    if last is TaskState.succeeded:
+    if last == TaskState.succeeded:
         message = "the dataset exists already: its files are being checked"
-        set_job_state(book, job, JobState.queued, message=message)
-    elif book.connection.scalar(_STARTED, {"b_job": job}):
-        set_job_state(book, job, JobState.running)
+        book.set_state(job, JobState.queued, message=message)
     elif book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == job)) == JobState.planning:
-        set_job_state(book, job, JobState.queued)
+        book.set_state(job, JobState.queued)
 
 
-@dataclass(frozen=True, slots=True)
-class _Known(KeyedTask):
-    """A task that was in the database before the piece."""
-
-    reason: str | None
-    message: str
-    cost_group: str
+_KNOWN = [*TASK, *(tasks.c[name] for name in ("key", "reason", "message", "cost_group"))]
+"""Columns of tasks that were in the database before the piece."""
 
 
-def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
+def _insert_plan(book: Ledger, job: int, plan: Plan) -> str:
     """Insert the tasks of `job`; return the state of the last one."""
     connection = book.connection
     needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
@@ -111,7 +109,7 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
     earlier = rows_with(connection, of_job, job_tasks.c.task, (task.seq for task in known.values()))
     own = {row.task for row in earlier}  # of earlier pieces
     shared = [task for task in known.values() if task.seq not in own]
-    settled = rejected | {task.seq for task in shared if task.state.is_settled}
+    settled = rejected | {task.seq for task in shared if task.state in SETTLED}
     held = ((job, seq, seq in settled) for seq in seqs.values() if seq not in own)
     insert_rows(connection, job_tasks, ("job", "task", "cached"), held)
     insert_rows(
@@ -125,38 +123,40 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> TaskState:
         ),
     )
     new = Counter(
-        (Stage(task.stage), task.cost_group, TaskState.rejected if seqs[key] in rejected else TaskState.pending)
+        (task.stage, task.cost_group, TaskState.rejected if seqs[key] in rejected else TaskState.pending)
         for key, task in plan.tasks.items()
         if key not in known
     )
+    overall = Counter[Any]()
     for (stage, _, state), count in new.items():
-        book.inserted[stage, state] += count
+        overall[stage, state] += count
+    TASK_COUNTS.add(connection, overall)
     _add_counts(connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared))
     lost = [task for task in shared if task.state in _LOST]
-    reset_tasks(book, lost, dict.fromkeys((task.seq for task in lost), job))  # its moves change the counts
+    book.move(lost, TaskState.pending, **FRESH)  # which changes the counts
     for key, old in known.items():
         if old.state in _LOST and key in plan.tasks:  # its row may have been damaged
             values = {"payload": _payload(plan.tasks[key], job), "build": plan.tasks[key].build}
             connection.execute(update(tasks).where(tasks.c.seq == old.seq).values(values))
-    charge_tasks(connection, (task.seq for task in shared if not task.state.is_settled))
+    reassign(book, [task for task in shared if task.state not in SETTLED])
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
 
 
-def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, _Known]:
+def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, Any]:
     if not connection.scalar(select(tasks.c.seq).limit(1)):
         return {}
-    return {row.key: _Known.of(row) for row in rows_with(connection, select(*_Known.columns()), tasks.c.key, keys)}
+    return {row.key: row for row in rows_with(connection, select(*_KNOWN), tasks.c.key, keys)}
 
 
 def _insert_tasks(
-    connection: Connection, job: int, plan: Plan, known: Mapping[bytes, _Known]
+    connection: Connection, job: int, plan: Plan, known: Mapping[bytes, Any]
 ) -> tuple[dict[bytes, int], set[int]]:
     """Insert the tasks that are new, in the order of the plan.
 
     Return the `seq` of every task of the plan, and those of new renders whose simulation has been rejected before.
     """
     seqs = {key: task.seq for key, task in known.items()}
-    settled = {task.seq: task for task in known.values() if task.state.is_settled}
+    settled = {task.seq: task for task in known.values() if task.state in SETTLED}
     rejected: set[int] = set()
     rows: list[tuple[Any, ...]] = []
     dependencies: list[tuple[int, int]] = []
@@ -177,7 +177,7 @@ def _insert_tasks(
                 continue
             if needed not in settled:
                 waiting_on += 1
-            elif stage == Stage.render and settled[needed].state is TaskState.rejected:
+            elif stage == Stage.render and settled[needed].state == TaskState.rejected:
                 why = ("rejected", settled[needed].reason, settled[needed].message)
                 fate = (*why, row_digest(key, *why, None))
                 rejected.add(seq)
@@ -195,13 +195,13 @@ def _payload(task: PlannedTask, job: int) -> str:
     return task.payload
 
 
-def _add_counts(connection: Connection, job: int, held: Mapping[tuple[Stage, str, TaskState], int]) -> None:
+def _add_counts(connection: Connection, job: int, held: Mapping[tuple[str, str, str], int]) -> None:
     """Count tasks that a job has, by stage, cost group and state."""
-    counts, left, cached = Counter[Any](), Counter[Any](), Counter[Stage]()
+    counts, left, cached = Counter[Any](), Counter[Any](), Counter[str]()
     for (stage, group, state), count in held.items():
         counts[job, stage, state] += count
         left[job, stage, group] += count * (state not in OVER)
-        cached[stage] += count * state.is_settled
+        cached[stage] += count * (state in SETTLED)
     JOB_COUNTS.add(connection, counts)
     JOB_GROUPS.add(connection, left)
     for stage, count in (+cached).items():
