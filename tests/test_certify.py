@@ -93,7 +93,7 @@ def test_a_cloth_job_from_refusal_to_dataset(
         worker.work()
         job = client.job(submitted.stdout.strip())
         assert job.dataset is not None
-        manifest, _ = client.manifest(job.dataset.dataset, job.dataset.version)
+        manifest = client.contents(job.dataset.dataset, job.dataset.version).manifest
     assert isinstance(manifest, Manifest)
     assert manifest.certificate == entry.digest
     assert manifest.builds.sim_core == full.sim_core

@@ -15,9 +15,9 @@ import numpy as np
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
-from stickslip_schemas.kinds.cloth_drag import HELD_OUT_VIEWPOINTS, TRAINING_VIEWPOINTS, ClothDragRender
+from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_schemas.spec.fabrics import HELD_OUT_TEXTURES, Texture
+from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
 
 
@@ -50,8 +50,8 @@ def main() -> None:
     shown = instants if args.instants == ["all"] else [int(instant) for instant in args.instants]
     frames = [instants.index(instant) for instant in shown]
     runs = list(range(len(about))) if args.only is None else args.only
-    textures = [t for t in Texture if (t in HELD_OUT_TEXTURES) == args.held_out_textures]
-    views = HELD_OUT_VIEWPOINTS if args.held_out_viewpoints else TRAINING_VIEWPOINTS
+    textures = list(Texture)[-4:] if args.held_out_textures else list(Texture)[:-4]
+    views = VIEWPOINTS[3:] if args.held_out_viewpoints else VIEWPOINTS[:3]
     cameras = {camera.name: camera for camera in load_rig("drag")}
     random = np.random.default_rng(args.seed)
     own = None

@@ -183,7 +183,7 @@ def test_a_link_that_leaves_the_dataset_is_not_followed(tmp_path: Path) -> None:
 def test_a_malicious_manifest_writes_nothing(origin: tuple[str, str], tmp_path: Path) -> None:
     """The manifest's own model allows `a/../../b`; the client does not."""
     with Client(origin[0]) as client:
-        manifest, _ = client.manifest(origin[1], 1)
+        manifest = client.contents(origin[1], 1).manifest
     evil_file = manifest.files[0].model_copy(update={"path": "a/../../evil"})
     evil = manifest.model_copy(update={"files": (evil_file,)}).model_dump_json().encode()
     assert Manifest.model_validate_json(evil)

@@ -151,7 +151,7 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
     url, dataset, worker = origin
     context: Context = made.state.context
     with Client(url) as client:
-        entry = client.manifest(dataset, 1)[0].sections[2]
+        entry = client.contents(dataset, 1).manifest.sections[2]
         context.store.path(entry.sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
         job = client.submit(rods(gamma=GAMMAS))
         shown = client.job(job.id)

@@ -19,7 +19,7 @@ from stickslip_schemas.format.codecs import encode_clip, encode_sample
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
-from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation, ClothDragSpec, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS
@@ -313,7 +313,7 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")
-    assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(Viewpoint)
+    assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(VIEWPOINTS)
 
 
 def test_a_trajectory_is_encoded_once_for_all_its_renders(

@@ -14,7 +14,7 @@ from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.format.layout import layout
 from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read_picture
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
-from stickslip_schemas.kinds.cloth_drag import ClothDragRender, ClothDragSpec, Viewpoint
+from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragRender, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
@@ -54,10 +54,10 @@ def _spec(**more: Any) -> ClothDragSpec:
 def test_names_of_the_users_own_are_codes_after_the_built_in_ones() -> None:
     categories = {array.name: array.categories for array in layout(_spec())}
     assert categories["texture"] == (*Texture, "logo")
-    assert categories["viewpoint"] == (*Viewpoint, "lab")
+    assert categories["viewpoint"] == (*VIEWPOINTS, "lab")
     assert categories["lighting"] == (*Lighting, "bench")
     assert categories["substrate"] == (*Substrate, "baize")
-    assert [camera.name for camera in _spec().cameras()] == [*Viewpoint, "lab"]
+    assert [camera.name for camera in _spec().cameras()] == [*VIEWPOINTS, "lab"]
     assert _spec().artifacts == {"/textures/logo": "a" * 64}
 
 

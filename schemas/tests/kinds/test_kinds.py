@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
-from stickslip_schemas.kinds.cloth_drag import Viewpoint
+from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import Material, Texture
 
@@ -26,7 +26,7 @@ def test_codes_of_labels_are_pinned() -> None:
     }
     textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
     assert list(Texture)[:8] == textures
-    assert list(Viewpoint)[:3] == ["calibrated", "left", "right"]
+    assert list(VIEWPOINTS)[:3] == ["calibrated", "left", "right"]
     assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")
     assert SPLITS == ("train", "validation", "test")
 

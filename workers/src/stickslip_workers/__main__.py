@@ -27,18 +27,17 @@ STEADY_SECONDS = 60.0
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit status."""
+    blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
+    blender, stored = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
+    blender.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+    stored.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
     parser = argparse.ArgumentParser(prog="python -m stickslip_workers", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
+    both = [stored, blender]
 
-    dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray")
-    dispatch.add_argument(
-        "--url",
-        required=True,
-        action="append",
-        help="base URL of the coordinator; repeatable, the next where one is away",
-    )
-    dispatch.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
+    dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray", parents=both)
+    urls = "base URL of the coordinator; repeatable, the next where one is away"
+    dispatch.add_argument("--url", required=True, action="append", help=urls)
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
     dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
@@ -48,49 +47,48 @@ def main(arguments: list[str] | None = None) -> int:
     where.add_argument("--ray-address", help="the Ray cluster (default: RAY_ADDRESS, else one for this machine alone)")
     where.add_argument("--ray-data", type=Path, help="use the head that `head` runs for this data directory")
     dispatch.add_argument("--once", action="store_true", help="end when the cluster is gone")
-    dispatch.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+    dispatch.set_defaults(run=_dispatch)
 
     head = commands.add_parser("head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`")
     head.add_argument("--ray-data", type=Path, required=True, help="data directory that it is for")
     head.add_argument("--cpus", type=int, help="CPUs to use (default: all)")
+    head.set_defaults(run=_head)
 
-    replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
+    replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator", parents=both)
     replay.add_argument("task", type=Path, help="the task as JSON")
-    replay.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
-    replay.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+    replay.set_defaults(run=_replay)
 
     certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
     certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
     certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json")
-    certify.add_argument(
-        "--quick", action="store_true", help="measure a few points only; such a certificate does not count"
+    few = "measure a few points only; such a certificate does not count"
+    certify.add_argument("--quick", action="store_true", help=few)
+    certify.set_defaults(run=_certify)
+
+    drawn = commands.add_parser(
+        "preview", help="draw a scene, as `stickslip scene preview` hands it over", parents=both
     )
-
-    drawn = commands.add_parser("preview", help="draw a scene, as `stickslip scene preview` hands it over")
     drawn.add_argument("scene", type=Path, help="the scene as JSON")
-    drawn.add_argument("--store", type=_store, required=True, help="directory of the store with its files")
     drawn.add_argument("--out", type=Path, required=True, help="directory for the pictures")
-    drawn.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
+    drawn.set_defaults(run=_preview)
 
-    commands.add_parser("describe", help="print the builds of this environment")
+    commands.add_parser("describe", help="print the builds of this environment").set_defaults(run=_describe)
 
     options = parser.parse_args(arguments)
-    if options.command == "head":
-        from stickslip_workers import ray_head
-
-        ray_head.main(ray_head.own_directory(options.ray_data), options.cpus)
-        return 0
     if options.command == "dispatch" and not options.once:
         command = [sys.executable, "-m", "stickslip_workers", *(sys.argv[1:] if arguments is None else arguments)]
         return run_for_ever([*command, "--once"], Backoff(first=1.0, most=30.0))
-    if options.command == "dispatch":
-        return _dispatch(options)
-    if options.command == "replay":
-        return _replay(options)
-    if options.command == "certify":
-        return _certify(options)
-    if options.command == "preview":
-        return _preview(options)
+    return int(options.run(options))
+
+
+def _head(options: argparse.Namespace) -> int:
+    from stickslip_workers import ray_head
+
+    ray_head.main(ray_head.own_directory(options.ray_data), options.cpus)
+    return 0
+
+
+def _describe(_options: argparse.Namespace) -> int:
     from stickslip_workers.stages.run import StageActor
 
     sys.stdout.write(json.dumps(StageActor(os.devnull).describe(), indent=2) + "\n")

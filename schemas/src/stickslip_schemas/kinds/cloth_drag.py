@@ -1,7 +1,6 @@
 """A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3], seen by the rig `drag`."""
 
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -26,32 +25,9 @@ SELF_FRICTION = 0.5
 middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
 
-class Viewpoint(StrEnum):
-    """Cameras of the rig `drag`; the first is calibrated on the real stage, and the last twelve are held out.
-
-    Their order gives the codes of the label `viewpoint`: add new ones at the end.
-    """
-
-    calibrated = "calibrated"
-    left = "left"
-    right = "right"
-    azimuth_minus_15 = "azimuth-minus-15"
-    azimuth_minus_10 = "azimuth-minus-10"
-    azimuth_minus_5 = "azimuth-minus-5"
-    azimuth_plus_5 = "azimuth-plus-5"
-    azimuth_plus_10 = "azimuth-plus-10"
-    azimuth_plus_15 = "azimuth-plus-15"
-    elevation_minus_15 = "elevation-minus-15"
-    elevation_minus_10 = "elevation-minus-10"
-    elevation_minus_5 = "elevation-minus-5"
-    elevation_plus_5 = "elevation-plus-5"
-    elevation_plus_10 = "elevation-plus-10"
-    elevation_plus_15 = "elevation-plus-15"
-
-
-TRAINING_VIEWPOINTS = (Viewpoint.calibrated, Viewpoint.left, Viewpoint.right)
-HELD_OUT_VIEWPOINTS = tuple(view for view in Viewpoint if view not in TRAINING_VIEWPOINTS)
-"""`calibrated` turned about what it looks at, by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]."""
+VIEWPOINTS = tuple(camera.name for camera in load_rig(RIG))
+"""The first is calibrated on the real stage. The last twelve, to test with, are it, turned about what it looks at by 5,
+10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes of the label `viewpoint`."""
 
 Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
 Factor = Annotated[
@@ -63,7 +39,7 @@ FactorAxis = Annotated[
 ]
 MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
 ViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(Viewpoint)]], SHORTHAND, VIEWPOINT
+    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(VIEWPOINTS)]], SHORTHAND, VIEWPOINT
 ]
 
 
@@ -130,7 +106,7 @@ class ClothDragSpec(ClipSpec):
     custom = (
         {"material": Custom("materials", "fabric", tuple(Material))}
         | dict(ClipSpec.custom)
-        | {"viewpoint": Custom("viewpoints", "camera", tuple(Viewpoint))}
+        | {"viewpoint": Custom("viewpoints", "camera", VIEWPOINTS)}
     )
     instants = 300
     instants_per_second = 2.4

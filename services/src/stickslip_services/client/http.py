@@ -228,13 +228,9 @@ class Client:
 
     def contents(self, dataset: str, version: int) -> Contents:
         """Return what the manifest of a version lists; sections of a large one are fetched on demand."""
-        root = f"/v1/datasets/{dataset}/versions/{version}/files/"
-        manifest, _ = self.manifest(dataset, version)
-        return Contents(manifest, lambda file: self.request("GET", root + file.path).content)
-
-    def manifest(self, dataset: str, version: int) -> tuple[Manifest, bytes]:
-        response = self.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
-        return parsed(Manifest, response), response.content
+        root = f"/v1/datasets/{dataset}/versions/{version}"
+        manifest = self._call(Manifest, "GET", f"{root}/manifest")
+        return Contents(manifest, lambda file: self.request("GET", f"{root}/files/{file.path}").content)
 
     def newest(self, dataset: str) -> int:
         """Return the number of the newest version of a dataset; raise ClientError if it has none yet."""
