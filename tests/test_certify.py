@@ -87,7 +87,7 @@ def test_a_cloth_job_from_refusal_to_dataset(
         assert refused.exit_code == 1
         assert f"it must have {', '.join(CONTACT_PROTOCOLS)}, since cloth touches cloth" in refused.stderr
         entry = client.register(full)
-        assert client.certificate(entry.digest) == full
+        assert client.request("GET", entry.href).content == full.canonical()
         submitted = cli("submit", spec)
         assert submitted.exit_code == 0, submitted.output
         worker.work()

@@ -72,10 +72,6 @@ class UnknownWorkerError(StickslipError):
     """No worker has registered under this id."""
 
 
-class MissingArtifactError(StickslipError):
-    """An artifact that the database refers to is missing or damaged in the store."""
-
-
 class DamagedRowsError(StickslipError):
     """Rows of the database have other values than were written; tasks can make `results` again."""
 

@@ -11,7 +11,6 @@ from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.problems import ProblemError
-from stickslip_services.errors import MissingArtifactError
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".webp": "image/webp", ".html": "text/html"}
@@ -47,10 +46,7 @@ def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: in
     }
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
-    try:
-        size = store.size(digest) if size is None else size
-    except OSError as error:
-        raise MissingArtifactError(f"artifact {digest} is not in the store") from error
+    size = store.size(digest) if size is None else size
     media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix, "application/octet-stream")
     wanted = request.headers.get("range")
     if wanted is not None and request.headers.get("if-range", etag).strip() != etag:

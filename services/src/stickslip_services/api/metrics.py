@@ -1,18 +1,20 @@
 """Prometheus metrics: the queue and the store, read at each scrape, and counters since the start."""
 
 from collections import Counter as Counts
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from sqlalchemy import func, select, text
+from sqlalchemy import func, select
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.ledger import HELD
 from stickslip_services.queue.workers import alive_workers
 
 
@@ -21,36 +23,38 @@ class _QueueCollector(Collector):
         self._context = context
 
     def collect(self) -> Iterable[Metric]:
-        tasks = GaugeMetricFamily("stickslip_tasks", "Tasks by stage and state", labels=["stage", "state"])
-        by_state = GaugeMetricFamily("stickslip_jobs", "Jobs by state", labels=["state"])
-        leases = GaugeMetricFamily("stickslip_leases", "Tasks on lease by worker", labels=["worker"])
-        workers = GaugeMetricFamily("stickslip_workers", "Workers with a recent message")
-        slots = GaugeMetricFamily("stickslip_worker_slots", "Slots of workers with a recent message")
+        own = dataset_versions.c
+        sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
         with self._context.database.read() as connection:
             alive = alive_workers(self._context, connection)
-            for stage, state, count in connection.execute(select(task_counts)):
-                tasks.add_metric([stage, state], count)
-            for state, count in connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)):
-                by_state.add_metric([state], count)
-            held = Counts(connection.scalars(select(tasks_.c.owner).where(text("tasks.owner IS NOT NULL"))).all())
-            own = dataset_versions.c
-            sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
+            tasks = connection.execute(select(task_counts)).all()
+            by_state = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
+            held = Counts(connection.scalars(select(tasks_.c.owner).where(HELD)).all())
             count, size, bad, read_at = connection.execute(select(*sums).where(own.manifest.is_not(None))).one()
-        versions = GaugeMetricFamily("stickslip_dataset_versions", "Dataset versions", value=count)
-        size_text = "Size of the files of all dataset versions"
-        bytes_ = GaugeMetricFamily("stickslip_dataset_bytes", size_text, value=size or 0)
-        damaged = GaugeMetricFamily("stickslip_damaged_files", "Files that scrubbing found damaged", value=bad or 0)
-        age = self._context.clock() - read_at if count else 0.0
-        unread = GaugeMetricFamily("stickslip_unread_seconds", "Age of the oldest scrub of a version [s]", value=age)
-        disk = GaugeMetricFamily("stickslip_store_disk_bytes", "Disk of the store", labels=["state"])
-        if (room := self._context.store.room()) is not None:
-            disk.add_metric(["free"], room.free)
-            disk.add_metric(["used"], room.used)
-        for worker in alive:
-            leases.add_metric([worker.name], held[worker.id])
-        workers.add_metric([], len(alive))
-        slots.add_metric([], sum(worker.condition.slots for worker in alive))
-        return [tasks, by_state, leases, workers, slots, versions, bytes_, damaged, unread, disk]
+        age, room = self._context.clock() - read_at if count else 0.0, self._context.store.room()
+        disk = () if room is None else (("free", room.free), ("used", room.used))
+        return [
+            _gauge("tasks", "Tasks by stage and state", tasks, "stage", "state"),
+            _gauge("jobs", "Jobs by state", by_state, "state"),
+            _gauge("leases", "Tasks on lease by worker", [(one.name, held[one.id]) for one in alive], "worker"),
+            _gauge("workers", "Workers with a recent message", [(len(alive),)]),
+            _gauge(
+                "worker_slots", "Slots of workers with a recent message", [(sum(w.condition.slots for w in alive),)]
+            ),
+            _gauge("dataset_versions", "Dataset versions", [(count,)]),
+            _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),
+            _gauge("damaged_files", "Files that scrubbing found damaged", [(bad or 0,)]),
+            _gauge("unread_seconds", "Age of the oldest scrub of a version [s]", [(age,)]),
+            _gauge("store_disk_bytes", "Disk of the store", disk, "state"),
+        ]
+
+
+def _gauge(name: str, text: str, rows: Iterable[Sequence[Any]], *labels: str) -> Metric:
+    """Return a gauge from rows of the values of its labels and its own."""
+    made = GaugeMetricFamily(f"stickslip_{name}", text, labels=labels)
+    for *of_labels, value in rows:
+        made.add_metric(of_labels, value)
+    return made
 
 
 class Metrics:

@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match, Route
 from starlette.types import Receive, Scope, Send
 from stickslip_schemas.documents.problems import MEDIA_TYPE, FieldError, Problem, ProblemCode
+from stickslip_schemas.format.manifest import BrokenSectionError
 
 from stickslip_services import errors
 from stickslip_services.pages.rendering import html_page
@@ -26,7 +27,6 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
     errors.UnknownFileError: (422, ProblemCode.validation_failed),
-    errors.MissingArtifactError: (500, ProblemCode.storage_error),
     errors.DamagedRowsError: (500, ProblemCode.storage_error),
 }
 
@@ -67,8 +67,8 @@ class ProblemError(Exception):
 
 
 def install(app: FastAPI) -> None:
-    known = (ProblemError, errors.StickslipError, RequestValidationError, HTTPException, OperationalError, Exception)
-    for sort in known:
+    known = (ProblemError, errors.StickslipError, RequestValidationError, HTTPException, OperationalError)
+    for sort in (*known, OSError, BrokenSectionError, Exception):
         app.add_exception_handler(sort, _answer)
 
 
@@ -120,6 +120,9 @@ def _problem_of(request: Request, error: Exception) -> ProblemError:
             detail = "the coordinator cannot use its database (is the disk full?); its log says more"
             return ProblemError(503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"})
     logger.error("%s %s failed", request.method, path, exc_info=error)
+    if isinstance(error, OSError | BrokenSectionError):
+        detail = "a file is missing or damaged in the store, or the store is out of reach; the log says more"
+        return ProblemError(500, ProblemCode.storage_error, detail)
     return ProblemError(500, ProblemCode.internal_error, "the coordinator has a fault; its log says more")
 
 

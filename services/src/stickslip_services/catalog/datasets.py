@@ -4,16 +4,15 @@ from functools import lru_cache, partial
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, select
-from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry
-from stickslip_schemas.store import Store
+from stickslip_schemas.format.manifest import FileEntry
+from stickslip_schemas.store import CorruptArtifactError, Store
 
 from stickslip_services.access.asker import own_version
 from stickslip_services.catalog.versions import sealed_digests, stored_contents
 from stickslip_services.database.paging import PageRequest, document_of, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
-from stickslip_services.errors import MissingArtifactError, NotFoundError
+from stickslip_services.errors import NotFoundError
 
 
 def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
@@ -39,42 +38,23 @@ def find_version(connection: Connection, dataset: str, version: int) -> DatasetV
 
 
 def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
-    """Return the file at `path` of a version; raise NotFoundError where the version has none."""
+    """Return the file at `path` of a version; raise NotFoundError where the version has none.
+
+    Raises OSError or BrokenSectionError where the store has lost or damaged it, or what lists it.
+    """
     digests = sealed_digests(version.manifest, version.group)
     if path in digests:
-        return FileEntry(path=path, sha256=digests[path], size=_size(store, digests[path]))
-    file = _listed(store, version.manifest, path)
+        return FileEntry(path=path, sha256=digests[path], size=store.size(digests[path]))
+    file = read_contents(store, version.manifest).file(path)
     if file is None:
         raise NotFoundError(f"version {version.version} has no file {path[:200]!r}")
-    if _size(store, file.sha256) != file.size:
-        raise MissingArtifactError(f"file {path} of version {version.version} is damaged in the store")
+    if store.size(file.sha256) != file.size:
+        raise CorruptArtifactError(f"file {path} of version {version.version} is damaged in the store")
     return file
 
 
-@lru_cache(maxsize=16)
-def read_contents(store: Store, manifest: Sha256) -> Contents:
-    """Return what a manifest lists; raise MissingArtifactError where it is damaged or lost.
-
-    A manifest never changes, so it is cached. A section is read with the first request for one of its files.
-    """
-    try:
-        return stored_contents(store, manifest)
-    except OSError as error:
-        raise MissingArtifactError(f"the manifest {manifest} is damaged or not in the store") from error
-
-
-def _listed(store: Store, manifest: Sha256, path: str) -> FileEntry | None:
-    try:
-        return read_contents(store, manifest).file(path)
-    except (OSError, BrokenSectionError) as error:
-        raise MissingArtifactError(f"a section of the manifest {manifest} is damaged or not in the store") from error
-
-
-def _size(store: Store, digest: Sha256) -> int:
-    try:
-        return store.size(digest)
-    except OSError as error:
-        raise MissingArtifactError(f"artifact {digest} is not in the store") from error
+read_contents = lru_cache(maxsize=16)(stored_contents)
+"""Returns what a manifest lists. It never changes; a section is read with the first request for one of its files."""
 
 
 def _is_own() -> ColumnElement[bool]:

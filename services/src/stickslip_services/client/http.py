@@ -26,7 +26,6 @@ from stickslip_schemas.documents.responses import (
     JobProgressEvent,
     JobStateEvent,
     Page,
-    Preview,
     SampleState,
     TaskStateEvent,
     TextureEntry,
@@ -155,9 +154,6 @@ class Client:
         query = {} if state is None else {"state": str(state)}
         return self._items(Page[SampleState], f"/v1/jobs/{job_id}/samples", query)
 
-    def previews(self, job_id: str) -> list[Preview]:
-        return self._call(list[Preview], "GET", f"/v1/jobs/{job_id}/previews")
-
     def prioritise(self, job_id: str, priority: int) -> JobDetail:
         """Set the priority of a job: tasks of the job with the highest number run first."""
         return self._call(JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
@@ -267,9 +263,6 @@ class Client:
     def certificates(self) -> Iterator[CertificateEntry]:
         """Yield all certificates, newest first."""
         return self._items(Page[CertificateEntry], "/v1/certificates")
-
-    def certificate(self, digest: str) -> Certificate:
-        return self._call(Certificate, "GET", f"/v1/certificates/{digest}")
 
     def register(self, certificate: Certificate) -> CertificateEntry:
         """Register a certificate. Registering it again changes nothing."""

@@ -89,6 +89,11 @@ def safe_path(target: Path, path: str) -> Path:
 
 def verify(target: Path) -> list[Fault]:
     """Return the faults of the dataset in `target`, by path; an intact dataset has none."""
+    return sorted(_found(target), key=lambda fault: fault.path)
+
+
+def _found(target: Path) -> list[Fault]:
+    """Return the faults of the first check that finds some: of the seal, of a part, of the sections, of the files."""
     sealed: dict[str, bytes] = {}
     for name in SEALED_NAMES:
         try:
@@ -111,7 +116,7 @@ def verify(target: Path) -> list[Fault]:
             return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {selection.manifest}")]
         needed = part_files(contents, selection.selection, None)
         if faults := _faults(target, needed):  # the other files of a part follow from its labels
-            return sorted(faults, key=lambda fault: fault.path)
+            return faults
         label = partial(read_label, target, manifest)
         numbers = sections_of(contents, selection.selection, label)
         chosen = selection.selection
@@ -122,7 +127,7 @@ def verify(target: Path) -> list[Fault]:
     # A damaged section lists no files.
     sections = [manifest.sections[number] for number in numbers] if manifest.sections else []
     if faults := _faults(target, sections):
-        return sorted(faults, key=lambda fault: fault.path)
+        return faults
     there = set(files_below(target))
     try:
         wanted = {file.path: file for file in part_files(contents, chosen, label)}
@@ -132,12 +137,8 @@ def verify(target: Path) -> list[Fault]:
     except (OSError, BrokenSectionError) as error:
         return [Fault(MANIFEST_NAME, "manifest", str(error))]
     faults = _faults(target, list(wanted.values()))
-    for path in there:
-        if path not in wanted and path not in OWN_NAMES:
-            faults.append(Fault(path, "extra", "not in the manifest"))
-    if not faults and READS_ARRAYS:
-        faults = _sample_key_faults(target, contents, numbers)
-    return sorted(faults, key=lambda fault: fault.path)
+    faults += [Fault(path, "extra", "not in the manifest") for path in there - wanted.keys() - {*OWN_NAMES}]
+    return faults or (_sample_key_faults(target, contents, numbers) if READS_ARRAYS else [])
 
 
 def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:

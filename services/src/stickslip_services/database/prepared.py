@@ -6,7 +6,7 @@ SQLAlchemy events.
 """
 
 from collections import namedtuple
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -47,22 +47,15 @@ class Prepared:
 
     def tuples(self, connection: Connection, values: Values | None = None) -> list[Any]:
         """Return the rows as plain tuples, also those of a statement that is written as text."""
-        sql, parameters = self._filled(connection, values or {})
-        with _translated(connection, sql):
-            found: list[Any] = _driver(connection).execute(sql, parameters).fetchall()
-        return found
+        return list(self._executed(connection, values or {}, lambda cursor: cursor.fetchall()))
 
     def scalar(self, connection: Connection, values: Values | None = None) -> Any:
         """Return the first column of the first row; None if there is no row."""
-        sql, parameters = self._filled(connection, values or {})
-        with _translated(connection, sql):
-            row = _driver(connection).execute(sql, parameters).fetchone()
+        row = self._executed(connection, values or {}, lambda cursor: cursor.fetchone())
         return None if row is None else row[0]
 
     def run(self, connection: Connection, values: Values) -> None:
-        sql, parameters = self._filled(connection, values)
-        with _translated(connection, sql):
-            _driver(connection).execute(sql, parameters)
+        self._executed(connection, values, lambda _: None)
 
     def run_all(self, connection: Connection, values: Sequence[Values]) -> None:
         """Execute it with each of the values, if there are any; it must not have expanding parameters."""
@@ -77,7 +70,7 @@ class Prepared:
             else:
                 _driver(connection).executemany(compiled.sql, rows)
 
-    def _filled(self, connection: Connection, values: Values) -> tuple[str, list[Any]]:
+    def _executed(self, connection: Connection, values: Values, fetch: Callable[[Any], Any]) -> Any:
         compiled = self._compile(connection.dialect)
         sql = compiled.sql
         for name, none in compiled.lists.items():
@@ -90,7 +83,8 @@ class Prepared:
                 parameters.extend(value)
             else:
                 parameters.append(value)
-        return sql, parameters
+        with _translated(connection, sql):
+            return fetch(_driver(connection).execute(sql, parameters))
 
     def _compile(self, dialect: Dialect) -> _Compiled:
         compiled = self._compiled.get(dialect.name)

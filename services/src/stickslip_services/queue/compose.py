@@ -18,7 +18,7 @@ from stickslip_schemas.store import in_parallel
 
 from stickslip_services.access.asker import own_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
-from stickslip_services.database.database import batches, rows_with
+from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
@@ -37,26 +37,21 @@ STORED_TASK = [*TASK, *(tasks.c[name] for name in ("key", "build", "payload", "p
 """Columns of a task from which its document is composed."""
 
 
-def compose_tasks(connection: Connection, stored: Sequence[Any], publish: Publish) -> dict[int, AnyTask]:
-    """Return the documents of tasks by `seq`; all their dependencies must be settled.
+def compose_task(connection: Connection, task: Any, publish: Publish) -> AnyTask:
+    """Return the document of a task, a row with `STORED_TASK`; all its dependencies must be settled.
 
     Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with `publish`, which takes a
     while: do not call this in a write transaction.
     """
-    renders = [task for task in stored if task.stage == Stage.render]
-    composed = _render_tasks(connection, renders) if renders else {}
-    for task in stored:
-        if task.stage == Stage.simulate:
-            composed[task.seq] = _simulate_task(task)
-        elif task.stage == Stage.pack:
-            composed[task.seq] = _pack_task(connection, task)
-        elif task.stage == Stage.publish:
-            composed[task.seq] = _publish_task(connection, task, publish)
-    return composed
+    if task.stage == Stage.simulate:
+        return _simulate_task(task)
+    if task.stage == Stage.render:
+        return _render_task(connection, task)
+    return _pack_task(connection, task) if task.stage == Stage.pack else _publish_task(connection, task, publish)
 
 
 def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
-    """Return a task by its name, composed as by `compose_tasks`.
+    """Return a task by its name, see `compose_task`.
 
     Raises NotFoundError, or ConflictError where its dependencies are not settled.
     """
@@ -67,7 +62,7 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:
         raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
-    return compose_tasks(connection, [row], publish)[row.seq]
+    return compose_task(connection, row, publish)
 
 
 def _simulate_task(task: Any) -> AnyTask:
@@ -81,29 +76,18 @@ def _check_key(task: Any, key: Sha256) -> None:
         raise DamagedRowsError
 
 
-def _render_tasks(connection: Connection, group: list[Any]) -> dict[int, AnyTask]:
-    seqs = [task.seq for task in group]
-    edges = [
-        (row.task, row.depends_on)
-        for row in rows_with(connection, select(task_dependencies), task_dependencies.c.task, seqs)
-    ]
-    made = _results(connection, {needed for _, needed in edges})
-    simulated = {task: made[needed] for task, needed in edges}
-    composed: dict[int, AnyTask] = {}
-    for task in group:
-        simulation = simulated[task.seq]
-        render = json.loads(task.payload)
-        document = {"render": render, "simulation": simulation.key.hex(), "build": task.build}
-        _check_key(task, content_key("render", document))
-        if simulation.output is None:
-            raise ConflictError(f"the render {task.key.hex()} has nothing to render: its simulation was rejected")
-        record = json.loads(simulation.output)["record"]
-        composed[task.seq] = RenderTask.model_validate(
-            {"render": render, "record": record, "preview": bool(task.preview)}
-        )
-    return composed
+def _render_task(connection: Connection, task: Any) -> RenderTask:
+    (simulation,) = _results(connection, _needed(connection, task)).values()
+    render = json.loads(task.payload)
+    document = {"render": render, "simulation": simulation.key.hex(), "build": task.build}
+    _check_key(task, content_key("render", document))
+    if simulation.output is None:
+        raise ConflictError(f"the render {task.key.hex()} has nothing to render: its simulation was rejected")
+    record = json.loads(simulation.output)["record"]
+    return RenderTask.model_validate({"render": render, "record": record, "preview": bool(task.preview)})
 
 
+_NEEDED = Prepared(select(task_dependencies.c.depends_on).where(task_dependencies.c.task == bindparam("b_task")))
 _RESULTS = Prepared(
     select(
         *(tasks.c[name] for name in ("seq", "key", "state", "reason", "message", "output", "payload", "digest"))
@@ -116,6 +100,10 @@ _SAMPLES = Prepared(
     )
     .order_by(samples.c.slot)
 )
+
+
+def _needed(connection: Connection, task: Any) -> set[int]:
+    return {seq for (seq,) in _NEEDED.tuples(connection, {"b_task": task.seq})}
 
 
 def _results(connection: Connection, seqs: Collection[int]) -> dict[int, Any]:
@@ -169,8 +157,7 @@ def _publish_task(connection: Connection, task: Any, publish: Publish) -> Publis
     payload = json.loads(task.payload)
     job = payload["job"]
     spec, terms = read_plan(connection, job)
-    needed = select(task_dependencies.c.depends_on).where(task_dependencies.c.task == task.seq)
-    rows = _results(connection, set(connection.scalars(needed))).values()
+    rows = _results(connection, _needed(connection, task)).values()
     packed = {json.loads(row.payload)["shard"]: row for row in rows}
     certificate = payload.get("certificate")
     pack_keys = [packed[shard].key.hex() for shard in sorted(packed)]

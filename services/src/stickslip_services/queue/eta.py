@@ -1,4 +1,4 @@
-"""What tasks cost, and the time that is left, from measured durations, with its uncertainty.
+"""Progress of jobs, what tasks cost, and the time that is left, from measured durations, with its uncertainty.
 
 With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over k_g measured tasks,
 and p slots to run them on,
@@ -15,17 +15,19 @@ leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 %
 The cost of a task is its share of the wall time of the call that made it; the call is what can hang.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
-from typing import Self
+from typing import Any, Self
 
-from sqlalchemy import Connection, select
-from stickslip_schemas.base.states import Stage
-from stickslip_schemas.documents.responses import Eta
+from sqlalchemy import Connection, Row, select
+from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
+from stickslip_schemas.documents.tasks import TaskResult
 
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import cost_groups
+from stickslip_services.database.tables import cost_groups, job_counts, job_groups, job_stages, job_tasks, tasks
+from stickslip_services.queue.ids import task_key
 
 QUANTILE_80 = 1.2816
 MODEL_ERROR = 0.15  # f
@@ -71,21 +73,6 @@ class StageTimings:
         if self.count < 2:
             return self.mean**2
         return max(0.0, (self.squares - self.total * self.mean) / (self.count - 1))
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """The measured cost of one task."""
-
-    task: int
-    stage: Stage
-    kind: str
-    cost_group: str
-    cpu_seconds: float
-    wall_seconds: float
-    """Its share of the call that made it."""
-    call_seconds: float | None
-    """The whole call; None if it is not representative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,12 +185,13 @@ def long_groups(costs: Mapping[Group, Cost], stage: Stage, kind: str, at_most: f
     ]
 
 
-def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
-    """Add the costs of tasks; calls that are not representative are skipped."""
-    by_group: dict[Group, list[tuple[float, float]]] = {}
-    for run in runs:
-        if run.call_seconds is not None:
-            by_group.setdefault((run.stage, run.kind, run.cost_group), []).append((run.wall_seconds, run.call_seconds))
+def add_costs(connection: Connection, runs: Sequence[tuple[Any, TaskResult]]) -> None:
+    """Add the costs of tasks that have a representative call; rejections often come early."""
+    by_group: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for task, run in runs:
+        if run.call_seconds is not None and run.outcome == "succeeded":
+            group = by_group.setdefault((task.stage, task.kind, task.cost_group), [])
+            group.append((run.wall_seconds, run.call_seconds))
     for (stage, kind, cost_group), costs in by_group.items():
         wall, call = (StageTimings.of(seconds) for seconds in zip(*costs, strict=True))
         sums = {"n": wall.count, "wall": wall.total, "wall2": wall.squares, "call": call.total, "call2": call.squares}
@@ -220,3 +208,82 @@ _ADD_TO_COST_GROUPS = Prepared(
         for column in ("count", "wall_sum", "wall_squares", "call_sum", "call_squares")
     )
 )
+
+
+Frames = Mapping[str, tuple[int, int]]
+"""Progress of running simulations by task: (frames done, frames total)."""
+
+
+def read_progress(
+    connection: Connection, rows: Collection[Row[tuple[object, ...]]], slots: Mapping[int, int], frames: Frames
+) -> dict[int, Progress]:
+    """Return the progress of jobs (rows of `jobs`) by `seq`; `slots` is the number of tasks that can run at once."""
+    seqs, costs = [row.seq for row in rows], read_costs(connection)
+    counts: dict[tuple[int, str], dict[TaskState, int]] = {}
+    for job, stage, state, count in connection.execute(select(job_counts).where(job_counts.c.job.in_(seqs))):
+        counts.setdefault((job, stage), {})[TaskState(state)] = count
+    stages = {
+        (row.job, row.stage): row for row in connection.execute(select(job_stages).where(job_stages.c.job.in_(seqs)))
+    }
+    running = [row.seq for row in rows if row.state in (JobState.queued, JobState.running)]
+    groups: dict[tuple[int, str], list[tuple[str, int]]] = {}
+    if running:
+        for job, stage, group, left in connection.execute(select(job_groups).where(job_groups.c.job.in_(running))):
+            groups.setdefault((job, stage), []).append((group, left))
+    told = _frames(connection, seqs, frames)
+
+    def progress_of(row: Row[tuple[object, ...]]) -> Progress:
+        shown: dict[Stage, StageProgress] = {}
+        work: dict[Stage, list[StageWork]] = {}
+        for stage in Stage:
+            kept = stages.get((row.seq, stage))
+            if kept is None:  # not planned yet
+                continue
+            mine = [each for key, of_group in told.items() if key[:2] == (row.seq, stage) for each in of_group]
+            shown[stage] = StageProgress(
+                counts={state: count for state, count in counts[row.seq, stage].items() if count},
+                cached=kept.cached,
+                cpu_seconds=kept.cpu_seconds,
+                frames=(sum(done for done, _ in mine), sum(total for _, total in mine)) if mine else None,
+            )
+            work[stage] = []
+            for group, left in groups.get((row.seq, stage), ()):
+                finished = sum(done / max(total, 1) for done, total in told.get((row.seq, stage, group), ()))
+                work[stage].append(StageWork(left - finished, timings_of(costs, stage, row.kind, group)))
+        eta = None
+        if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
+            eta = estimate(work, slots=slots.get(row.seq, 0))
+        return Progress(
+            done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
+            total=sum(count for stage in shown.values() for count in stage.counts.values()),
+            planned=row.planned,
+            stages=shown,
+            eta=eta,
+        )
+
+    return {row.seq: progress_of(row) for row in rows}
+
+
+def _frames(
+    connection: Connection, seqs: list[int], frames: Frames
+) -> dict[tuple[int, str, str], list[tuple[int, int]]]:
+    """Return what running simulations report, (frames done, frames total), by job, stage and cost group."""
+    found: dict[tuple[int, str, str], list[tuple[int, int]]] = {}
+    by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
+    if not by_key:
+        return found
+    rows = connection.execute(
+        select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, tasks.c.key)
+        .join(tasks, tasks.c.seq == job_tasks.c.task)
+        .where(tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs))
+    )
+    for job, stage, group, key in rows:
+        found.setdefault((job, stage, group), []).append(by_key[key])
+    return found
+
+
+def rejected_samples(progress: Progress) -> int:
+    """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
+    rendered = progress.stages.get(Stage.render)
+    last = rendered if rendered is not None and rendered.counts else progress.stages.get(Stage.simulate)
+    return 0 if last is None else last.counts.get(TaskState.rejected, 0)

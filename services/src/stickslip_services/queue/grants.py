@@ -77,19 +77,17 @@ def has_ready_task(
     """Return whether a request for these stages would be granted a task of at most `at_most` seconds a call."""
     costs = {} if at_most is None else read_costs(connection)
     return any(
-        _READY_TASK.scalar(
-            connection,
-            {
-                "b_stage": stage,
-                "b_build": build,
-                "b_kind": kind,
-                "b_left_out": long_groups(costs, stage, kind, at_most),
-            },
-        )
+        _READY_TASK.scalar(connection, _group(costs, stage, kind, build, at_most))
         for kind, builds in worker.builds.items()
         for stage, build in builds.by_stage.items()
         if stage in stages
     )
+
+
+def _group(costs: Mapping[Group, Cost], stage: Stage, kind: str, build: str, at_most: float | None) -> dict[str, Any]:
+    """Return the parameters of `_OF_GROUP`."""
+    left_out = long_groups(costs, stage, kind, at_most)
+    return {"b_stage": stage, "b_build": build, "b_kind": kind, "b_left_out": left_out}
 
 
 def grant_leases(
@@ -130,21 +128,10 @@ def _pick(
     """Choose ready tasks of a stage (rows of `_READY_TASKS`), one at a time, in the order that the module describes."""
     queues: dict[str, list[_Waiting]] = {}
     for job, project, priority, on_lease in _JOBS_WITH_PENDING.tuples(connection, {"b_stage": stage}):
-        ready = [
-            task
-            for kind, builds in worker.builds.items()
-            for task in _READY_TASKS.rows(
-                connection,
-                {
-                    "b_stage": stage,
-                    "b_build": builds.by_stage[stage],
-                    "b_kind": kind,
-                    "b_left_out": long_groups(costs, stage, kind, at_most),
-                    "b_job": job,
-                    "b_count": count,
-                },
-            )
-        ]
+        ready: list[Any] = []
+        for kind, builds in worker.builds.items():
+            group = _group(costs, stage, kind, builds.by_stage[stage], at_most)
+            ready += _READY_TASKS.rows(connection, group | {"b_job": job, "b_count": count})
         if ready:
             queues.setdefault(project, []).append((-priority, on_lease, job, ready[::-1]))
     for queue in queues.values():

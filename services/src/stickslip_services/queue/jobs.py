@@ -24,10 +24,9 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import events, job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.eta import StageTimings, read_costs
+from stickslip_services.queue.eta import Frames, StageTimings, read_progress, rejected_samples
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.ledger import RUNNABLE, SETTLED
-from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
 from stickslip_services.queue.recompute import check_results, check_samples, terms_of
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
@@ -190,7 +189,7 @@ def _shown(
 ) -> list[Job]:
     served = (JobState.queued, JobState.running)
     slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served}
-    progress = read_progress(connection, rows, slots, costs=read_costs(connection), frames=frames)
+    progress = read_progress(connection, rows, slots, frames)
     return [
         document_of(
             Job,

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, select, update
 from stickslip_schemas.base.states import Reason, TaskState
-from stickslip_schemas.documents.tasks import AnyTask, PublishTask
+from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
     HeartbeatAnswer,
@@ -24,7 +24,7 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
-from stickslip_services.queue.compose import UNSOUND, Publish, compose_tasks
+from stickslip_services.queue.compose import UNSOUND, Publish, compose_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.grants import grant_leases, has_ready_task
 from stickslip_services.queue.ids import task_key
@@ -175,17 +175,14 @@ def _compose_leases(
     connection: Connection, grants: Sequence[tuple[Any, dict[str, Any]]], publish: Publish
 ) -> tuple[tuple[Lease, ...], dict[int, Sequence[int]]]:
     """Return the leases of granted tasks, and by task the damaged results where rows that it needs are damaged."""
-    composed: dict[int, AnyTask] = {}
+    leases: list[Lease] = []
     damaged: dict[int, Sequence[int]] = {}
-    try:
-        composed = compose_tasks(connection, [task for task, _ in grants], publish)
-    except UNSOUND:
-        for task, _ in grants:
-            try:
-                composed |= compose_tasks(connection, [task], publish)
-            except UNSOUND as error:
-                damaged[task.seq] = getattr(error, "results", ())
-    return tuple(Lease(task=composed[task.seq], **terms) for task, terms in grants if task.seq in composed), damaged
+    for task, terms in grants:
+        try:
+            leases.append(Lease(task=compose_task(connection, task, publish), **terms))
+        except UNSOUND as error:
+            damaged[task.seq] = getattr(error, "results", ())
+    return tuple(leases), damaged
 
 
 def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -> None:

@@ -31,12 +31,13 @@ from stickslip_schemas.documents.responses import (
     JobStateEvent,
     TaskStateEvent,
 )
+from stickslip_schemas.documents.tasks import TaskResult
 
 from stickslip_services.database.database import batches
 from stickslip_services.database.paging import document_of
 from stickslip_services.database.prepared import Counters, Prepared
 from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
-from stickslip_services.queue.eta import Run, add_costs
+from stickslip_services.queue.eta import add_costs
 from stickslip_services.queue.ids import task_id
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
@@ -120,7 +121,7 @@ class Ledger:
         self.connection = connection
         self.now = now
         self._moves: list[tuple[Any, TaskState]] = []
-        self._runs: list[Run] = []
+        self._runs: list[tuple[Any, TaskResult]] = []
         self.given_up: set[int] = set()
         """Jobs whose tasks this transaction gives up: their counters follow, also after they have ended."""
 
@@ -144,9 +145,9 @@ class Ledger:
         """Note that leased tasks have been started: from here on they may fail."""
         self.move(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
 
-    def ran(self, run: Run) -> None:
-        """Note the cost of a task."""
-        self._runs.append(run)
+    def ran(self, task: Any, result: TaskResult) -> None:
+        """Note the cost of a task, whose row has its kind and its cost group."""
+        self._runs.append((task, result))
 
     def tell(self, task: Any, state: TaskState, reason: Reason, message: str) -> None:
         """Store an event of a task, whose row has its `key`, for each of its open jobs."""
@@ -190,7 +191,7 @@ class Ledger:
         runs, self._runs = self._runs, []
         if not moves and not runs:
             return
-        holders = self._holders({*(task.seq for task, _ in moves), *(run.task for run in runs)})
+        holders = self._holders({*(task.seq for task, _ in moves), *(task.seq for task, _ in runs)})
         overall, by_job, left = Counter[Any](), Counter[Any](), Counter[Any]()
         for task, new in moves:
             for state, change in ((task.state, -1), (new, 1)):
@@ -202,9 +203,9 @@ class Ledger:
         JOB_COUNTS.add(self.connection, by_job)
         JOB_GROUPS.add(self.connection, {group: change for group, change in left.items() if change})
         spent = [
-            {"b_job": holder.job, "b_stage": run.stage, "b_cpu": run.cpu_seconds, "b_wall": run.wall_seconds}
-            for run in runs
-            for holder in holders.get(run.task, ())
+            {"b_job": holder.job, "b_stage": task.stage, "b_cpu": run.cpu_seconds, "b_wall": run.wall_seconds}
+            for task, run in runs
+            for holder in holders.get(task.seq, ())
             if not holder.cached
         ]
         _ADD_TO_JOB_STAGES.run_all(self.connection, spent)

@@ -28,7 +28,6 @@ from stickslip_services.database.database import batches
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.eta import Run
 from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.ledger import LIVE, SETTLED, Ending, Ledger
 from stickslip_services.queue.recompute import recompute, wait_for
@@ -178,10 +177,7 @@ def _take_results(book: Ledger, settled: Sequence[Ended], versions: dict[str, Ma
         costs = {"b_cpu_seconds": result.cpu_seconds, "b_wall_seconds": result.wall_seconds}
         written.append(_written(book, task, result.outcome, result.reason, result.message, output) | costs)
         book.moved([task], TaskState(result.outcome))
-        # Rejections often come early, so their durations are not representative.
-        call_seconds = None if result.reason is not None else result.call_seconds
-        seconds = (result.cpu_seconds, result.wall_seconds, call_seconds)
-        book.ran(Run(task.seq, Stage(task.stage), task.kind, task.cost_group, *seconds))
+        book.ran(task, result)
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
             book.tell(task, TaskState.rejected, *rejected[task.seq])
