@@ -145,6 +145,7 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         gc.freeze()  # modules and application stay: each look through them would stop all requests for 50 ms
+        gc.set_threshold(50_000)  # a plan has a million small objects without cycles: looking often takes a fifth of it
         if self.started:
             sys.stdout.write(f"listening on {self._url}\n")
             sys.stdout.flush()

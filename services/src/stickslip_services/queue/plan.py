@@ -1,12 +1,10 @@
 """The plan of a job: its tasks simulate -> render -> pack -> publish, each keyed by what its result depends on.
 
-Planning is pure and slow, and runs outside any transaction. `planner` plans a job of many samples piece by piece.
+Planning is pure and slow: `planner` plans a job of many samples piece by piece, outside any transaction.
 """
 
-import gc
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
@@ -98,21 +96,6 @@ class Plan:
     def publish_key(self) -> bytes:
         """Key of the last task, of the last piece."""
         return next(reversed(self.tasks))
-
-
-@contextmanager
-def collector_at_rest() -> Iterator[None]:
-    """Disable the garbage collector while a plan grows.
-
-    A plan has a million small objects and no cycles; the search for cycles takes a fifth of the time.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def expand(spec: JobSpec, terms: Terms, *, previews: int = 0) -> Plan:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_tasks, jobs, tasks
@@ -20,8 +21,9 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import unplanned_jobs
 from stickslip_services.queue.ledger import Ending
-from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, pieces, terms_for
+from stickslip_services.queue.plan import Plan, Terms, expand, pieces, terms_for
 from stickslip_services.queue.recompute import terms_of
+from stickslip_services.queue.workers import present_workers
 from stickslip_services.queue.write_plan import begin_planning, write_plan
 
 logger = logging.getLogger(__name__)
@@ -38,28 +40,27 @@ def plan_waiting_jobs(context: Context) -> None:
     """Plan the jobs that were submitted before the first worker registered, or fail those that cannot be planned."""
     with context.database.read() as connection:
         waiting = unplanned_jobs(connection)
-    for row in waiting:
-        terms: Terms | None = None
-        refusal, reason, at_once = "", Reason.waiting_for_worker, False
-        try:
-            spec, _ = terms_of(row)
-            at_once = spec.sample_count <= context.settings.plan_samples
-            with context.database.read() as connection:
-                terms = terms_for(connection, spec)
-            if terms is None:
-                return
-        except KindNotAvailableError as error:
-            refusal = str(error)
-        except PresetNotCertifiedError as error:
-            refusal, reason = str(error), Reason.preset_not_certified
-        plan = expand(spec, terms, previews=context.settings.previews_per_job) if terms and at_once else None
+        is_known = any(worker.builds for worker in present_workers(connection))
+    for row in waiting if is_known else ():
         with context.ledger() as book:
             if row.seq not in {other.seq for other in unplanned_jobs(book.connection)}:
                 continue  # cancelled, or planned by another coordinator
-            if terms is None:
-                book.set_state(row.seq, JobState.failed, reason=reason, message=refusal)
-                continue
-            begin_planning(book, row.seq, terms, plan)
+            try:
+                spec, _ = terms_of(row)
+                if (terms := terms_for(book.connection, spec)) is None:
+                    return
+                begin_planning(book, row.seq, terms, plan_at_once(context, spec, terms))
+            except (KindNotAvailableError, PresetNotCertifiedError) as error:
+                is_preset = isinstance(error, PresetNotCertifiedError)
+                reason = Reason.preset_not_certified if is_preset else Reason.waiting_for_worker
+                book.set_state(row.seq, JobState.failed, reason=reason, message=str(error))
+
+
+def plan_at_once(context: Context, spec: JobSpec, terms: Terms) -> Plan | None:
+    """Return the plan of a job of few samples; None of one that is planned piece by piece."""
+    if spec.sample_count > context.settings.plan_samples:
+        return None
+    return expand(spec, terms, previews=context.settings.previews_per_job)
 
 
 class Planner:
@@ -89,10 +90,9 @@ class Planner:
             self._job, self._pieces = None, iter(())
             return False
         try:
-            with collector_at_rest():
-                if not self._goes_on(row):
-                    self._pieces = self._begin(row, packed)
-                self._write(row.seq, next(self._pieces))
+            if not self._goes_on(row):
+                self._pieces = self._begin(row, packed)
+            self._write(row.seq, next(self._pieces))
         except Exception as error:
             self._job = None
             if isinstance(error, OSError | SQLAlchemyError):

@@ -26,7 +26,8 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
 from stickslip_services.queue.jobs import show_job
 from stickslip_services.queue.ledger import SETTLED, ledger
-from stickslip_services.queue.plan import Plan, Terms, collector_at_rest, expand, terms_for
+from stickslip_services.queue.plan import Terms, expand, terms_for
+from stickslip_services.queue.planner import plan_at_once
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
 from stickslip_services.queue.workers import NO_WORKER, alive_workers
 from stickslip_services.queue.write_plan import begin_planning, insert_job
@@ -52,45 +53,27 @@ def submit_job(
     IdempotencyKeyReusedError.
     """
     check_files(context.database, context.store, spec)
-    with collector_at_rest():
-        return _submit(context, spec, idempotency_key, priority)
-
-
-def _submit(context: Context, spec: JobSpec, key: str | None, priority: int) -> JobDetail | Replay:
     project, print_ = this_asker().project, sha256(spec.model_dump_json().encode())
-    at_once = spec.sample_count <= context.settings.plan_samples
-    plan: Plan | None = None
-    planned_for: Terms | None = None
-    while True:
-        with context.database.read() as connection:
-            if replay := _find_replay(connection, key, print_):
-                return replay
-            check_quota(connection, project, spec.sample_count)
-            terms = terms_for(connection, spec)
-        if terms is not None and at_once and planned_for != terms:
-            plan, planned_for = expand(spec, terms, previews=context.settings.previews_per_job), terms
-        with context.database.write() as connection:
-            if replay := _find_replay(connection, key, print_):
-                return replay
-            if terms_for(connection, spec) != terms:
-                continue  # meanwhile a worker with other builds, or a certificate, has been registered
-            check_quota(connection, project, spec.sample_count)
-            now = context.clock()
-            with ledger(connection, now) as book:
-                job = insert_job(book, spec, priority=priority, project=project)
-                if terms is None:
-                    book.set_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
-                else:
-                    begin_planning(book, job, terms, plan)
-            shown = show_job(context, connection, job)
-            details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
-            note(connection, "job.submit", shown.id, now, **details)
-            if key:
-                row = {"project": project, "key": key, "fingerprint": print_, "job": job, "created_at": now}
-                connection.execute(insert(idempotency_keys).values(row | {"response": shown.model_dump_json()}))
-        context.notifier.notify()
-        check_made_datasets(context, at_most=CHECKED_AT_ONCE)
-        return shown
+    with context.database.write() as connection:
+        if replay := _find_replay(connection, idempotency_key, print_):
+            return replay
+        check_quota(connection, project, spec.sample_count)
+        terms, now = terms_for(connection, spec), context.clock()
+        with ledger(connection, now) as book:
+            job = insert_job(book, spec, priority=priority, project=project)
+            if terms is None:
+                book.set_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
+            else:
+                begin_planning(book, job, terms, plan_at_once(context, spec, terms))
+        shown = show_job(context, connection, job)
+        details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
+        note(connection, "job.submit", shown.id, now, **details)
+        if idempotency_key:
+            row = {"project": project, "key": idempotency_key, "fingerprint": print_, "job": job, "created_at": now}
+            connection.execute(insert(idempotency_keys).values(row | {"response": shown.model_dump_json()}))
+    context.notifier.notify()
+    check_made_datasets(context, at_most=CHECKED_AT_ONCE)
+    return shown
 
 
 def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> Replay | None:
@@ -173,14 +156,13 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
             return 0
         if spec.sample_count > LOOKED_UP:
             return None
-    with collector_at_rest():
-        plan = expand(spec, terms)
-        with database.read() as connection:
-            found = (
-                connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(SETTLED)))
-                for batch in batches(plan.tasks)
-            )
-            return sum(number or 0 for number in found)
+    plan = expand(spec, terms)
+    with database.read() as connection:
+        found = (
+            connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(SETTLED)))
+            for batch in batches(plan.tasks)
+        )
+        return sum(number or 0 for number in found)
 
 
 def _compression(connection: Connection, kind: str) -> float | None:
