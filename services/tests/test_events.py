@@ -128,7 +128,6 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     app: FastAPI, client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, clock: ManualClock
 ) -> None:
     """Twenty watchers, each from another event on, while old events have left the feed's memory."""
-    monkeypatch.setattr(sse, "KEPT_EVENTS", 2)
     looks: list[int] = []
 
     def look(context: Context, connection: Any, job: int) -> Any:

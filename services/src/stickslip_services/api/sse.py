@@ -31,9 +31,6 @@ MOST_STREAMS = 500
 """Event streams of one key, and of one address."""
 ALL_STREAMS = 2000
 """Event streams of all: half of all connections, so that streams never keep other requests out."""
-KEPT_EVENTS = 1000
-"""Number of events that a feed keeps in memory; older ones are read from the database."""
-
 
 OPENAPI = {
     # The schema of one event; OpenAPI 3.2 has `itemSchema` for it.
@@ -106,12 +103,11 @@ class _Feed:
         self._context = context
         self._job = job
         self._after = after
-        """`_events` has all events after this id."""
+        """`_events`, those of the last look, are all events after this id; older ones are read from the database."""
         self._events: list[StoredEvent] = []
         self._progress = ""
         self._is_complete = False
-        """True when the job has ended and all of its events are in `_events`."""
-        self._version = 0
+        """True when the job has ended and all of its events have been read."""
         self._changed = asyncio.Event()
         self.watchers = 0
         self.task = asyncio.create_task(self._follow())
@@ -121,7 +117,7 @@ class _Feed:
         opening = f"retry: {RECONNECT_MILLISECONDS}\n".encode()  # goes with the first event
         told = ""
         while True:
-            version, changed = self._version, self._changed
+            changed = self._changed
             events = await self._events_after(cursor)
             messages: list[bytes] = []
             last: list[bytes] = []  # the end of the job comes after the progress that goes with it
@@ -142,7 +138,7 @@ class _Feed:
             if self.task.done():
                 self.task.result()  # raises the error of the feed; the client reconnects
                 return
-            if version == self._version and is_up_to_date:
+            if changed is self._changed and is_up_to_date:
                 try:
                     await asyncio.wait_for(changed.wait(), KEEP_ALIVE_SECONDS)
                 except TimeoutError:
@@ -195,17 +191,14 @@ class _Feed:
 
     def _take(self, events: list[StoredEvent], progress: str | None, *, ended: bool) -> None:
         is_new = bool(events) or ended or progress not in (None, self._progress)
-        self._events += events
-        if len(self._events) > 2 * KEPT_EVENTS:
-            self._after = self._events[-KEPT_EVENTS - 1].id
-            del self._events[:-KEPT_EVENTS]
+        if events:
+            self._after, self._events = self._newest, events
         self._progress = progress or self._progress
         self._is_complete = ended
         if is_new:
             self._tell()
 
     def _tell(self) -> None:
-        self._version += 1
         self._changed.set()
         self._changed = asyncio.Event()
 
