@@ -18,10 +18,9 @@ Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, Row, bindparam, case, exists, func, insert, or_, select, text, update
+from sqlalchemy import Connection, bindparam, case, exists, func, insert, or_, select, text, update
 from stickslip_schemas.base.document import Document
 from stickslip_schemas.base.states import JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import (
@@ -74,26 +73,6 @@ class Task(NamedTuple):
 
 
 TASK = [tasks.c[name] for name in Task._fields]
-
-
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """The end state of a job, and the dataset version that it has made or found."""
-
-    state: JobState
-    reason: Reason | None
-    message: str
-    dataset: DatasetRef | None = None
-    rejected_count: int = 0
-
-    @staticmethod
-    def published(version: Row[Any]) -> "Ending":
-        """Return the ending of a job whose dataset version, a row of `dataset_versions`, exists."""
-        reference, lost = document_of(DatasetRef, version), version.sample_count - version.valid_count
-        if lost == 0:
-            return Ending(JobState.succeeded, None, "", reference)
-        message = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
-        return Ending(JobState.succeeded_with_rejects, None, message, reference, lost)
 
 
 _OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
@@ -166,20 +145,30 @@ class Ledger:
         self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
         self._append_event(job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message))
 
-    def end(self, job: int, ending: Ending) -> None:
+    def publish(self, job: int, version: Any, note: str = "") -> None:
+        """End a live job, whose dataset version, a row of `dataset_versions`, exists."""
+        reference, lost = document_of(DatasetRef, version), version.sample_count - version.valid_count
+        rejects = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
+        state = JobState.succeeded_with_rejects if lost else JobState.succeeded
+        if self._is_live(job):
+            values = {**reference.model_dump(), "rejected_count": lost}
+            self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
+            self._append_event(job, EventName.dataset_published, DatasetPublishedEvent(dataset=reference))
+            self.end(job, state, None, ". ".join(filter(None, [note, rejects if lost else ""])))
+
+    def end(self, job: int, state: JobState, reason: Reason | None, message: str) -> None:
         """End a job, unless it is not live any more, and give up what only it needs."""
-        own = jobs.c.seq == job
-        if self.connection.scalar(select(jobs.c.seq).where(own, jobs.c.state.in_(LIVE))) is None:
+        if not self._is_live(job):
             return
         self.count()
-        if ending.dataset is not None:
-            values = {**ending.dataset.model_dump(), "rejected_count": ending.rejected_count}
-            self.connection.execute(update(jobs).where(own).values(values))
-            self._append_event(job, EventName.dataset_published, DatasetPublishedEvent(dataset=ending.dataset))
-        self.set_state(job, ending.state, reason=ending.reason, message=ending.message)
+        self.set_state(job, state, reason=reason, message=message)
         waiting = (job_counts.c.job == job, job_counts.c.state.in_(WAITING), job_counts.c.count > 0)
         if self.connection.scalar(select(job_counts.c.count).where(*waiting).limit(1)):
             give_up(self, job)
+
+    def _is_live(self, job: int) -> bool:
+        query = select(jobs.c.seq).where(jobs.c.seq == job, jobs.c.state.in_(LIVE))
+        return self.connection.scalar(query) is not None
 
     def jobs_of(self, task: int) -> list[int]:
         """Return the open jobs of a task."""
@@ -355,4 +344,4 @@ def _end_if_blocked(book: Ledger, job: int) -> None:
         f"{task_id(failed[0].stage, failed[0].key)}: {failed[0].message}. What is done is kept; submit the job again "
         "to try again"
     )
-    book.end(job, Ending(JobState.failed, Reason.quarantined, message))
+    book.end(job, JobState.failed, Reason.quarantined, message)

@@ -20,7 +20,6 @@ from stickslip_services.errors import KindNotAvailableError, PresetNotCertifiedE
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import unplanned_jobs
-from stickslip_services.queue.ledger import Ending
 from stickslip_services.queue.plan import Plan, Terms, expand, pieces, terms_for
 from stickslip_services.queue.recompute import terms_of
 from stickslip_services.queue.workers import present_workers
@@ -149,7 +148,7 @@ class Planner:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
         with self._context.ledger() as book:
             if book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                book.end(row.seq, Ending(JobState.failed, Reason.internal_error, message))
+                book.end(row.seq, JobState.failed, Reason.internal_error, message)
 
 
 def _pack_keys(connection: Connection, job: int) -> list[str]:

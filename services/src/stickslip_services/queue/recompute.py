@@ -15,7 +15,6 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from sqlalchemy import Connection, and_, bindparam, or_, select, update
@@ -32,7 +31,7 @@ from stickslip_services.database.tables import dataset_versions, jobs, task_depe
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
-from stickslip_services.queue.ledger import FRESH, LIVE, OVER, SETTLED, TASK, Ending, Ledger, Task, charge, live_jobs
+from stickslip_services.queue.ledger import FRESH, LIVE, OVER, SETTLED, TASK, Ledger, Task, charge, live_jobs
 from stickslip_services.queue.plan import Terms
 
 logger = logging.getLogger(__name__)
@@ -103,8 +102,7 @@ def end_made(book: Ledger, made: Any, damaged: Mapping[str, Sha256] | None) -> N
     if damaged is not None and not damaged:
         own = dataset_versions.c.publish_task == made.publish_task
         book.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=book.now, damaged=0))
-        ending = Ending.published(find_committed(book.connection, made.publish_task))
-        book.end(made.seq, replace(ending, message=ending.message or "every result was cached"))
+        book.publish(made.seq, find_committed(book.connection, made.publish_task), "every result was cached")
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
@@ -195,7 +193,7 @@ def fail_damaged_jobs(context: Context) -> None:
     if damaged:
         with context.ledger() as book:
             for job in damaged:
-                book.end(job, Ending(JobState.failed, Reason.storage_error, str(DamagedRowsError())))
+                book.end(job, JobState.failed, Reason.storage_error, str(DamagedRowsError()))
 
 
 def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:

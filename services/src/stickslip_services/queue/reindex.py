@@ -6,7 +6,7 @@ finds it. Results of single simulations and renders, and certificates, are not r
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from sqlalchemy import select, update
 from stickslip_schemas.base.keys import Sha256, sha256
@@ -25,7 +25,7 @@ from stickslip_services.catalog.versions import (
 )
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import dataset_versions, jobs, tasks
-from stickslip_services.queue.ledger import Ending, Task, ledger
+from stickslip_services.queue.ledger import Task, ledger
 from stickslip_services.queue.plan import Terms, pieces
 from stickslip_services.queue.write_plan import begin_planning, insert_job, write_plan
 
@@ -103,8 +103,6 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
             book.moved([Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded)
             reserve_number(connection, manifest.dataset, manifest.version, task)
             commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
-            ending = Ending.published(find_committed(connection, task))
-            message = ". ".join(filter(None, ["found again in the store", ending.message]))
             for holder in book.jobs_of(task):
-                book.end(holder, replace(ending, message=message))
+                book.publish(holder, find_committed(connection, task), "found again in the store")
     return True

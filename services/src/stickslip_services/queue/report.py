@@ -29,7 +29,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest, task_id, task_key
-from stickslip_services.queue.ledger import LIVE, SETTLED, Ending, Ledger
+from stickslip_services.queue.ledger import LIVE, SETTLED, Ledger
 from stickslip_services.queue.recompute import recompute, wait_for
 from stickslip_services.queue.retries import HELD_TASK, fail_tries, give_back, lose
 from stickslip_services.queue.workers import find_worker, note_heard
@@ -199,7 +199,7 @@ def _commit(book: Ledger, publish_task: int, manifest: Manifest, output: Publish
     name = next((row.name for row in waiting if row.name is not None), None)
     commit_version(connection, publish_task, manifest, output, name=name, now=book.now)
     for row in waiting:
-        book.end(row.seq, Ending.published(find_committed(connection, publish_task)))
+        book.publish(row.seq, find_committed(connection, publish_task))
 
 
 def _written(

@@ -17,7 +17,7 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import HELD, RUNNABLE, TASK, Ending, Ledger, reassign
+from stickslip_services.queue.ledger import HELD, RUNNABLE, TASK, Ledger, reassign
 from stickslip_services.settings import Settings
 
 HELD_TASK = [*TASK, *(tasks.c[name] for name in ("key", "tries", "losses", "token", "expires_at"))]
@@ -83,7 +83,7 @@ def _fail(book: Ledger, task: Any, reason: Reason, message: str, times: int, set
         if is_quarantined:
             why = f"{failed} of its tasks were quarantined, at last {name}: {message}"
         kept = "No further tasks are started; what is done is kept, and submitting the job again tries again"
-        book.end(job, Ending(JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}"))
+        book.end(job, JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}")
 
 
 _FAILED = (
