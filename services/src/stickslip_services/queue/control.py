@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import Connection, Row, select, update
+from sqlalchemy import Row, select, update
 from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 
@@ -60,9 +60,7 @@ def pause_job(context: Context, job_id: str) -> JobDetail:
                 f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
             )
         if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
-            message = "nothing more is started; tasks that are running finish"
-            book.set_state(job.seq, JobState.pausing, message=message)
-            reassign_waiting(book, job.seq)
+            pause(book, job.seq, message="nothing more is started; tasks that are running finish")
     return _shown(context, job.seq)
 
 
@@ -74,7 +72,7 @@ def resume_job(context: Context, job_id: str) -> JobDetail:
     if trouble := context.store_watch.trouble:
         raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
     with _change(context, job_id, "job.resume") as (book, job):
-        _resume(book, job)
+        resume(book, job)
     plan_waiting_jobs(context)
     note_stranded(context)
     return _shown(context, job.seq)
@@ -90,32 +88,6 @@ def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
     return _shown(context, job.seq)
 
 
-def hold_jobs(book: Ledger, trouble: str) -> None:
-    """Pause all runnable jobs because the store takes no results."""
-    message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
-    for seq in book.connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))).all():
-        book.set_state(seq, JobState.pausing, reason=Reason.store_unavailable, message=message)
-        reassign_waiting(book, seq)
-
-
-def release_jobs(book: Ledger) -> None:
-    """Resume the jobs that waited for the store."""
-    for job in held_jobs(book.connection):
-        _resume(book, job)
-
-
-_HELD_JOBS = Prepared(
-    select(jobs)
-    .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
-    .order_by(jobs.c.seq)
-)
-
-
-def held_jobs(connection: Connection) -> list[Any]:
-    """Return the rows of the jobs that wait for the store."""
-    return _HELD_JOBS.rows(connection)
-
-
 @contextmanager
 def _change(context: Context, job_id: str, action: str, **details: Any) -> Iterator[tuple[Ledger, Row[Any]]]:
     """Open a transaction that changes a job; yield its ledger and the job's row. It ends with an audit entry."""
@@ -125,7 +97,14 @@ def _change(context: Context, job_id: str, action: str, **details: Any) -> Itera
         note(book.connection, action, job_id, book.now, **details)
 
 
-def _resume(book: Ledger, job: Row[Any]) -> None:
+def pause(book: Ledger, job: int, *, reason: Reason | None = None, message: str) -> None:
+    """Start no further task of a job."""
+    book.set_state(job, JobState.pausing, reason=reason, message=message)
+    reassign_waiting(book, job)
+
+
+def resume(book: Ledger, job: Any) -> None:
+    """Let a job, a row of `jobs`, go on; raise ConflictError if it has ended."""
     if job.state in RUNNABLE:
         return
     if job.state not in (JobState.pausing, JobState.paused):

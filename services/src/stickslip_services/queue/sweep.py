@@ -8,18 +8,20 @@ from contextlib import suppress
 from math import inf
 
 from sqlalchemy import or_, select, update
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base.states import JobState, Reason
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 
 from stickslip_services.access.keys import admit_local_worker
 from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.opening import upgrade
+from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import held_jobs, hold_jobs, release_jobs
+from stickslip_services.queue.control import pause, resume
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.queue.lease import renew_all_leases
+from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.planner import plan_waiting_jobs, release_claims
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, fail_damaged_jobs, read_plan
 from stickslip_services.queue.retries import take_back
@@ -55,18 +57,28 @@ def sweep(context: Context) -> None:
     check_made_datasets(context, at_most=CHECKED_AT_ONCE)
 
 
+_RUNNABLE_JOBS = Prepared(select(jobs).where(jobs.c.state.in_(RUNNABLE)))
+_HELD_JOBS = Prepared(
+    select(jobs)
+    .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
+    .order_by(jobs.c.seq)
+)
+
+
 def _watch_store(context: Context) -> None:
     """Pause jobs while the store takes no results, and resume them afterwards."""
     trouble = context.store_watch.look()
+    due = _RUNNABLE_JOBS if trouble else _HELD_JOBS
     with context.database.read() as connection:
-        due = has_runnable_job(connection) if trouble else bool(held_jobs(connection))
-    if not due:
-        return
+        if not due.tuples(connection):
+            return
+    message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
     with context.ledger() as book:
-        if trouble:
-            hold_jobs(book, trouble)
-        else:
-            release_jobs(book)
+        for job in due.rows(book.connection):
+            if trouble:
+                pause(book, job.seq, reason=Reason.store_unavailable, message=message)
+            else:
+                resume(book, job)
     logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
 
 
