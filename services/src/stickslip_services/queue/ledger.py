@@ -224,7 +224,7 @@ _LIVE_JOBS = Prepared(
 
 
 def live_jobs(connection: Connection, task_seqs: Iterable[int], states: Sequence[JobState] = LIVE) -> dict[int, int]:
-    """Return the job that each task is to be charged to, of those in some states; tasks without any are left out."""
+    """Return the job to charge each task to, of those in some states; tasks without any are left out."""
     found: dict[int, tuple[int, int, int]] = {}
     for batch in batches(task_seqs):
         for task, halted, priority, job in _LIVE_JOBS.tuples(connection, {"b_tasks": batch, "b_states": list(states)}):
