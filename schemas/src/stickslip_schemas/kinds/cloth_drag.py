@@ -171,16 +171,12 @@ class ClothDragSpec(ClipSpec):
         return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        factors = (
-            array("density", "factor of the fabric's mass per area"),
-            array("bending", "factor of the fabric's rigidity against bending"),
-            array("stretching", "factor of the fabric's stiffness in its plane"),
-        )
+        about = {name: field.description or "" for name, field in ClothDragAxes.model_fields.items()}
         return (
             *clip_arrays(self),
             codes("material", self.names("material")),
             array("mu", "friction coefficient"),
-            *(factor for factor in factors if factor.name in self.named_axes),
+            *(array(name, about[name]) for name in ("density", "bending", "stretching") if name in self.named_axes),
             *fabric_arrays(),
             array("bias_side", "side to which gravity leaned during the drop, +1 or -1 along x", "int8", fill=0),
             array("landed_side", "side of the holders on which the cloth landed, +1 or -1 along x", "int8", fill=0),

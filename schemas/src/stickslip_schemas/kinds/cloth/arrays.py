@@ -37,10 +37,7 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     return (
         array("video", "sRGB clip", "uint8", pixels | {"rgb": 3}, per_sample=True, is_clip=True, attributes=instants),
         *_ground_truth_arrays(spec, pixels),
-        codes("texture", spec.names("texture")),
-        codes("viewpoint", spec.names("viewpoint")),
-        codes("lighting", spec.names("lighting")),
-        codes("substrate", spec.names("substrate")),
+        *(codes(axis, spec.names(axis)) for axis in ("texture", "viewpoint", "lighting", "substrate")),
         array("light_seed", "seed of the lamp, the floor and the noise", "int32"),
         array(
             "light", "azimuth and elevation of the lamp [degree], its power over the nominal", "float32", {"light": 3}
