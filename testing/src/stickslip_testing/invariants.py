@@ -15,7 +15,7 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.ledger import LIVE, OVER, RUNNABLE
+from stickslip_services.queue.ledger import LIVE, ON_LEASE, OVER, READY, RUNNABLE, holds_alone
 
 
 def violations(connection: Connection) -> list[str]:
@@ -125,6 +125,18 @@ def _job_faults(connection: Connection) -> list[str]:
             faults.append(f"job {row.seq} is {row.state} and its dataset says otherwise")
         if JobState(row.state).is_open != (row.finished_at is None):
             faults.append(f"job {row.seq} is {row.state} and its end says otherwise")
+        own = select(tasks.c.state).join(job_tasks, job_tasks.c.task == tasks.c.seq).where(job_tasks.c.job == row.seq)
+        there = set(connection.scalars(own))
+        if row.state == JobState.queued and there & {*ON_LEASE}:
+            faults.append(f"job {row.seq} is queued and a task of it is on lease")
+        if row.state == JobState.pausing and not holds_alone(connection, row.seq, RUNNABLE):
+            faults.append(f"job {row.seq} is pausing and nothing runs for it alone")
+        if row.state == JobState.cancelling and row.given_up is None and not holds_alone(connection, row.seq, LIVE):
+            faults.append(f"job {row.seq} is cancelling and nothing runs for it alone")
+        is_blocked = TaskState.failed in there and not there & {*ON_LEASE, TaskState.soft_failed}
+        is_blocked &= connection.execute(own.where(READY).limit(1)).first() is None
+        if row.state in (JobState.queued, JobState.running) and is_blocked:
+            faults.append(f"job {row.seq} is {row.state} and only quarantined tasks of it are left")
     for row in connection.execute(
         select(dataset_versions.c.manifest, tasks.c.state).join(tasks, tasks.c.seq == dataset_versions.c.publish_task)
     ):
