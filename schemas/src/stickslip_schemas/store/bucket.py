@@ -14,9 +14,13 @@ import hashlib
 import os
 import random
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import timedelta
+from functools import partial
+from http import HTTPStatus
 from typing import Any, TypeVar
 
 import obstore
@@ -62,6 +66,8 @@ class BucketStore:
         self.place = f"s3://{bucket}/{prefix}".rstrip("/")
         self._bucket, self._prefix = bucket, prefix
         self._patience = PATIENCE if patience is None else patience
+        self._deletes_many = True
+        """False once the server has refused the request that deletes many objects."""
         try:
             self._objects = obstore.store.S3Store(
                 bucket,
@@ -226,9 +232,11 @@ class BucketStore:
 
     def probe(self) -> None:
         quick = BucketStore(self._bucket, self._prefix, patience=min(self._patience, PROBE_PATIENCE))
+        quick._deletes_many = self._deletes_many
         name = f".probe-{random.randbytes(8).hex()}"
         quick._put(name, b"probe", mode="overwrite")
         quick._delete([name])
+        self._deletes_many = quick._deletes_many
 
     def _head(self, name: str) -> Any:
         return self._tried(lambda: obstore.head(self._objects, name))
@@ -245,8 +253,26 @@ class BucketStore:
         return sorted(name.rstrip("/").rpartition("/")[2] for name in found["common_prefixes"])
 
     def _delete(self, names: list[str]) -> None:
-        if names:
-            self._tried(lambda: obstore.delete(self._objects, names))
+        """Delete objects, one by one where the bucket has no request that deletes many."""
+        if names and self._deletes_many:
+            try:
+                return self._tried(lambda: obstore.delete(self._objects, names))
+            except _RefusedError:
+                self._deletes_many = False
+        for name in names:
+            self._tried(partial(self._delete_one, name))
+        return None
+
+    def _delete_one(self, name: str) -> None:
+        """Delete an object by a request of its own, which `obstore` signs, but does not make."""
+        url = obstore.sign(self._objects, "DELETE", name, timedelta(minutes=5))
+        try:
+            urllib.request.urlopen(urllib.request.Request(url, method="DELETE"), timeout=PROBE_PATIENCE).close()
+        except urllib.error.HTTPError as error:
+            if error.code != HTTPStatus.NOT_FOUND:
+                raise _BusyError(f"status code: {error.code}") from error
+        except OSError as error:
+            raise _BusyError(str(error)) from error
 
     def _tried(self, request: Callable[[], R]) -> R:
         """Make a request until the server answers or patience ends.
