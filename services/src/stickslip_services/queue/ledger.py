@@ -9,7 +9,7 @@ Between any two transactions (`stickslip_testing.invariants` looks at all of it)
 4. A `queued` job has no task on lease. A `pausing` job has one that no runnable job needs, and a `cancelling` job one
    that no live job needs. A job of which only quarantined tasks and their dependents are left has failed.
 
-`move` keeps the first, `reassign` the third, and `close`, at the end of the transaction, the second and the fourth.
+`move` keeps the first, `reassign` the third, and `_close`, at the end of the transaction, the second and the fourth.
 A job of a million tasks that ends would keep other writers waiting: its tasks are given up in pieces (`give_up`).
 
 Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were before the transaction changed them.
