@@ -87,17 +87,23 @@ std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (!found) return std::nullopt;
   if (found->on_patch) track_.triangle[node] = found->triangle;
   feet_[node] = *found;
-  return SmoothTouch{found->height - apart(node, *found), found->normal,
+  return SmoothTouch{found->height - apart(end_, node, *found), found->normal,
                      surface_of(found->triangle) - materials_.sheets};
 }
 
 // What a node keeps, m: pairs stay idle as long as the triangles around it lie on the surface.
-double SmoothContact::apart(int node, const Foot& foot) const {
+double SmoothContact::apart(const PatchShape& shape, int node, const Foot& foot) const {
   const int sheet = sheet_of_node_[node], surface = surface_of(foot.triangle);
   const double r = radius_[node];
-  const double curvature = patches_.curvature(end_, foot.triangle, foot.weights, track_.side[node]);
+  const double curvature = patches_.curvature(shape, foot.triangle, foot.weights, track_.side[node]);
   const double sinking = 0.5 * r * r * std::min(curvature, settings_.curvature_max / r);
   return std::max(materials_.mean(sheet, surface), materials_.apart(sheet, surface) + sinking);
+}
+
+Vector3d SmoothContact::forced(int node, const Vector3d& before) const {
+  if (track_.triangle[node] < 0) return Vector3d::Zero();
+  const std::optional<Foot> foot = patches_.foot(start_, before, track_.triangle[node], track_.side[node]);
+  return foot ? std::max(apart(start_, node, *foot) - foot->height, 0.0) * foot->normal : Vector3d::Zero().eval();
 }
 
 // The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was somewhere, while

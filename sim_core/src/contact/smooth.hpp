@@ -42,6 +42,8 @@ class SmoothContact {
 
   // What a node sees at p, if a surface is near.
   std::optional<SmoothTouch> touch(int node, const Eigen::Vector3d& p);
+  // How far a node that was at `before` when the step began was too near then, towards the cloth, m.
+  Eigen::Vector3d forced(int node, const Eigen::Vector3d& before) const;
   // Of what the node saw last: its way over the surface since it was at `before` when the step began, m; friction; and
   // the foot.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
@@ -53,7 +55,7 @@ class SmoothContact {
   void take_shapes(const Buffer<double>& start, const Buffer<double>& ends);
   int surface_of(int triangle) const { return sheet_of_node_[patches_.triangles()[triangle][0]]; }
 
-  double apart(int node, const Foot& foot) const;
+  double apart(const PatchShape& shape, int node, const Foot& foot) const;
 
   std::vector<int> sheet_of_node_;
   std::vector<double> radius_;
