@@ -1,5 +1,6 @@
 #include "contact/candidates.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 
@@ -7,20 +8,14 @@ namespace sim_core {
 namespace {
 
 using Eigen::Array3d;
-
-struct Box {
-  Array3d low, high;
-};
+using Box = Eigen::AlignedBox3d;
 
 template <std::size_t count>
 Box box_of(const std::array<int, count>& nodes, const Buffer<double>& x, double margin) {
-  Box box{at_node(x, nodes[0]).array(), at_node(x, nodes[0]).array()};
-  for (std::size_t c = 1; c < count; ++c) {
-    box.low = box.low.min(at_node(x, nodes[c]).array());
-    box.high = box.high.max(at_node(x, nodes[c]).array());
-  }
-  box.low -= margin;
-  box.high += margin;
+  Box box;
+  for (int node : nodes) box.extend(at_node(x, node));
+  box.min().array() -= margin;
+  box.max().array() += margin;
   return box;
 }
 
@@ -28,18 +23,17 @@ Box box_of(const std::array<int, count>& nodes, const Buffer<double>& x, double 
 class Grid {
  public:
   explicit Grid(const std::vector<Box>& boxes) {
-    Box all = boxes[0];
+    Box all;
     double extent = 0.0;
     for (const Box& box : boxes) {
-      all.low = all.low.min(box.low);
-      all.high = all.high.max(box.high);
-      extent += (box.high - box.low).maxCoeff();
+      all.extend(box);
+      extent += box.diagonal().maxCoeff();
     }
-    low_ = all.low;
+    low_ = all.min().array();
     size_ = extent / static_cast<double>(boxes.size());
     const double cells_max = cells_per_item * static_cast<double>(boxes.size()) + 64.0;
-    while ((((all.high - low_) / size_).floor() + 1.0).prod() > cells_max) size_ *= 1.25;
-    count_ = (((all.high - low_) / size_).floor() + 1.0).cast<int>();
+    while ((((all.max().array() - low_) / size_).floor() + 1.0).prod() > cells_max) size_ *= 1.25;
+    count_ = (((all.max().array() - low_) / size_).floor() + 1.0).cast<int>();
     begin_.assign(static_cast<std::size_t>(count_.prod()) + 1, 0);
     for (const Box& box : boxes) visit(box, [&](int cell) { ++begin_[cell + 1]; });
     for (std::size_t c = 1; c < begin_.size(); ++c) begin_[c] += begin_[c - 1];
@@ -67,7 +61,7 @@ class Grid {
   int index(const Eigen::Array3i& at) const { return (at[2] * count_[1] + at[1]) * count_[0] + at[0]; }
   template <class Call>
   void visit(const Box& box, const Call& call) const {
-    const Eigen::Array3i from = place(box.low), to = place(box.high);
+    const Eigen::Array3i from = place(box.min().array()), to = place(box.max().array());
     for (int z = from[2]; z <= to[2]; ++z) {
       for (int y = from[1]; y <= to[1]; ++y) {
         for (int x = from[0]; x <= to[0]; ++x) call((z * count_[1] + y) * count_[0] + x);
@@ -89,8 +83,8 @@ class Around {
       low_[c].clear();
       high_[c].clear();
       for (const int* i = begin; i < end; ++i) {
-        low_[c].push_back(boxes[*i].low[c]);
-        high_[c].push_back(boxes[*i].high[c]);
+        low_[c].push_back(boxes[*i].min()[c]);
+        high_[c].push_back(boxes[*i].max()[c]);
       }
     }
     meet_.resize(static_cast<std::size_t>(end - begin));
@@ -136,9 +130,7 @@ struct SkeletonSearch {
   template <class Pieces, class Call>
   void near(const Box& box, int node, const Pieces& pieces, int count, const Call& call) const {
     for (int i = 0; i < count; ++i) {
-      const Box other = box_of(pieces[i], x, 0.0);
-      if ((other.low > box.high).any() || (other.high < box.low).any()) continue;
-      if (surface.may_touch(pieces[i][0], node)) call(i);
+      if (box.intersects(box_of(pieces[i], x, 0.0)) && surface.may_touch(pieces[i][0], node)) call(i);
     }
   }
 
@@ -149,8 +141,7 @@ struct SkeletonSearch {
       const Box box = box_of(corner, x, reach_of(corner[0]));
       for (int v = 0; v < surface.bone_vertices; ++v) {
         const int vertex = surface.vertices[v];
-        const Array3d p = at_node(x, vertex).array();
-        if ((p < box.low).any() || (p > box.high).any() || !surface.may_touch(vertex, corner[0])) continue;
+        if (!box.contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
         add_if_near(
             out,
             {PairKind::vertex_triangle, vertex, static_cast<int>(t), {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
@@ -192,20 +183,18 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
   std::vector<Candidate> out;
   std::vector<Box> boxes;
   for (int t = 0; t < surface.bone_triangles; ++t) boxes.push_back(box_of(surface.triangles[t], x, reach));
-  if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
-        return box.low.isFinite().all() && box.high.isFinite().all();
-      })) {
+  if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(),
+                                    [](const Box& box) { return box.min().allFinite() && box.max().allFinite(); })) {
     return out;
   }
   const Grid around_triangles(boxes);
   for (int v = 0; v < surface.bone_vertices; ++v) {
     const int vertex = surface.vertices[v];
-    const Array3d p = at_node(x, vertex).array();
-    const int cell = around_triangles.cell_at(p);
+    const int cell = around_triangles.cell_at(at_node(x, vertex).array());
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
-      if ((p < boxes[*t].low).any() || (p > boxes[*t].high).any() || !surface.may_touch(vertex, corner[0])) continue;
+      if (!boxes[*t].contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
       if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
       add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
                   reach);
@@ -231,7 +220,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
         if (!surface.may_touch(a[0], b[0])) continue;
         if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1]) continue;
         // Boxes that meet in many cells count in the one with the lowest corner of what they share.
-        if (edges.cell_at(boxes[*i].low.max(boxes[*j].low)) != cell) continue;
+        if (edges.cell_at(boxes[*i].min().cwiseMax(boxes[*j].min()).array()) != cell) continue;
         add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}, 0.0}, x, reach);
       }
     }
