@@ -151,11 +151,8 @@ bool Stepper::solve_part(double begin, double end, double dt, const Drive& drive
 Eigen::Vector3d Stepper::forced(int node, const std::vector<Body>& at_start) const {
   Eigen::Vector3d out = Eigen::Vector3d::Zero();
   if (node >= assembly_.numbering.free_nodes) return out;
-  const SmoothContact* surfaces = newton.contact.surfaces.get();
-  if (surfaces && newton.contact.mode[node] != contact_open) {
-    const Eigen::Vector3d way = surfaces->forced(node, at_node(start_, node));
-    if (way.squaredNorm() > constants_.inside * constants_.inside) out = way;
-  }
+  if (newton.contact.surfaces && newton.contact.mode[node] != contact_open)
+    out = newton.contact.surfaces->forced(node, at_node(start_, node), constants_.inside);
   for (std::size_t b = 0; b < at_start.size(); ++b) {
     if (newton.contact.by_pairs(b)) continue;
     const Gap gap = gap_of(at_start[b], at_node(start_, node));

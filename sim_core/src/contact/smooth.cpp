@@ -100,10 +100,11 @@ double SmoothContact::apart(const PatchShape& shape, int node, const Foot& foot)
   return std::max(materials_.mean(sheet, surface), materials_.apart(sheet, surface) + sinking);
 }
 
-Vector3d SmoothContact::forced(int node, const Vector3d& before) const {
+Vector3d SmoothContact::forced(int node, const Vector3d& before, double allowed) const {
   if (track_.triangle[node] < 0) return Vector3d::Zero();
   const std::optional<Foot> foot = patches_.foot(start_, before, track_.triangle[node], track_.side[node]);
-  return foot ? std::max(apart(start_, node, *foot) - foot->height, 0.0) * foot->normal : Vector3d::Zero().eval();
+  const double depth = foot ? apart(start_, node, *foot) - foot->height : 0.0;
+  return depth > allowed ? depth * foot->normal : Vector3d::Zero().eval();
 }
 
 // The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was somewhere, while

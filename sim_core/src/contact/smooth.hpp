@@ -42,8 +42,8 @@ class SmoothContact {
 
   // What a node sees at p, if a surface is near.
   std::optional<SmoothTouch> touch(int node, const Eigen::Vector3d& p);
-  // How far a node that was at `before` when the step began was too near then, towards the cloth, m.
-  Eigen::Vector3d forced(int node, const Eigen::Vector3d& before) const;
+  // How far a node that was at `before` when the step began was too near then, if by more than `allowed`, m.
+  Eigen::Vector3d forced(int node, const Eigen::Vector3d& before, double allowed) const;
   // Of what the node saw last: its way over the surface since it was at `before` when the step began, m; friction; and
   // the foot.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
