@@ -11,8 +11,7 @@ from pathlib import Path
 import stickslip_training.benchmark
 import yaml
 from stickslip_training.benchmark.sets import frozen
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 
 
 def main() -> None:

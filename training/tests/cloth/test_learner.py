@@ -19,7 +19,7 @@ from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, tra
 from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
 from stickslip_training.cloth.posterior import MU_BINS
 
-SMALL = ClothTraining(steps=6, batch_size=2, width=16)
+SMALL = ClothTraining(steps=6, epoch=6, batch_size=2, width=16)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def few(runs, split_runs):
 @pytest.fixture(scope="module")
 def first(few):
     """A model to go on from; nothing may change it."""
-    return train_friction(*few[:2], SMALL, epoch=6)
+    return train_friction(*few[:2], SMALL)
 
 
 def weights(model):
@@ -52,7 +52,7 @@ def unfamiliar(monkeypatch):
 def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, unfamiliar, tmp_path, monkeypatch):
     from stickslip_training.engine import fit as engine
 
-    straight = train_friction(*few[:2], SMALL, epoch=2)
+    straight = train_friction(*few[:2], replace(SMALL, epoch=2))
     loss = FrictionLearner.loss
 
     def killed(learner, net, step):
@@ -64,11 +64,11 @@ def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, u
         patch.setattr(engine, "_CHECKPOINT_SECONDS", 0.0)  # after every step
         patch.setattr(FrictionLearner, "loss", killed)
         with pytest.raises(KeyboardInterrupt):
-            train_friction(*few[:2], SMALL, out=tmp_path, epoch=2)
-    resumed = train_friction(*few[:2], SMALL, out=tmp_path, epoch=2, resume=True)
+            train_friction(*few[:2], replace(SMALL, epoch=2), out=tmp_path)
+    resumed = train_friction(*few[:2], replace(SMALL, epoch=2), out=tmp_path, resume=True)
     assert equal(straight, resumed)
     assert straight.temperature == resumed.temperature
-    assert not equal(straight, train_friction(*few[:2], replace(SMALL, seed=1), epoch=2))
+    assert not equal(straight, train_friction(*few[:2], replace(SMALL, seed=1, epoch=2)))
 
 
 @pytest.mark.physics
@@ -158,13 +158,13 @@ def some_clips(few, renders=2):
 
 @pytest.mark.physics
 def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, first, unfamiliar):
-    going = replace(SMALL, steps=4, learning_rate=1e-4)
+    going = replace(SMALL, steps=4, epoch=2, learning_rate=1e-4)
     clips = some_clips(few)
-    model = train_friction(*few[:2], going, clips=clips, start=first, epoch=2)
+    model = train_friction(*few[:2], going, clips=clips, start=first)
     assert model.card["training_clips"] == len(clips.train) == 18
-    assert equal(model, train_friction(*few[:2], going, clips=clips, start=first, epoch=2))
+    assert equal(model, train_friction(*few[:2], going, clips=clips, start=first))
     # It went on: weights are nearer to those of the model than to those of another start.
-    fresh = train_friction(*few[:2], going, clips=clips, epoch=2)
+    fresh = train_friction(*few[:2], going, clips=clips)
 
     def distance(a, b):
         return sum(float((weights(a)[name] - value).norm()) for name, value in weights(b).items() if value.ndim > 1)
@@ -204,7 +204,7 @@ def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrore
 
 @pytest.mark.physics
 def test_the_silhouettes_of_a_start_stay_and_its_reader_learns(few, first, unfamiliar):
-    model = train_friction(*few[:2], replace(SMALL, seed=3), start=first, epoch=6)
+    model = train_friction(*few[:2], replace(SMALL, seed=3), start=first)
     for name, tensor in weights(first).items():
         if name.startswith("silhouette.") or name in ("mu.weight", "encoder.0.weight"):
             assert torch.equal(tensor, weights(model)[name]) == name.startswith("silhouette.")

@@ -11,7 +11,7 @@ from stickslip_training.cloth.learner import ClothTraining, train_friction
 def test_friction_of_unseen_simulations_is_learned_from_clips(runs, split_runs):
     train, validation, test = split_runs(runs, 0.1, 0.22)
     assert 65 <= len(train) <= 70
-    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False, repeats=1, dropout=0.1), epoch=150)
+    model = train_friction(train, validation, ClothTraining(steps=900, worlds=False, repeats=1, dropout=0.1, epoch=150))
     clips = render_clips(test, 6, 99)
     scores = score(model.estimate(clips), clips)
     assert scores.blind.simulations >= 20

@@ -5,7 +5,7 @@ import pytest
 import torch
 from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, frames_at, training_cameras
-from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
+from stickslip_training.cloth.crop import ANCHOR, HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
 from stickslip_training.cloth.render import POINTS, _refined, draw_style, draw_textures, render_crops, splat, turned
 from stickslip_training.cloth.world import coded, draw_world
 
@@ -24,7 +24,7 @@ def square(side, center=(0.0, 0.0), half=0.1, x=0.0):
 def silhouettes(positions, camera, points):
     """Share of each pixel of the picture that meshes (F, side, side, 3) cover, (F, height, width)."""
     fine = _refined(positions[None], points)
-    whole = Crops(torch.zeros(1, len(positions), 2), torch.ones(1, len(positions)), (0.0, 0.0))
+    whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, len(positions), 2), torch.ones(1, len(positions)))
     size = camera.height, camera.width
     return splat(fine, torch.ones(fine.shape[:-1]), Cameras.of([camera]), whole, size=size)[0][0]
 
@@ -54,7 +54,7 @@ def test_what_is_nearer_hides_what_is_behind():
         camera = looking_at(
             (0, 0, 0), azimuth=azimuth, elevation=0, distance=1.0, name="c", width=64, height=48, focal=100.0
         )
-        whole = Crops(torch.zeros(1, 1, 2), torch.ones(1, 1), (0.0, 0.0))
+        whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, 1, 2), torch.ones(1, 1))
         alpha, color = splat(points, colors, Cameras.of([camera]), whole, size=(48, 64))
         seen = color[alpha > 0.9]
         assert len(seen) > 60

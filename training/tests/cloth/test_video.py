@@ -9,7 +9,7 @@ import torch
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_testing.films import meshes_at, write_film
 from stickslip_training.cloth.clips import INSTANTS, RATE
-from stickslip_training.cloth.crop import Cameras, Crops, cut, holder_crops
+from stickslip_training.cloth.crop import ANCHOR, Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
 from stickslip_training.cloth.video import VideoError, import_video, load_camera
 
@@ -30,7 +30,7 @@ def pictures(run, seconds):
     found = []
     for mesh in torch.from_numpy(meshes_at(run, seconds)).split(32):
         fine = _refined(mesh[None], 112)
-        whole = Crops(torch.zeros(1, len(mesh), 2), torch.ones(1, len(mesh)), (0.0, 0.0))
+        whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, len(mesh), 2), torch.ones(1, len(mesh)))
         colors = checks.expand(fine.shape[:-1])
         alpha, color = splat(fine, colors, Cameras.of([CAMERA]), whole, size=(224, 224))
         found.append((alpha * color + (1 - alpha) * 0.05)[0])

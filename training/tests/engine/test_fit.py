@@ -3,8 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from stickslip_training.engine import fit as module
-from stickslip_training.engine.files import load_tensors
-from stickslip_training.engine.fit import FitSettings, Learner, cosine_rate, fit, seeded
+from stickslip_training.engine.fit import FitSettings, Learner, cosine_rate, fit, load_tensors, seeded
 from torch import nn
 
 SETTINGS = FitSettings(steps=23, epoch=5, seed=3, averaging=0.9, clip=1.0, threads=1)

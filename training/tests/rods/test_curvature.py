@@ -32,39 +32,39 @@ def weights(report_or_config):
 
 def test_the_loss_falls(trained):
     _, report = trained
-    validation = {epoch.step: epoch.validation_loss for epoch in report.history}
+    validation = {epoch["step"]: epoch["validation_loss"] for epoch in report["history"]}
     assert len(validation) == 12
-    assert validation[report.best_step] == min(validation.values())
-    assert min(validation.values()) < 0.85 * report.history[0].validation_loss
+    assert validation[report["best_step"]] == min(validation.values())
+    assert min(validation.values()) < 0.85 * report["history"][0]["validation_loss"]
 
 
 def test_the_report_measures_the_model_that_is_saved(trained, rods):
     config, report = trained
-    assert [method.method for method in report.methods] == [
+    assert [method["method"] for method in report["methods"]] == [
         "network",
         "quintic spline",
         "cubic spline",
         "finite differences",
     ]
-    assert json.loads((config.out / "report.json").read_text())["test_loss"] == report.test_loss
+    assert json.loads((config.out / "report.json").read_text())["test_loss"] == report["test_loss"]
     with DatasetReader(rods.root) as reader:
         test = load_splits(reader, config.evaluation_rods)[0]["test"]
     noisy = noisy_test_centerline(test, config.noise, config.seed)
     assert np.array_equal(test.centerline, rods.arrays["centerline"][test.slots])
     assert 0.0009 < (noisy - test.centerline).std() < 0.0011
     strains = estimate_strains(load_model(config.out / "model.pt"), noisy)
-    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report.test_loss, rel=1e-5)
+    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
     estimate, truth = (np.hypot(values[..., 1], values[..., 2]) for values in (strains, test.strains))
     errors = np.linalg.norm(estimate - truth, axis=1) / np.linalg.norm(truth, axis=1)
-    assert report.methods[0].relative_median == pytest.approx(np.median(errors), rel=1e-5)
-    assert report.rods == dict(rods.manifest.split_counts)
-    assert report.certificate == rods.manifest.certificate
-    assert report.parameters == 9_985_154
+    assert report["methods"][0]["relative_median"] == pytest.approx(np.median(errors), rel=1e-5)
+    assert report["rods"] == dict(rods.manifest.split_counts)
+    assert report["certificate"] == rods.manifest.certificate
+    assert report["parameters"] == 9_985_154
 
 
 def test_few_test_rods_are_told(trained):
-    assert len(trained[1].notes) == 1
-    assert trained[1].notes[0].startswith(f"There are only {trained[1].rods['test']} test rods")
+    assert len(trained[1]["notes"]) == 1
+    assert trained[1]["notes"][0].startswith(f"There are only {trained[1]['rods']['test']} test rods")
 
 
 @pytest.mark.slow
@@ -75,7 +75,7 @@ def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, 
     second = train_curvature(again)
     other = replace(config, out=tmp_path / "other", seed=1)
     train_curvature(other)
-    assert [epoch.train_loss for epoch in first.history] == [epoch.train_loss for epoch in second.history]
+    assert [epoch["train_loss"] for epoch in first["history"]] == [epoch["train_loss"] for epoch in second["history"]]
     for name, tensor in weights(config).items():
         assert torch.equal(tensor, weights(again)[name])
     assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
@@ -85,10 +85,10 @@ def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, 
 def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path):
     straight = train_curvature(config)
     stopped = replace(config, out=tmp_path / "stopped", steps=4)
-    assert train_curvature(stopped).steps == 4  # within the second epoch
+    assert train_curvature(stopped)["steps"] == 4  # within the second epoch
     resumed = train_curvature(replace(config, out=stopped.out), resume=True)
-    assert [(epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in resumed.history] == [
-        (epoch.step, epoch.train_loss, epoch.validation_loss) for epoch in straight.history
+    assert [(epoch["step"], epoch["train_loss"], epoch["validation_loss"]) for epoch in resumed["history"]] == [
+        (epoch["step"], epoch["train_loss"], epoch["validation_loss"]) for epoch in straight["history"]
     ]
     for name, tensor in weights(config).items():
         assert torch.equal(tensor, weights(stopped)[name])
@@ -122,24 +122,24 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
         return train_curvature(CurvatureTraining(dataset=str(made.root), out=tmp_path / name, steps=1, threads=1))
 
     only_train = run("train", train=1.0)
-    assert only_train.rods == {"train": 6, "validation": 0, "test": 6}
-    assert only_train.history[0].validation_loss is None
-    assert [note.split(":")[0] for note in only_train.notes] == [
+    assert only_train["rods"] == {"train": 6, "validation": 0, "test": 6}
+    assert only_train["history"][0]["validation_loss"] is None
+    assert [note.split(":")[0] for note in only_train["notes"]] == [
         "The validation split is empty",
         "The test split is empty",
         "Test rods were trained on",
         "There are only 6 test rods",
     ]
     only_test = run("test", test=1.0)
-    assert only_test.rods == {"train": 6, "validation": 0, "test": 6}
-    assert only_test.notes[0] == "The train split is empty: the network was trained on the test split."
+    assert only_test["rods"] == {"train": 6, "validation": 0, "test": 6}
+    assert only_test["notes"][0] == "The train split is empty: the network was trained on the test split."
 
 
 @pytest.mark.physics
 def test_evaluation_of_a_part_is_told(config):
     report = train_curvature(replace(config, steps=3, evaluation_rods=3))
-    assert report.rods["test"] == 3
-    assert report.notes[0].startswith("Evaluated on 3 of ")
+    assert report["rods"]["test"] == 3
+    assert report["notes"][0].startswith("Evaluated on 3 of ")
 
 
 def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):

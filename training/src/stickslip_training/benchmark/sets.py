@@ -25,8 +25,7 @@ from stickslip_training.arrays import Array, Integers
 from stickslip_training.benchmark.cloth import ClothTask
 from stickslip_training.benchmark.rods import RodTask
 from stickslip_training.benchmark.task import Task
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 
 SETS = Path(__file__).parent / "sets"
 

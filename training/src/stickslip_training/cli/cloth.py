@@ -9,9 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import readable_errors
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.cli.errors import readable_errors, shows_epochs
+from stickslip_training.data.reader import DatasetReader, Split
 
 NO_ANSWER = 3
 """Exit status of `predict` where no clip has an answer."""
@@ -48,14 +47,9 @@ def train(
     from stickslip_training.cloth.clips import training_clips, training_runs
     from stickslip_training.cloth.learner import ClothTraining, train_friction
     from stickslip_training.cloth.model import load_friction, save_friction
-    from stickslip_training.engine.fit import EpochReport
+    from stickslip_training.engine.fit import write_report
 
     console = Console()
-
-    def show(epoch: EpochReport) -> None:
-        validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
-        console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
-
     with readable_errors():
         settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=device)
         first = None if start is None else load_friction(start)
@@ -74,11 +68,11 @@ def train(
             out=out,
             identity=source,
             resume=resume,
-            on_epoch=show,
+            on_epoch=shows_epochs(console, steps),
         )
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
-        (out / "report.json").write_text(json.dumps(model.card, indent=2) + "\n", encoding="utf-8")
+        write_report(out, model.card)
     console.print(f"{out}: friction.safetensors, report.json, checkpoint.pt", soft_wrap=True)
 
 

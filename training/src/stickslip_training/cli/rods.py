@@ -1,20 +1,13 @@
 """The commands on rods: `stickslip-train curvature` and `reconstruct`."""
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import DatasetArgument, readable_errors
-
-if TYPE_CHECKING:
-    from stickslip_training.rods.curvature import TrainingReport
-
-
-_SECONDS_BETWEEN_LINES = 5.0  # epochs of a small dataset take less
+from stickslip_training.cli.errors import DatasetArgument, readable_errors, shows_epochs
 
 
 def curvature(
@@ -29,20 +22,9 @@ def curvature(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
     """Train the network that estimates curvature from a noisy centreline, and compare it with no learning."""
-    from stickslip_training.engine.fit import EpochReport
     from stickslip_training.rods.curvature import CurvatureTraining, train_curvature
 
     console = Console()
-    shown_at = -math.inf
-
-    def show(epoch: EpochReport) -> None:
-        nonlocal shown_at
-        if epoch.seconds < shown_at + _SECONDS_BETWEEN_LINES:
-            return
-        shown_at = epoch.seconds
-        validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
-        console.print(f"epoch {epoch.epoch}: loss {epoch.train_loss:.3f}{validation} rad, {epoch.seconds:.0f} s")
-
     with readable_errors():
         config = CurvatureTraining(
             dataset=dataset,
@@ -54,30 +36,31 @@ def curvature(
             threads=threads,
             device=device,
         )
-        report = train_curvature(config, resume=resume, on_epoch=show)
+        report = train_curvature(config, resume=resume, on_epoch=shows_epochs(console, steps))
         console.print(_results(report))
-        for note in report.notes:
+        for note in report["notes"]:
             console.print(f"Note: {note}")
         console.print(f"{out}: report.json, model.pt, checkpoint.pt", soft_wrap=True)
 
 
-def _results(report: "TrainingReport") -> Table:
+def _results(report: dict[str, Any]) -> Table:
+    rods = report["rods"]
     table = Table(
-        title=f"|κ| of {report.rods['test']} test rods at {report.config['noise']:.2%} noise",
-        caption=f"The network's loss over all three strains is {report.test_loss:.3f} rad. "
-        f"It was trained for {report.seconds:.0f} s on {report.rods['train']} rods.",
+        title=f"|κ| of {rods['test']} test rods at {report['config']['noise']:.2%} noise",
+        caption=f"The network's loss over all three strains is {report['test_loss']:.3f} rad. "
+        f"It was trained for {report['seconds']:.0f} s on {rods['train']} rods.",
         caption_justify="left",
     )
     table.add_column("method")
     for title in ("RMS of |κ| L", "error, median", "error, 90 %", "ms a rod"):
         table.add_column(title, justify="right", no_wrap=True)
-    for method in report.methods:
+    for method in report["methods"]:
         table.add_row(
-            method.method,
-            f"{method.rms:,.2f} rad",
-            f"{method.relative_median:,.1%}",
-            f"{method.relative_p90:,.1%}",
-            f"{1e3 * method.seconds_per_rod:,.2f}",
+            method["method"],
+            f"{method['rms']:,.2f} rad",
+            f"{method['relative_median']:,.1%}",
+            f"{method['relative_p90']:,.1%}",
+            f"{1e3 * method['seconds_per_rod']:,.2f}",
         )
     return table
 

@@ -24,8 +24,7 @@ from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
 from stickslip_training.cloth.runs import SLIDING, Runs, landed_side, load_runs, runs_of_dataset
 from stickslip_training.cloth.world import draw_world
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine.fit import seed_of_step
 
 RIG = "drag"

@@ -72,21 +72,19 @@ class Crops:
     """(B, F, 2) [px]: column and row of the middle of the holders."""
     scale: torch.Tensor
     """(B, F): pixels of the crop over those of the picture."""
-    anchor: tuple[float, float] = (ANCHOR[1], ANCHOR[0])
-    """Column and row of the crop at which the origin lands [px]."""
 
     def __getitem__(self, chosen: slice) -> "Crops":
-        return Crops(self.origin[chosen], self.scale[chosen], self.anchor)
+        return Crops(self.origin[chosen], self.scale[chosen])
 
     def off_by(self, shift: torch.Tensor, stretch: torch.Tensor) -> "Crops":
         """Return crops whose registration is wrong: by pixels of the crop (B, F, 2), and by a factor (B,) in scale."""
         scale = self.scale * stretch[:, None]
-        return Crops(self.origin - shift / scale[..., None], scale, self.anchor)
+        return Crops(self.origin - shift / scale[..., None], scale)
 
     def of_pixels(self, pixels: torch.Tensor) -> torch.Tensor:
         """Return pixels of the picture (B, F, ..., 2) in the crop, (column, row)."""
         extra = (1,) * (pixels.ndim - 3)
-        anchor = pixels.new_tensor(self.anchor)
+        anchor = pixels.new_tensor((ANCHOR[1], ANCHOR[0]))
         origin = self.origin.reshape(*self.origin.shape[:2], *extra, 2)
         return (pixels - origin) * self.scale.reshape(*self.scale.shape, *extra, 1) + anchor
 

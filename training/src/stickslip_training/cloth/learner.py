@@ -37,7 +37,6 @@ from stickslip_training.engine.fit import (
     FitSettings,
     Fitted,
     Learner,
-    check_device,
     check_positive,
     cosine_rate,
     fit,
@@ -54,10 +53,14 @@ KEPT = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClothTraining:
+class ClothTraining(FitSettings):
     """How a network is trained. The same settings, runs, machine and threads give the same weights."""
 
     steps: int = 1500
+    epoch: int = 250
+    averaging: float = 0.99
+    clip: float | None = 1.0
+    threads: int = 1
     batch_size: int = 16
     learning_rate: float = 2e-3
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
@@ -65,8 +68,6 @@ class ClothTraining:
     """Steps for each batch of clips: drawing it, with silhouettes, costs five times as much as learning from it."""
     dropout: float = 0.2
     """Share of the joined features that a step leaves out [1]; with 0.1 a network learns few simulations by heart."""
-    averaging: float = 0.99
-    """Decay of the running average over steps that is the model's weights."""
     smoothing: tuple[float, float] = (0.2, 0.02)
     """Standard deviation of the target histogram of mu at the first and at the last step [1]: wide targets teach the
     order of mu first."""
@@ -78,13 +79,11 @@ class ClothTraining:
     """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
     instants: tuple[int, ...] = INSTANTS
     """Of the frames that the network sees, of 300."""
-    seed: int = 0
     width: int = 96
-    threads: int = 1
-    device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check_positive(self, "steps", "batch_size", "learning_rate", "repeats", "width", "threads")
+        super().__post_init__()
+        check_positive(self, "batch_size", "learning_rate", "repeats", "width")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be from 0 to less than 1, and is {self.dropout}")
         if not all(0 < deviation < math.inf for deviation in self.smoothing):
@@ -92,7 +91,6 @@ class ClothTraining:
         for name in ("gap", "turn"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be 0 or more and finite, and is {getattr(self, name)}")
-        check_device(self.device)
 
 
 def train_friction(
@@ -106,7 +104,6 @@ def train_friction(
     identity: dict[str, Any] | None = None,
     resume: bool = False,
     on_epoch: Callable[[EpochReport], None] | None = None,
-    epoch: int = 250,
 ) -> FrictionModel:
     """Train a network on runs, calibrate it on the runs for validation, and return the model.
 
@@ -120,30 +117,14 @@ def train_friction(
         identity: Names the runs and the clips; a run that is resumed must have the same.
         resume: Continue from the checkpoint in `out`.
         on_epoch: Called with the report of every epoch.
-        epoch: Steps between two validations.
     """
     if start is not None and clips is None:
         train, validation = (runs.named(start.materials) for runs in (train, validation))
     with torch_threads(settings.threads):
         learner = FrictionLearner(train, validation, settings, clips, start)
         compared = {name: value for name, value in asdict(settings).items() if name not in ("threads", "device")}
-        fitted = fit(
-            learner,
-            FitSettings(
-                steps=settings.steps,
-                epoch=epoch,
-                seed=settings.seed,
-                averaging=settings.averaging,
-                clip=1.0,
-                threads=settings.threads,
-                device=settings.device,
-            ),
-            out=out,
-            identity=(identity or {}) | compared,
-            resume=resume,
-            on_epoch=on_epoch,
-        )
-        return learner.calibrated(fitted)
+        identity = (identity or {}) | compared
+        return learner.calibrated(fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch))
 
 
 class FrictionLearner(Learner):
@@ -293,11 +274,7 @@ class FrictionLearner(Learner):
             "training_runs": len(train),
             "validation_runs": len(self.judged),
             "training_clips": 0 if self.clips is None else len(self.clips.train),
-            "steps": fitted.steps,
-            "best_step": fitted.best_step,
-            "seconds": round(fitted.seconds, 1),
-            "history": [asdict(report) for report in fitted.history],
-            "parameters": sum(parameter.numel() for parameter in net.parameters()),
+            **fitted.facts(),
         }
         return FrictionModel(
             net=net,

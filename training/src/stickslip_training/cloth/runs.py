@@ -15,8 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 
 STEP = 1e-5
 """Of the positions in a packed file [m]."""

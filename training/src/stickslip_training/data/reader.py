@@ -1,25 +1,160 @@
 """Read samples of a dataset version, from a directory, a bucket or over HTTP, into NumPy arrays.
 
-There are no threads and nothing asynchronous, so a reader may be used before and after a fork, and it can be pickled.
-Missing data raises; it is never replaced by zeros.
+Opening checks the seal, manifest, metadata and labels against one another. There are no threads and nothing
+asynchronous, so a reader may be used before and after a fork, and it can be pickled. Missing data raises; it is never
+replaced by zeros.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import os
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 from stickslip_schemas.format.codecs import empty_in_order, in_order_of_chunks
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import SEAL_NAME, BrokenSealError, FileEntry, Manifest, Rejection, check_seal
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
+from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
+from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.errors import MissingFileError, RejectedSampleError
-from stickslip_training.data.version import Version
+from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError
+from stickslip_training.data.index import Index
+from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
+from stickslip_training.data.sources import DirectorySource, Source, open_source
 
+Split = Literal["train", "validation", "test"]
 Slots = Sequence[int] | npt.NDArray[np.integer[Any]]
 
 
-class DatasetReader(Version):
+class DatasetReader:
     """One version of a dataset, open for reading. Samples are named by their slot, 0 to `len(reader)` - 1."""
+
+    manifest_digest: str
+    """SHA-256 of the manifest."""
+    selection: Selection
+    """The part of the version that the source holds."""
+    arrays: dict[str, ArrayLayout]
+
+    def __init__(
+        self,
+        source: str | os.PathLike[str],
+        *,
+        api_key: str | None = None,
+        verify: bool = False,
+        check_shards: bool = True,
+        cache_bytes: int = 256 * 2**20,
+    ) -> None:
+        """Open a version.
+
+        Args:
+            source: Directory of the version, or its URL (see `sources`).
+            api_key: Key for a server; the default is the environment variable `STICKSLIP_API_KEY`.
+            verify: Read every file first, and check it against the manifest.
+            check_shards: Check a shard in a directory before its first sample is read. Over HTTP only `verify` checks
+                shards, for samples are parts of them.
+            cache_bytes: Memory for decoded chunks of curves, which hold many samples.
+
+        Raises:
+            DatasetError: The version is damaged, or contradicts the contract.
+        """
+        self.source = open_source(source, api_key=api_key)
+        try:
+            self.manifest_digest, group, manifest = _read_sealed(self.source)
+            parsed = _parse_manifest(manifest)
+            self.selection = _read_selection(self.source, self.manifest_digest)
+            self.arrays = {array.name: array for array in self.selection.choose_arrays(layout(parsed.spec))}
+            self.index = Index(self.source, parsed, self.arrays, check_shards=check_shards, cache_bytes=cache_bytes)
+            if verify:
+                self.verify()
+            self._check_metadata(group)
+            self._check_labels()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def manifest(self) -> Manifest:
+        return self.index.manifest
+
+    @property
+    def spec(self) -> JobSpec:
+        """The spec of the job that made the version."""
+        return self.manifest.spec
+
+    @property
+    def kind(self) -> str:
+        """The kind of the dataset, `rod_hang` for example."""
+        return str(self.spec.kind)
+
+    @cached_property
+    def valid(self) -> Array:
+        """True where there is a sample, bool (slots,)."""
+        return self.label("valid")
+
+    @cached_property
+    def chosen(self) -> Array:
+        """True where there is a sample in the part of the version that the source holds, bool (slots,)."""
+        return self.selection.choose_samples(self.arrays.values(), self.label)
+
+    def __len__(self) -> int:
+        """Return the number of slots, those of rejected samples included."""
+        return self.manifest.sample_count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.source.close()
+
+    def slots(self, split: Split | None = None) -> npt.NDArray[np.int64]:
+        """Return the slots of `split`, or of all splits, in increasing order.
+
+        Rejected samples, which have labels only, and those of other parts of the version are left out.
+        """
+        chosen = self.chosen.copy()
+        if split is not None:
+            if split not in SPLITS:
+                raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split!r}")
+            chosen &= self.label("split") == SPLITS.index(split)
+        return np.flatnonzero(chosen).astype(np.int64)
+
+    def array(self, name: str) -> ArrayLayout:
+        """Return the layout of an array; raise ValueError where the version has none of this name."""
+        try:
+            return self.arrays[name]
+        except KeyError:
+            raise ValueError(f"array must be one of {', '.join(self.arrays)}, and is {name!r}") from None
+
+    def label(self, name: str) -> Array:
+        """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector; read-only."""
+        array = self.array(name)
+        if not array.is_label:
+            raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
+        return self.index.label(name)
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        return tuple(array.name for array in self.arrays.values() if array.is_label)
+
+    def categories(self, name: str) -> tuple[str, ...]:
+        """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
+        return tuple(map(str, self.array(name).categories))
+
+    def rejections(self) -> Iterator[Rejection]:
+        """Yield the rejected samples with their reasons, by slot."""
+        with self.index.contents() as contents:
+            yield from contents.rejections()
+
+    def files(self) -> Iterator[FileEntry]:
+        with self.index.contents() as contents:
+            yield from contents.files()
 
     def read(self, name: str, slots: Slots) -> Array:
         """Return array `name` of the samples in `slots`, (len(slots), *sample shape)."""
@@ -66,3 +201,94 @@ class DatasetReader(Version):
                 f"sample {slot} is not in the part of the dataset that {self.source} holds: "
                 f"{self.selection.model_dump_json()}"
             )
+
+    # --- checks -------------------------------------------------------------------------------------------------
+
+    def verify(self) -> None:
+        """Check the size and the SHA-256 of every file of the manifest; opening has checked the manifest itself."""
+        with self.index.contents() as contents:
+            part = part_files(contents, self.selection, self.label)
+        for file in part:
+            if ".." in file.path.split("/"):
+                raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
+            self.index.read_file(file)
+        for slot in np.flatnonzero(self.chosen).tolist():
+            self.index.check_section(slot)
+
+    def _check_metadata(self, group: dict[str, Any]) -> None:
+        """Check the Zarr metadata against the layout, and their digests against the manifest."""
+        inline = consolidated(group)
+        for name, array in self.arrays.items():
+            if inline is None:
+                file = self.index.file(f"{name}/{GROUP_METADATA}", "metadata")
+                found: Any = parse_metadata(self.index.read_file(file), self.index.at(file))
+            else:
+                found = inline.get(name)
+            check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
+
+    def _check_labels(self) -> None:
+        """Check that the manifest fits the arrays `valid` and `split`.
+
+        A section is checked when the first of its samples is read.
+        """
+        for array in self.arrays.values():
+            for number in range(-(-len(self) // self.manifest.samples_per_file(array)) if array.is_label else 0):
+                self.index.file(array.shard_path(number), f"array {array.name}, file {number}")
+        if not self.manifest.sections:
+            self.index.check_section(0)
+        if (valid_count := int(np.count_nonzero(self.valid))) != self.manifest.valid_count:
+            raise InvalidDatasetError(
+                f"valid_count of the manifest is {self.manifest.valid_count}, and array valid has {valid_count}"
+            )
+        split = self.label("split")
+        if split.max() >= len(SPLITS):
+            raise InvalidDatasetError(f"array split must be less than {len(SPLITS)}, and there is a {split.max()}")
+        counts = np.bincount(split[self.valid], minlength=len(SPLITS)).tolist()
+        stated = [self.manifest.split_counts.get(name, 0) for name in SPLITS]
+        if stated != counts:
+            raise InvalidDatasetError(
+                f"split_counts of the manifest are {self.manifest.split_counts}, and those of the arrays "
+                f"{dict(zip(SPLITS, counts, strict=True))}"
+            )
+
+
+def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
+    """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked against one another."""
+    manifest = source.read_manifest()
+    group = source.fetch(GROUP_METADATA)[0]
+    try:
+        digest = check_seal(manifest, group, source.fetch(SEAL_NAME)[0])
+    except BrokenSealError as error:
+        raise CorruptDataError(f"{source}/{error}") from None
+    return digest, parse_metadata(group, f"{source}/{GROUP_METADATA}"), manifest
+
+
+def _read_selection(source: Source, manifest: str) -> Selection:
+    """Return the part of the version with this manifest that the source holds, which may be all of it."""
+    if not isinstance(source, DirectorySource):
+        return Selection()  # servers have whole versions
+    try:
+        data = source.fetch(SELECTION_NAME)[0]
+    except MissingFileError:
+        return Selection()
+    try:
+        part = PartDocument.model_validate_json(data)
+    except ValidationError as error:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is damaged: {error}") from None
+    if part.manifest != manifest:
+        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is of another version, whose manifest is {part.manifest}")
+    return part.selection
+
+
+def _parse_manifest(data: bytes) -> Manifest:
+    try:
+        manifest = Manifest.model_validate_json(data)
+    except ValidationError as error:
+        raise InvalidDatasetError(f"the manifest does not hold to the contract: {error}") from None
+    listed = manifest.sample_count if manifest.sections else len(manifest.sample_keys)
+    if listed != manifest.sample_count or manifest.spec.sample_count != manifest.sample_count:
+        raise InvalidDatasetError(
+            f"sample_count of the manifest is {manifest.sample_count}, its spec asks for {manifest.spec.sample_count} "
+            f"and it lists {len(manifest.sample_keys)} sample keys"
+        )
+    return manifest

@@ -22,8 +22,7 @@ from stickslip_schemas.spec.arrays import COMMON_ARRAYS
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 
 
 class Item(dict[str, torch.Tensor]):

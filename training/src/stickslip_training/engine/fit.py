@@ -6,7 +6,10 @@ give the same weights, and a run that is resumed goes on exactly as if it had no
 """
 
 import copy
+import io
+import json
 import math
+import platform
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,10 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
+from stickslip_schemas.store import write_durably
 from torch import nn
 
-from stickslip_training.engine.files import load_tensors, save_tensors
+from stickslip_training import __version__
 
 CHECKPOINT_NAME = "checkpoint.pt"
 
@@ -98,6 +103,23 @@ class Fitted:
     history: tuple[EpochReport, ...]
     best_step: int
     """The step whose weights the network has."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a report says of every run, as plain values, with the versions that its numbers depend on."""
+        return {
+            "steps": self.steps,
+            "best_step": self.best_step,
+            "seconds": round(self.seconds, 3),
+            "history": [asdict(report) for report in self.history],
+            "parameters": sum(parameter.numel() for parameter in self.net.parameters()),
+            "versions": {
+                "stickslip-training": __version__,
+                "python": platform.python_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+                "scipy": scipy.__version__,
+            },
+        }
 
 
 @dataclass
@@ -249,6 +271,27 @@ class _Run:
             setattr(self.state, name, value)
         self.state.history = [EpochReport(**report) for report in content["state"]["history"]]
         self.state.best = {name: tensor.cpu() for name, tensor in self.state.best.items()}
+
+
+# --- files ----------------------------------------------------------------------------------------------------
+
+
+def save_tensors(path: Path, content: dict[str, Any]) -> None:
+    """Write tensors and plain values, whole or not at all."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_durably(path, buffer.getvalue())
+
+
+def load_tensors(path: str | Path, *, device: str = "cpu") -> dict[str, Any]:
+    """Return what `save_tensors` wrote; nothing but tensors and plain values is ever loaded."""
+    content: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    return content
+
+
+def write_report(out: Path, report: Mapping[str, Any]) -> None:
+    """Write `report.json` below `out`, whole or not at all; a number that is none raises ValueError."""
+    write_durably(out / "report.json", f"{json.dumps(report, indent=2, allow_nan=False)}\n".encode())
 
 
 # --- for learners ---------------------------------------------------------------------------------------------

@@ -192,7 +192,7 @@ def _radius(views: Sequence[View]) -> float:
 
 def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radius: bool) -> list[Fit]:
     """Return the fits of all different starts."""
-    lines = [track.points for track in follow(views, radius, direction, STARTS)]
+    lines = follow(views, radius, direction, STARTS)
     try:
         by_hull = moving_cylinder(visual_hull(views), radius, direction)
     except HullTooLargeError:

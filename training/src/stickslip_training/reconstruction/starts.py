@@ -9,7 +9,6 @@ cloud has no order, and where turns of a curl come close in several views it has
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -31,16 +30,11 @@ BLUR = 0.6  # deviation of the filter of `_middle`, over the rod's radius
 PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))  # what it leaves in the middle of a straight strip of coverage 1
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
-    """One way: points (STEPS + 1, 3) one step apart, and what it cost."""
+def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 5) -> list[Floats]:
+    """Return the best ways from the clamp, (STEPS + 1, 3) each, one step apart; radius [L].
 
-    points: Floats
-    cost: float
-
-
-def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 5) -> list[Track]:
-    """Return the best ways from the clamp, cheapest first, each unlike the ones before it; radius [L]."""
+    The cheapest comes first, and each is unlike the ones before it.
+    """
     fields = [_middle(view, radius) for view in views]
     step = 1.0 / STEPS
     position = np.zeros((1, 3))
@@ -124,8 +118,8 @@ def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDAr
 
 def _unlike(
     trail: list[Floats], parents: list[npt.NDArray[np.int64]], cost: Floats, ways: int, apart: float = 0.02
-) -> list[Track]:
-    tracks: list[Track] = []
+) -> list[Floats]:
+    tracks: list[Floats] = []
     for end in np.argsort(cost, kind="stable"):
         index, points = int(end), []
         for positions, parent in zip(reversed(trail[1:]), reversed(parents), strict=True):
@@ -133,8 +127,8 @@ def _unlike(
             index = int(parent[index])
         points.append(trail[0][0])
         way = np.array(points[::-1])
-        if all(np.linalg.norm(way - other.points, axis=1).max() > apart for other in tracks):
-            tracks.append(Track(way, float(cost[end])))
+        if all(np.linalg.norm(way - other, axis=1).max() > apart for other in tracks):
+            tracks.append(way)
             if len(tracks) == ways:
                 break
     return tracks

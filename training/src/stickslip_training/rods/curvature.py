@@ -10,10 +10,20 @@ import torch
 from torch import nn
 
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.engine.files import MODEL_NAME, load_tensors, save_tensors, versions, write_report
-from stickslip_training.engine.fit import EpochReport, FitSettings, Learner, check_positive, fit, seeded, torch_threads
+from stickslip_training.engine.fit import (
+    EpochReport,
+    FitSettings,
+    Learner,
+    check_positive,
+    fit,
+    load_tensors,
+    save_tensors,
+    seeded,
+    torch_threads,
+    write_report,
+)
 from stickslip_training.rods.dataset import Rods, load_splits, with_white_noise
-from stickslip_training.rods.evaluation import MethodReport, estimate_strains, evaluate, noisy_test_centerline, rms
+from stickslip_training.rods.evaluation import estimate_strains, evaluate, noisy_test_centerline, rms
 from stickslip_training.rods.nets import CurvatureNet, root_mean_square_loss
 
 _TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apart
@@ -54,38 +64,13 @@ class CurvatureTraining(FitSettings):
             raise ValueError(f"decay must be between 0 and 1, and is {self.decay}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainingReport:
-    """What came out of a run."""
-
-    dataset: str
-    version: int
-    manifest: str
-    """SHA-256 of the manifest."""
-    certificate: str | None
-    config: dict[str, Any]
-    rods: dict[str, int]
-    """Number of rods used for training, validation and test."""
-    parameters: int
-    """Number of weights of the network."""
-    steps: int
-    seconds: float
-    """Training time [s]."""
-    history: tuple[EpochReport, ...]
-    best_step: int
-    """The step whose weights are the model."""
-    test_loss: float
-    """The loss on the test rods, all three strains [rad]."""
-    methods: tuple[MethodReport, ...]
-    notes: tuple[str, ...]
-    """What a reader of the numbers has to know: splits that were missing, few rods."""
-    versions: dict[str, str]
-
-
 def train_curvature(
     config: CurvatureTraining, *, resume: bool = False, on_epoch: Callable[[EpochReport], None] | None = None
-) -> TrainingReport:
-    """Train and evaluate; write the model, a checkpoint and the report below `config.out`.
+) -> dict[str, Any]:
+    """Train and evaluate; write the model, a checkpoint and the report below `config.out`, and return the report.
+
+    It has the dataset, `config`, the number of `rods` of each split, the run, its `test_loss` over all three strains
+    [rad], how each of the `methods` did, and `notes` that a reader of the numbers must know.
 
     With `resume`, go on from the checkpoint there, of a run with the same config but for its length; its training time
     counts. `on_epoch` hears of every epoch.
@@ -101,25 +86,20 @@ def train_curvature(
     with torch_threads(config.threads):
         noisy = noisy_test_centerline(rods["test"], config.noise, config.seed)
         methods, test_loss = evaluate(fitted.net, rods["test"], noisy)
-    report = TrainingReport(
-        dataset=manifest.dataset,
-        version=manifest.version,
-        manifest=digest,
-        certificate=manifest.certificate,
-        config={**asdict(config), "out": str(config.out)},
-        rods={name: len(part) for name, part in rods.items()},
-        parameters=sum(parameter.numel() for parameter in fitted.net.parameters()),
-        steps=fitted.steps,
-        seconds=round(fitted.seconds, 3),
-        history=fitted.history,
-        best_step=fitted.best_step,
-        test_loss=test_loss,
-        methods=methods,
-        notes=tuple(notes),
-        versions=versions(),
-    )
+    report = {
+        "dataset": manifest.dataset,
+        "version": manifest.version,
+        "manifest": digest,
+        "certificate": manifest.certificate,
+        "config": {**asdict(config), "out": str(config.out)},
+        "rods": {name: len(part) for name, part in rods.items()},
+        **fitted.facts(),
+        "test_loss": test_loss,
+        "methods": [asdict(method) for method in methods],
+        "notes": notes,
+    }
     content = {"net": fitted.net.state_dict(), "noise": config.noise, "manifest": digest}
-    save_tensors(config.out / MODEL_NAME, content)
+    save_tensors(config.out / "model.pt", content)
     write_report(config.out, report)
     return report
 

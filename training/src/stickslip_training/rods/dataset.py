@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stickslip_training.arrays import AnyFloats, Array, Integers, SingleFloats
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.version import Split
+from stickslip_training.data.reader import DatasetReader, Split
 
 KIND = "rod_hang"
 
