@@ -34,10 +34,10 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     floor = np.tile(plane(mu).pose, (64, 1, 1, 1))
     cloth.advance(seconds, motion, path=lambda times: (hands.at(times), floor[: len(times)]))
     cpu = time.process_time() - start
-    steps = cloth.steps
+    total, steps = cloth.total, cloth.total.steps
     print(
-        f"| {vertices} | {cpu:.1f} | {hanging:.1f} | {steps} | {cloth.newton / steps:.2f} | {cloth.krylov / steps:.1f} "
-        f"| {cloth.factorizations / steps:.2f} | {cloth.missed_steps} | {cloth.unconverged_steps} |",
+        f"| {vertices} | {cpu:.1f} | {hanging:.1f} | {steps} | {total.newton / steps:.2f} | {total.krylov / steps:.1f} "
+        f"| {total.factorizations / steps:.2f} | {total.missed} | {total.unconverged} |",
         flush=True,
     )
     if vertices in BEFORE:

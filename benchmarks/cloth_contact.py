@@ -76,8 +76,8 @@ def compare(material: str, vertices: int, frames: int) -> None:
         seconds[mu], cloth, crossed = dragged(material, vertices, frames, mu)
         print(
             f"{material} {vertices} x {vertices}, {frames} frames, contact with itself {mu}: {seconds[mu]:.2f} CPU s, "
-            f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged, {crossed} end with a crossing, "
-            f"{cloth.newton} iterations, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses",
+            f"{cloth.total.unconverged} of {cloth.total.steps} steps unconverged, {crossed} end with a crossing, "
+            f"{cloth.total.newton} iterations, least distance {cloth.total.least_distance / THICKNESS:.4f} thicknesses",
             flush=True,
         )
     print(f"  ratio {seconds[0.5] / seconds[None]:.2f}", flush=True)
@@ -96,9 +96,9 @@ def stretched(vertices: int, frames: int) -> None:
     seconds = between - begin, time.process_time() - between
     print(
         f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a stretched cloth "
-        f"{seconds[1]:.1f}: {seconds[1] / seconds[0]:.1f} times; {cloth.unconverged_steps} of {cloth.steps} steps "
-        f"unconverged, least distance {cloth.least_distance / THICKNESS:.4f} thicknesses, "
-        f"{(cloth.self_intersections > 0).sum()} frames cross",
+        f"{seconds[1]:.1f}: {seconds[1] / seconds[0]:.1f} times; {cloth.labels['unconverged_steps']} of "
+        f"{cloth.labels['steps']} steps unconverged, least distance {cloth.least_distance / THICKNESS:.4f} "
+        f"thicknesses, {(cloth.self_intersections > 0).sum()} frames cross",
         flush=True,
     )
 
@@ -163,8 +163,9 @@ def over_facets() -> None:
                 f"capstan, mu {mu}, {name}: "
                 f"ln(T2/T1) {np.log(heavy.mean() / capstan.LIGHT) / expected - 1.0:+.2%}, "
                 f"ripple {np.ptp(heavy) / heavy.mean():.2%}, "
-                f"{strip.iterations:.1f} iterations a measured step, {cloth.newton / cloth.steps:.1f} a step in all, "
-                f"{cloth.unconverged_steps} of {cloth.steps} steps unconverged",
+                f"{strip.iterations:.1f} iterations a measured step, "
+                f"{cloth.total.newton / cloth.total.steps:.1f} a step in all, "
+                f"{cloth.total.unconverged} of {cloth.total.steps} steps unconverged",
                 flush=True,
             )
 

@@ -44,7 +44,8 @@ def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> ClothRun:
     seconds = time.process_time() - start
     print(
         f"  {vertices:3d} x {vertices:<3d} dt {1e3 * preset.time_step:7.3f} ms  {seconds:8.1f} CPU s  "
-        f"{scene.unconverged_steps}/{scene.steps} steps unconverged  worst residual {scene.worst_residual:.1e}  "
+        f"{scene.labels['unconverged_steps']}/{scene.labels['steps']} steps unconverged  "
+        f"worst residual {scene.labels['worst_residual']:.1e}  "
         f"crossings {int(scene.self_intersections.max())}  {'valid' if scene.valid else scene.reason}",
         flush=True,
     )

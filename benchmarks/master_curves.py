@@ -14,28 +14,28 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core.reference import boundary_value, master_curves, plate_buckling
+from stickslip_sim_core.reference import master_curves, plate_buckling
 
 Floats = NDArray[np.float64]
 
 
-def with_stages(stages: int, curve: Callable[[], Floats]) -> Floats:
-    usual, boundary_value.STAGES = boundary_value.STAGES, stages
-    boundary_value.gauss_method.cache_clear()
+def with_tolerance(tolerance: float, curve: Callable[[], Floats]) -> Floats:
+    usual, master_curves.TOLERANCE = master_curves.TOLERANCE, tolerance
     try:
         return curve()
     finally:
-        boundary_value.STAGES = usual
-        boundary_value.gauss_method.cache_clear()
+        master_curves.TOLERANCE = usual
 
 
 def collocated(name: str, x: Floats, curve: Callable[[Floats], Floats]) -> None:
     start = time.process_time()
     values = curve(x)
     spent = time.process_time() - start
-    coarse, fine = (with_stages(stages, lambda: curve(x)) for stages in (7, 11))
+    coarse, fine = (with_tolerance(tolerance, lambda: curve(x)) for tolerance in (1e-8, 1e-10))
     errors = [np.abs(other / fine - 1.0).max() for other in (coarse, values)]
-    print(f"{name:18} {x[0]:8.2g} ... {x[-1]:8.6g}  7 stages {errors[0]:.0e}  8 (used) {errors[1]:.0e}", end="")
+    print(
+        f"{name:18} {x[0]:8.2g} ... {x[-1]:8.6g}  tolerance 1e-8 {errors[0]:.0e}  1e-9 (used) {errors[1]:.0e}", end=""
+    )
     print(f"  {1e3 * spent / len(x):.1f} ms a point")
 
 

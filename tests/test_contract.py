@@ -15,7 +15,7 @@ from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, PresetName
-from stickslip_sim_core._sim_core import cloth_kernels
+from stickslip_sim_core._sim_core import kernels
 from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
@@ -30,7 +30,7 @@ def test_materials_presets_and_kernels_have_one_name() -> None:
     assert tuple(Material) == stickslip_sim_core.fabric_names()
     assert [preset.value for preset in PresetName] == list(stickslip_sim_core.PRESETS)
     assert {ROD_PRESET, *PresetName} == set(CERTIFICATION)
-    assert tuple(cloth_kernels()) == KERNELS[: len(cloth_kernels())]
+    assert tuple(kernels()) == KERNELS[: len(kernels())]
     assert Certificate.model_fields["sim_core"].annotation is str
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stickslip_sim_core import build_info
-from stickslip_sim_core._sim_core import cloth_kernels
+from stickslip_sim_core._sim_core import kernels
 
 SOURCE = Path(__file__).parents[1]
 
@@ -42,7 +42,7 @@ def test_fields() -> None:
     assert info.compiler
     assert info.isa
     assert info.rod_kernel
-    assert info.cloth_kernel in cloth_kernels()
+    assert info.cloth_kernel in kernels()
 
 
 @pytest.mark.physics

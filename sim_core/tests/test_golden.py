@@ -85,14 +85,15 @@ def dragged(material: str, mu: float, vertices: int, frames: int, preset: str) -
     scene = cloth_drag.scene(
         material, mu, mesh=vertices, frames=frames, preset=preset, seed=1, self_friction=None
     ).run()
-    counts = np.array([scene.steps, scene.unconverged_steps])
+    counts = np.array([scene.labels["steps"], scene.labels["unconverged_steps"]])
     return digest(scene.positions, scene.contact_force, scene.holder_force, scene.self_intersections, counts)
 
 
 def touching(scene: str) -> str:
     """Run a scene in which cloth touches itself."""
     cloth = SCENES[scene](preset_named("certified"))
-    return digest(cloth.positions, cloth.velocities, cloth.pair_forces.forces, np.array([cloth.newton, cloth.krylov]))
+    counts = np.array([cloth.total.newton, cloth.total.krylov])
+    return digest(cloth.positions, cloth.velocities, cloth.pair_forces.forces, counts)
 
 
 def rods() -> str:

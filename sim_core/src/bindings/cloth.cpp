@@ -13,7 +13,6 @@
 #include <tuple>
 
 #include "cloth/intersections.hpp"
-#include "cloth/kernels/choice.hpp"
 #include "cloth/solver.hpp"
 
 namespace sim_core {
@@ -57,20 +56,19 @@ void bind_cloth(nb::module_& m) {
       "rest"_a, "triangles"_a, "Internal: number of pieces of a mesh that hang together.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
-  m.def("cloth_kernels", &cloth_kernels, "Internal: cloth kernels this processor can run, narrowest first.");
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
       "Internal: constants of the cloth solver by name; see cloth/constants.hpp.");
   nb::class_<Observed>(m, "Observed", "Worst values over the accepted steps, for the checks of a run.")
-      .def(nb::init<>())
-      .def("add", &Observed::add, "next"_a, "Add the values of later steps.")
       .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
       .def_ro("depth", &Observed::depth, "Largest depth in a body beyond what round bodies allow [cells].")
       .def_ro("passages", &Observed::passages, "Triangles that passed the core of a body.")
       .def_ro("contact_work", &Observed::contact_work, "Work of bodies on motion against them, where positive [J].")
       .def_ro("flow", &Observed::flow, "Sum of the sizes of all changes of energy and of all work [J].")
       .def_ro("gain", &Observed::gain, "Largest energy gained beyond the work of all forces [J].");
-  nb::class_<StepReport>(m, "StepReport", "How a step of cloth went.")
+  nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
+      .def(nb::init<>())
+      .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")
       .def_ro("converged", &StepReport::converged)
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
       .def_ro("steps", &StepReport::steps)
@@ -112,12 +110,17 @@ void bind_cloth(nb::module_& m) {
               list.push_back({density, stretching, rigidity, damping});
             }
             new (self) ClothSolver(
-                rest, triangles, list, held,
-                {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                {step_error, longest_step, finest}, kernel,
-                {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
-                 constants.contact.surface_share},
-                {surface_triangles, surface_of_vertex, surface_positions, crease}, constants);
+                {rest,
+                 triangles,
+                 list,
+                 held,
+                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
+                 {step_error, longest_step, finest},
+                 kernel,
+                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
+                  constants.contact.surface_share},
+                 {surface_triangles, surface_of_vertex, surface_positions, crease},
+                 constants});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a, "krylov_max"_a,
           "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a, "longest_step"_a,

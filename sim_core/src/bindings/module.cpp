@@ -8,13 +8,15 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <cstdlib>
 #include <memory>
 #include <stdexcept>
 #include <string>
 #include <tuple>
 #include <vector>
 
-#include "build_info.hpp"
+#include "build_constants.hpp"
+#include "kernel_levels.hpp"
 #include "rods/chain.hpp"
 #include "rods/rods.hpp"
 
@@ -95,7 +97,7 @@ Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness,
   const sim_core::RodSettings settings{twist_stiffness, elements,
                                        start_level < 0 ? sim_core::default_start_level(elements) : start_level};
   sim_core::check_rods(settings, points, phi0.data(), phi1.data(), static_cast<std::int64_t>(n));
-  const sim_core::RodKernels kernels = sim_core::rod_kernels_named(kernel);
+  const sim_core::RodKernels kernels = sim_core::kernel_level(kernel).rods;
   RodArrays arrays{n, p};
   const sim_core::RodBatch batch{gamma.data(), phi0.data(), phi1.data(), arrays.output()};
   solve_in_parts(kernels.solve, batch, settings, points, n);
@@ -114,7 +116,7 @@ Solution solve_general_rods(Input gamma, InputRows<3> stiffness, InputRows<4> cl
       start.shape(1) != 2 * N + 1 || slope.shape(1) != N / 2 + 1) {
     throw std::invalid_argument("solve_general_rods: shapes disagree");
   }
-  const sim_core::RodKernels kernels = sim_core::rod_kernels_named(kernel);
+  const sim_core::RodKernels kernels = sim_core::kernel_level(kernel).rods;
   RodArrays arrays{n, p};
   const sim_core::GeneralRodBatch batch{
       gamma.data(), stiffness.data(),         clamp.data(),   natural.data(), start.data(),
@@ -123,10 +125,20 @@ Solution solve_general_rods(Input gamma, InputRows<3> stiffness, InputRows<4> cl
   return arrays.solution();
 }
 
-std::vector<std::string> rod_kernels() {
-  std::vector<std::string> names;
-  for (const auto& kernels : sim_core::rod_kernels()) names.emplace_back(kernels.name);
-  return names;
+struct BuildInfo {
+  std::string version, build_hash, compiler, isa, rod_kernel, cloth_kernel, eigen;
+};
+
+BuildInfo build_info() {
+  const char* pinned = std::getenv("STICKSLIP_CLOTH_KERNEL");
+  const std::string isa = SIM_CORE_BUILD_ISA;
+  return {SIM_CORE_VERSION,
+          SIM_CORE_BUILD_HASH,
+          SIM_CORE_BUILD_COMPILER,
+          isa.empty() ? SIM_CORE_BUILD_PROCESSOR : isa,
+          sim_core::kernel_names().back(),
+          sim_core::kernel_level(pinned ? pinned : "").cloth.name,
+          SIM_CORE_BUILD_EIGEN};
 }
 
 }  // namespace
@@ -140,19 +152,18 @@ NB_MODULE(_sim_core, m) {
   }
 #endif
   m.doc() = "Internal: the C++ core. Use stickslip_sim_core.";
-  nb::class_<sim_core::BuildInfo>(m, "BuildInfo", "What the C++ core was built from.")
-      .def_ro("version", &sim_core::BuildInfo::version)
-      .def_ro("build_hash", &sim_core::BuildInfo::build_hash,
-              "SHA-256, hex: over sources, compiler, flags and instruction set.")
-      .def_ro("compiler", &sim_core::BuildInfo::compiler, "Id and version.")
-      .def_ro("isa", &sim_core::BuildInfo::isa, "Instruction set of the whole library.")
-      .def_ro("rod_kernel", &sim_core::BuildInfo::rod_kernel,
+  nb::class_<BuildInfo>(m, "BuildInfo", "What the C++ core was built from.")
+      .def_ro("version", &BuildInfo::version)
+      .def_ro("build_hash", &BuildInfo::build_hash, "SHA-256, hex: over sources, compiler, flags and instruction set.")
+      .def_ro("compiler", &BuildInfo::compiler, "Id and version.")
+      .def_ro("isa", &BuildInfo::isa, "Instruction set of the whole library.")
+      .def_ro("rod_kernel", &BuildInfo::rod_kernel,
               "Vectors of the rod solver on this processor; its bits are the same for all.")
-      .def_ro("cloth_kernel", &sim_core::BuildInfo::cloth_kernel,
+      .def_ro("cloth_kernel", &BuildInfo::cloth_kernel,
               "Level of the cloth kernels: the widest of this processor, or STICKSLIP_CLOTH_KERNEL. Levels differ in "
               "the last digits.")
-      .def_ro("eigen", &sim_core::BuildInfo::eigen, "Version.");
-  m.def("build_info", &sim_core::build_info, "Tell what the C++ core was built from.");
+      .def_ro("eigen", &BuildInfo::eigen, "Version.");
+  m.def("build_info", &build_info, "Tell what the C++ core was built from.");
   m.def("solve_rods", &solve_rods, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "elements"_a, "points"_a,
         "start_level"_a = -1, "kernel"_a = "",
         "Internal: see stickslip_sim_core.solve_rods. Level -1 and kernel '' leave the choice to the solver.");
@@ -169,7 +180,7 @@ NB_MODULE(_sim_core, m) {
   m.def("chain_jacobian", &sim_core::chain_jacobian, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
         "natural"_a, "quaternions"_a, "basis"_a, "stride"_a,
         "Internal: derivatives of nodal positions by gamma and natural curvature. See rods/chain.hpp.");
-  m.def("rod_kernels", &rod_kernels, "Internal: rod kernels this processor can run, narrowest first.");
+  m.def("kernels", &sim_core::kernel_names, "Internal: levels of kernels that this processor runs, narrowest first.");
   m.def("relax_rod", &sim_core::relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
         "Internal: as relax_chain, of a uniform round rod.");
   sim_core::bind_cloth(m);

@@ -2,10 +2,12 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <utility>
 #include <vector>
 
 #include "cloth/mesh.hpp"
 #include "cloth/problem.hpp"
+#include "cloth/refusal.hpp"
 
 namespace sim_core {
 
@@ -29,7 +31,14 @@ struct Fabrics {
   std::vector<int> of_triangle;
 
   // Throws std::invalid_argument, naming `fabric`, where there are too many or too few.
-  Fabrics(const ClothMesh& mesh, std::vector<ClothProperties> list);
+  Fabrics(const ClothMesh& mesh, std::vector<ClothProperties> list_in) : list(std::move(list_in)) {
+    if (list.size() != 1 && static_cast<int>(list.size()) != mesh.sheets) {
+      refuse(text("fabric: must be one, or one for each of ", mesh.sheets, " sheets, got ", list.size()));
+    }
+    for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+      of_triangle.push_back(list.size() == 1 ? 0 : mesh.sheet_of_vertex[mesh.triangles(t, 0)]);
+    }
+  }
   const ClothProperties& at(Eigen::Index triangle) const { return list[of_triangle[triangle]]; }
 };
 

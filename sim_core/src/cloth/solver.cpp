@@ -5,15 +5,15 @@
 
 #include "cloth/contact_setup.hpp"
 #include "cloth/intersections.hpp"
-#include "cloth/kernels/choice.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
+#include "kernel_levels.hpp"
 
 namespace sim_core {
 
 struct ClothSolver::Impl {
   const ClothMesh mesh;
-  const SurfaceMeshes surfaces;
+  const SurfaceMeshes& surfaces;
   const ContactMaterials materials;
   Assembly assembly;
   Stepper stepper;
@@ -21,26 +21,24 @@ struct ClothSolver::Impl {
   Newton& newton;
   const Numbering& numbering;
 
-  Impl(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-       const std::vector<std::int32_t>& held, const ClothSettings& settings, const StepControl& control,
-       const std::string& kernel, const ContactMaterials& touch, const SurfaceMeshes& surfaces_in,
-       const Constants& constants, const std::vector<Body>& bodies = {}, const std::vector<Skeleton>& skeletons = {})
-      : mesh(rest, triangles),
-        surfaces(surfaces_in),
-        materials(with_skeletons(touch, skeletons, bodies, cell_of(mesh))),
-        assembly(cloth_kernel_named(kernel), mesh, Fabrics(mesh, fabrics), held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), constants.factor),
-        stepper(mesh, assembly, settings, constants),
-        controller(stepper, control, constants.control),
+  explicit Impl(const ClothSetup& setup, const std::vector<Body>& bodies = {},
+                const std::vector<Skeleton>& skeletons = {})
+      : mesh(setup.rest, setup.triangles),
+        surfaces(setup.surfaces),
+        materials(with_skeletons(setup.touch, skeletons, bodies, cell_of(mesh))),
+        assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
+                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), setup.constants.factor),
+        stepper(mesh, assembly, setup.settings, setup.constants),
+        controller(stepper, setup.control, setup.constants.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
     stepper.sheets = mesh.sheets;
     for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
     if ((materials.mu.array() >= 0.0).any()) {
-      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, skeletons, constants);
+      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, skeletons, setup.constants);
     }
     if (numbering.others > 0) {
-      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces, constants.smooth);
+      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
     }
     stepper.skeletons = skeletons;
     newton.contact.whole_skeletons.assign(bodies.size(), 0);
@@ -92,29 +90,19 @@ struct ClothSolver::Impl {
   }
 };
 
-ClothSolver::ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-                         const std::vector<std::int32_t>& held, const ClothSettings& settings,
-                         const StepControl& control, const std::string& kernel, const ContactMaterials& touch,
-                         const SurfaceMeshes& surfaces, const Constants& constants)
-    : make_([=](const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons) {
-        return std::make_unique<Impl>(rest, triangles, fabrics, held, settings, control, kernel, touch, surfaces,
-                                      constants, bodies, skeletons);
-      }),
-      constants_(constants.skeleton),
-      impl_(make_({}, {})) {}
+ClothSolver::ClothSolver(const ClothSetup& setup) : setup_(setup), impl_(std::make_unique<Impl>(setup_)) {}
 ClothSolver::~ClothSolver() = default;
 
 // Before a first step: takes skeletons of these bodies in place of those of others.
 void ClothSolver::meet(const std::vector<Body>& bodies) {
   if (impl_->stepper.started()) return;
   const Points3 at = positions();
-  const Points2& rest = impl_->mesh.rest;
-  const double across = (rest.colwise().maxCoeff() - rest.colwise().minCoeff()).norm();
-  const std::vector<Skeleton> skeletons =
-      skeletons_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
-                   at.colwise().maxCoeff().transpose(), constants_.beyond * across, constants_);
+  const double across = (setup_.rest.colwise().maxCoeff() - setup_.rest.colwise().minCoeff()).norm();
+  const std::vector<Skeleton> skeletons = skeletons_of(
+      bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(), at.colwise().maxCoeff().transpose(),
+      setup_.constants.skeleton.beyond * across, setup_.constants.skeleton);
   if (skeletons.empty() && impl_->stepper.skeletons.empty()) return;
-  std::unique_ptr<Impl> next = make_(bodies, skeletons);
+  std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, skeletons);
   const long kept = 4L * (next->numbering.nodes - next->numbering.bones);
   std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
   std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());

@@ -4,7 +4,6 @@
 #include <Eigen/Core>
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <memory>
 #include <string>
 #include <tuple>
@@ -21,14 +20,23 @@
 
 namespace sim_core {
 
+// What a solver is made of.
+struct ClothSetup {
+  Points2 rest;
+  Triangles triangles;
+  std::vector<ClothProperties> fabrics;  // one, or one of each sheet
+  std::vector<std::int32_t> held;        // vertices whose positions are prescribed
+  ClothSettings settings;
+  StepControl control;
+  std::string kernel;      // level of the kernels, "" for the widest that this processor runs
+  ContactMaterials touch;  // among the sheets and then the surfaces
+  SurfaceMeshes surfaces;
+  Constants constants;
+};
+
 class ClothSolver {
  public:
-  // `kernel`: level of the kernels, "" for the widest that this processor runs. `fabrics`: one, or one of each sheet.
-  // `held`: vertices whose positions are prescribed; `touch`: contact among the sheets and then the surfaces.
-  ClothSolver(const Points2& rest, const Triangles& triangles, const std::vector<ClothProperties>& fabrics,
-              const std::vector<std::int32_t>& held, const ClothSettings& settings, const StepControl& control,
-              const std::string& kernel, const ContactMaterials& touch, const SurfaceMeshes& surfaces = {},
-              const Constants& constants = {});
+  explicit ClothSolver(const ClothSetup& setup);
   ~ClothSolver();
 
   // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in the next step.
@@ -81,8 +89,7 @@ class ClothSolver {
 
  private:
   struct Impl;
-  std::function<std::unique_ptr<Impl>(const std::vector<Body>& bodies, const std::vector<Skeleton>& skeletons)> make_;
-  SkeletonSettings constants_;
+  const ClothSetup setup_;
   std::unique_ptr<Impl> impl_;
 
   // Calls with each vertex of a pair with a skeleton that bears, the pair, and the body.

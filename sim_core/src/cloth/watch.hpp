@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "cloth/newton.hpp"
-#include "cloth/observed.hpp"
 #include "contact/cores.hpp"
 
 namespace sim_core {

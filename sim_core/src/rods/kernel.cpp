@@ -2,6 +2,6 @@
 
 namespace sim_core {
 
-constinit const RodKernels ROD_KERNELS = kernels_of<ROD_LANES>(KERNEL_LEVEL);
+constinit const RodKernels ROD_KERNELS = kernels_of<ROD_LANES>();
 
 }  // namespace sim_core

@@ -183,8 +183,8 @@ void solve_range(const Batch& batch, const RodSettings& settings, const std::vec
 }
 
 template <int W>
-constexpr RodKernels kernels_of(const char* name) {
-  return {name, solve_range<W, RodReader>, solve_range<W, GeneralRodReader>};
+constexpr RodKernels kernels_of() {
+  return {solve_range<W, RodReader>, solve_range<W, GeneralRodReader>};
 }
 
 }  // namespace

@@ -13,25 +13,6 @@ constexpr int start_elements_min = 24;
 
 }  // namespace
 
-std::vector<RodKernels> rod_kernels() {
-  std::vector<RodKernels> kernels{rods_baseline};
-#ifdef SIM_CORE_X86_64_KERNELS
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("x86-64-v3")) kernels.push_back(rods_x86_64_v3);
-  if (__builtin_cpu_supports("x86-64-v4")) kernels.push_back(rods_x86_64_v4);
-#endif
-  return kernels;
-}
-
-RodKernels rod_kernels_named(const std::string& name) {
-  const std::vector<RodKernels> all = rod_kernels();
-  if (name.empty()) return all.back();
-  for (const RodKernels& kernels : all) {
-    if (kernels.name == name) return kernels;
-  }
-  throw std::invalid_argument("kernel: must be one that this build has and this processor runs, got '" + name + "'");
-}
-
 int default_start_level(int elements) {
   int level = 0;
   while (level < 2 && (elements >> (2 - level)) < start_elements_min) ++level;

@@ -2,7 +2,6 @@
 #pragma once
 
 #include <cstdint>
-#include <string>
 #include <vector>
 
 namespace sim_core {
@@ -58,17 +57,10 @@ using RodKernel = void (*)(const Batch&, const RodSettings&, const std::vector<S
 // What is compiled for one instruction set: kernel.hpp is the code of all of them, and all return the same bits. They
 // are constants, so that no code for wider vectors runs where they are listed.
 struct RodKernels {
-  const char* name;
   RodKernel<RodBatch> solve;
   RodKernel<GeneralRodBatch> solve_general;
 };
 extern const RodKernels rods_baseline, rods_x86_64_v3, rods_x86_64_v4;
-
-// Those that this processor runs, narrowest first.
-std::vector<RodKernels> rod_kernels();
-
-// That of this name, or, where it is empty, the widest. Throws std::invalid_argument, naming `kernel`.
-RodKernels rod_kernels_named(const std::string& name);
 
 // The coarsest level on which the search from the natural shape is reliable. Measured over gamma 100 ... 1300,
 // phi0 0.2 ... 12, phi1 6 ... 20: 16 elements fail in 0.4 % of the rods, 24 in none.

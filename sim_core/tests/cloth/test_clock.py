@@ -67,7 +67,7 @@ def test_every_frame_rate_films_the_same_run(run: Callable[[float], ClothRun]) -
     reference = run(100)
     for rate in (1, 2, 10, 50):
         filmed = run(rate)
-        assert filmed.steps == reference.steps
+        assert filmed.labels["steps"] == reference.labels["steps"]
         assert filmed.positions.tobytes() == reference.positions[:: 100 // rate].tobytes()
         assert filmed.contact_force.tobytes() == reference.contact_force[:: 100 // rate].tobytes()
 
@@ -189,18 +189,18 @@ def test_steps_end_at_events(step_error: float | None) -> None:
 
 @pytest.mark.physics
 def test_steps_that_miss_their_error_are_counted() -> None:
-    assert swing(1).checks["missed"] == 0.0
+    assert swing(1).labels["missed"] == 0.0
     coarse = swing(1, replace(CERTIFIED, finest=1))
-    assert coarse.checks["missed"] >= 1.0
+    assert coarse.labels["missed"] >= 1.0
     assert coarse.code == "missed"
-    assert swing(1, replace(CERTIFIED, step_error=None)).checks["missed"] == 0.0
+    assert swing(1, replace(CERTIFIED, step_error=None)).labels["missed"] == 0.0
 
 
 @pytest.mark.physics
 def test_a_run_ends_where_its_iterations_are_spent() -> None:
     run = swing(10, replace(CERTIFIED, newton_per_second=40))
     assert run.code == "budget"
-    assert run.checks["budget"] > 1.0
+    assert run.labels["budget"] > 1.0
     assert len(run.positions) < 11
     assert np.isfinite(run.positions).all()
 
@@ -224,18 +224,18 @@ class TestController:
     def test_reruns_equal(self) -> None:
         first, second = self.sliding(2.0), self.sliding(2.0)
         assert first.positions.tobytes() == second.positions.tobytes()
-        assert first.steps == second.steps
-        assert first.unconverged_steps == 0
+        assert first.total.steps == second.total.steps
+        assert first.total.unconverged == 0
 
     def test_smaller_error_takes_more_steps_and_is_nearer(self) -> None:
         fine = self.sliding(1.6, step_error=1e-6, longest_step=2**-9, finest=2)
         loose, tight = self.sliding(1.6, step_error=1e-3), self.sliding(1.6, step_error=1e-5)
-        assert 16 <= loose.steps < tight.steps < fine.steps
+        assert 16 <= loose.total.steps < tight.total.steps < fine.total.steps
         wrong = [float(np.abs(cloth.positions - fine.positions).max()) for cloth in (loose, tight)]
         assert wrong[1] < 0.7 * wrong[0]
 
     def test_fixed_steps(self) -> None:
-        assert self.sliding(0.8, step_error=None, time_step=0.02).steps == 40
+        assert self.sliding(0.8, step_error=None, time_step=0.02).total.steps == 40
 
 
 @pytest.mark.parametrize(

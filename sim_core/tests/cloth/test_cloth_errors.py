@@ -72,5 +72,5 @@ def test_lost_state_is_counted_and_does_not_crash() -> None:
     cloth.set_state(at, 1e160 * at)
     for _ in range(3):
         cloth.step(0.1, bodies=[floor])
-    assert cloth.unconverged_steps == 3
+    assert cloth.total.unconverged == 3
     assert not cloth.worst_residual < 1.0

@@ -41,11 +41,11 @@ def stack(mu: float, cells: int = 4, preset: str = "certified") -> stacked_incli
 
 def watched(cloth: Cloth, steps: int, dt: float = 0.02, **drive: object) -> int:
     """Step, check that nothing crosses after any step, and return how many did not converge."""
-    before = cloth.unconverged_steps
+    before = cloth.total.unconverged
     for _ in range(steps):
         cloth.step(dt, **drive)  # type: ignore[arg-type]
         assert self_intersections(cloth.positions, cloth.mesh.triangles) == 0
-    return cloth.unconverged_steps - before
+    return cloth.total.unconverged - before
 
 
 class TestWithoutContact:
@@ -59,7 +59,7 @@ class TestWithoutContact:
             cloth.set_state(start)
             for step in range(20):
                 cloth.step(0.02, held=start[[0]] - 0.0002 * step * np.array([1.0, 1.0, 0.0]), bodies=[plane(0.3)])
-            assert cloth.least_distance == np.inf
+            assert cloth.total.least_distance == np.inf
             assert cloth.sliding.any()
             return cloth.positions
 
@@ -144,7 +144,7 @@ class TestBearing:
             ends = start[held]
             ends[len(below) :, 2] -= 1e-4 * (step + 1)
             cloth.step(0.02, held=ends, damping=5.0)
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
         return cloth
 
     @pytest.mark.parametrize(("bearing", "share"), [("all", 1.0), ("vertices", 0.9), ("first", 0.9)])
@@ -153,7 +153,7 @@ class TestBearing:
         pairs = cloth.pair_forces
         assert np.linalg.norm(pairs.forces, axis=1).max() > 5e-4
         assert pairs.distance == pytest.approx(share * THICKNESS, rel=1e-4)
-        assert cloth.least_distance == pytest.approx(share * THICKNESS, rel=1e-3)
+        assert cloth.total.least_distance == pytest.approx(share * THICKNESS, rel=1e-3)
 
     @pytest.mark.parametrize("bearing", ["vertices", "first"])
     def test_which_vertices_bear_where_sheets_lie_flat(self, bearing: str) -> None:
@@ -179,7 +179,7 @@ class TestBearing:
             monkeypatch.setattr(tumbles, "SelfContact", lambda mu: SelfContact(mu, bearing=bearing))
             fold = tumbles.tumble("folding-0")
             tumbles.watch(fold, 80)
-            assert fold.cloth.least_distance < 1.01 * THICKNESS
+            assert fold.cloth.total.least_distance < 1.01 * THICKNESS
             return fold.cloth.positions.tobytes()
 
         assert run("all") == run("first")
@@ -265,7 +265,7 @@ class TestSurfaces:
             all_positions = np.concatenate([cloth.positions, cloth.surfaces[0].at(cloth.time)])
             behind = np.asarray(cloth.surfaces[0].triangles) + len(cloth.mesh.rest)
             assert self_intersections(all_positions, np.concatenate([cloth.mesh.triangles, behind])) == 0
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
 
     @pytest.mark.parametrize("mu", [0.1, 0.8])
     @pytest.mark.parametrize("beyond", [-0.02, 0.02])
@@ -294,7 +294,7 @@ class TestSurfaces:
         """By 10 cm in a step, hundreds of times the thickness."""
         cloth = self.on(lambda time, at: at + np.array([0.0, 0.0, 0.1 * (time > 0.03)]))
         self.watch(cloth, 3)
-        assert cloth.least_distance >= 0.99 * THICKNESS
+        assert cloth.total.least_distance >= 0.99 * THICKNESS
         assert cloth.positions[:, 2].min() > 0.1
 
     def test_several_with_motion_of_a_controller(self) -> None:
@@ -309,7 +309,7 @@ class TestSurfaces:
         cloth.set_state(flat(self.SHEET, THICKNESS))
         gravity = cloth.gravity.copy()
         cloth.advance(0.2, lambda _: (gravity, np.empty((0, 3)), []), event=0.2)
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
         weight = cloth.masses.sum() * GRAVITY
         smooth, rough = (forces.sum(axis=0) / weight for forces in cloth.surface_forces)
         assert abs(smooth[1]) < 1e-6
@@ -356,8 +356,8 @@ class TestNothingCrosses:
         wave = 0.006 * np.sin(80.0 * u + rng.uniform(0, 6)) + 0.003 * np.sin(150.0 * v + rng.uniform(0, 6))
         cloth.set_state(np.column_stack([0.7 * u, wave, 0.08 + 0.9 * v]))
         unconverged = watched(cloth, 60, 0.01, bodies=[plane(0.4)])
-        assert cloth.least_distance < 1.01 * THICKNESS  # it did touch itself
-        assert cloth.least_distance > 0.9 * THICKNESS
+        assert cloth.total.least_distance < 1.01 * THICKNESS  # it did touch itself
+        assert cloth.total.least_distance > 0.9 * THICKNESS
         assert unconverged <= 1
 
     @pytest.mark.parametrize(
@@ -406,7 +406,7 @@ class TestNothingCrosses:
         ends[len(a.rest) :, 2] = -0.02
         report = cloth.step(0.02, held=ends)
         assert not report.converged
-        assert cloth.unconverged_steps == 1
+        assert cloth.total.unconverged == 1
         assert self_intersections(cloth.positions, mesh.triangles) == 0
         assert cloth.positions[len(a.rest) :, 2].min() > 0.0
         ends[len(a.rest) :, 2] = 0.002
@@ -426,7 +426,7 @@ class TestNothingCrosses:
         ends = start.copy()
         ends[:count, 2] = np.where(away, 0.005, end)
         cloth.step(0.02, held=ends[held])
-        assert cloth.unconverged_steps == unconverged
+        assert cloth.total.unconverged == unconverged
         assert bool((cloth.positions[held] == ends[held]).all()) is not bool(unconverged)
 
     def test_sheets_that_collide_keep_their_momentum(self) -> None:

@@ -67,8 +67,8 @@ class TestCarries:
         assert force == pytest.approx(weight(cloth), rel=0.1)
         assert cloth.contact_force() == pytest.approx(body_forces(cloth).sum(axis=0), abs=2e-3 * weight(cloth))
         assert cloth.positions[:, 2].max() == pytest.approx(cells * CELL, abs=0.4 * CELL)
-        assert cloth.sharpest == pytest.approx(cells, rel=1e-3)
-        assert cloth.unconverged_steps <= 1
+        assert cloth.total.sharpest == pytest.approx(cells, rel=1e-3)
+        assert cloth.total.unconverged <= 1
 
     def test_a_blade_lifts(self) -> None:
         blade = [box(0.5, (0.3, 0.002, 0.05), origin=(0.0, 0.0, -0.025))]
@@ -83,7 +83,7 @@ class TestCarries:
         for _ in range(10):
             cloth.step(0.01, bodies=[sphere(0.5, 0.05)])
         assert (cloth.contacts == 0).any()
-        assert cloth.sharpest == np.inf
+        assert cloth.total.sharpest == np.inf
         assert not len(cloth.pair_forces.forces)
 
 
@@ -183,7 +183,7 @@ def pulled(radius: float, cell: float) -> tuple[float, float]:
         cloth.step(dt, held=ends, bodies=table, damping=5.0 if way == 0.0 else 1.0)
         if step > 50:
             forces.append(-cloth.reactions[held, 1].sum())
-    return float(np.mean(forces)) / weight(cloth), cloth.sharpest
+    return float(np.mean(forces)) / weight(cloth), cloth.total.sharpest
 
 
 @pytest.mark.physics

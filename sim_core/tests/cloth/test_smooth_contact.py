@@ -182,7 +182,7 @@ class TestCloth:
             cloth.gravity[:] = tilt
             for _ in range(40):
                 cloth.step(0.01)
-            assert cloth.unconverged_steps == 0
+            assert cloth.total.unconverged == 0
             assert not len(cloth.pair_forces.forces)
             off.append(np.linalg.norm(cloth.positions - round_one.positions, axis=1).max())
             assert (cloth.contacts == round_one.contacts).all()
@@ -214,7 +214,7 @@ class TestCloth:
         for _ in range(250):
             cloth.step(0.02)
         assert np.abs(cloth.positions - before).max() < 1e-9
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
 
     def test_carries_what_sticks(self) -> None:
         """On a sphere that turns about the vertical, and as fast about its middle."""
@@ -236,7 +236,7 @@ class TestCloth:
         cloth = over(Surface(ground.triangles, lambda time: wave(time, ground.rest), 1.0), THICKNESS, fabric=soft)
         for _ in range(60):
             cloth.step(0.02)
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
         exact = wave(1.0, cloth.positions[:, :2])[:, 2]
         touching = cloth.contacts >= 0
         assert touching.mean() > 0.5
@@ -251,7 +251,7 @@ class TestCloth:
         for _ in range(20):
             cloth.step(0.02)
         assert cloth.positions[:, 2] == pytest.approx(-THICKNESS, abs=1e-8)
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
 
     def test_coarse_cloth_keeps_off_what_is_curved(self) -> None:
         """So that its triangles do not cut into it: no pair bears, and nodes are as far off as they need to be."""
@@ -296,7 +296,7 @@ class TestCloth:
         for _ in range(40):
             cloth.step(0.02, bodies=[plane(0.3)])
             assert crossings(cloth) == 0
-        assert cloth.unconverged_steps == 0
+        assert cloth.total.unconverged == 0
         assert cloth.positions[:, 0].min() > -0.032 + 0.02 * cloth.time
         assert cloth.positions[:, 2].min() > -1e-8
         assert (cloth.contacts == 0).any()
@@ -312,7 +312,7 @@ class TestCloth:
             cloth.step(0.01, damping=2.0)
             assert crossings(cloth) == 0
         assert (cloth.pair_forces.vertices >= len(SHEET.rest)).any()
-        assert cloth.least_distance > 0.2 * THICKNESS
+        assert cloth.total.least_distance > 0.2 * THICKNESS
 
     @pytest.mark.parametrize("seed", [1, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2))])
     def test_nothing_crosses(self, seed: int) -> None:
@@ -329,8 +329,8 @@ class TestCloth:
         for _ in range(50):
             cloth.step(0.01)
             assert crossings(cloth) == 0
-        assert cloth.least_distance < THICKNESS
-        assert cloth.unconverged_steps <= 1
+        assert cloth.total.least_distance < THICKNESS
+        assert cloth.total.unconverged <= 1
 
     def test_a_rerun_is_the_same_to_the_bit(self) -> None:
         assert (

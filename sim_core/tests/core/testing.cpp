@@ -10,11 +10,11 @@
 #include <tuple>
 
 #include "cloth/assembly.hpp"
-#include "cloth/kernels/choice.hpp"
 #include "contact/nearest.hpp"
 #include "contact/pair_law.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
+#include "kernel_levels.hpp"
 #include "rods/chain.hpp"
 #include "rods/energy.hpp"
 
@@ -109,7 +109,7 @@ NB_MODULE(_testing, m) {
         const ClothMesh mesh(rest, triangles);
         FactorSettings exact;  // no fold is too small, and none is old
         exact.fold_smallest = exact.stiffening_change = 0.0;
-        Assembly assembly(cloth_kernel_named(""), mesh, Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0,
+        Assembly assembly(kernel_level("").cloth, mesh, Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0,
                           exact);
         const std::vector<int>& node = assembly.numbering.node;
         Buffer<double> at(4 * x.rows());

@@ -29,8 +29,8 @@ class TestCapstan:
         measured, expected = np.log(heavy.mean() / capstan.LIGHT), np.log(master_curves.capstan(0.3, wrap, 0.05))
         assert measured == pytest.approx(expected, rel=3e-3)
         assert np.ptp(heavy) < 0.01 * heavy.mean()
-        assert strip.cloth.newton <= 10 * strip.cloth.steps
-        assert strip.cloth.unconverged_steps == 0
+        assert strip.cloth.total.newton <= 10 * strip.cloth.total.steps
+        assert strip.cloth.total.unconverged == 0
 
     def test_radius(self) -> None:
         with pytest.raises(ValueError, match="radius: must be finite and > 0"):

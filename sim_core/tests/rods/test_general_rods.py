@@ -116,7 +116,7 @@ def test_every_kernel_gives_the_same_bits() -> None:
     K = np.ascontiguousarray(np.broadcast_to([0.5, 0.8, 1.2], (n, 3)))
     results = [
         _sim_core.solve_general_rods(gamma, K, clamp, on_grid, on_grid, slope, at_points, N, 30.0, kernel=kernel)
-        for kernel in _sim_core.rod_kernels()
+        for kernel in _sim_core.kernels()
     ]
     for result in results[1:]:
         for a, b in zip(results[0], result, strict=True):

@@ -52,7 +52,7 @@ def test_twice(rods: Floats, elements: int) -> None:
 def test_every_kernel(rods: Floats, elements: int) -> None:
     reference = solve_on("baseline", rods, elements)
     assert (~reference.converged).sum() == 1
-    for kernel in _sim_core.rod_kernels():
+    for kernel in _sim_core.kernels():
         assert_same_bits(reference, solve_on(kernel, rods, elements))
 
 

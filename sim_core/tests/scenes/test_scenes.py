@@ -54,8 +54,8 @@ class TestClothRun:
         assert dragged.valid, dragged.reason
         assert dragged.reason == ""
         assert dragged.positions.shape == (110, 121, 3)
-        assert dragged.unconverged_steps == 0
-        assert 0.0 < dragged.worst_residual <= 1e-3
+        assert dragged.labels["unconverged_steps"] == 0
+        assert 0.0 < dragged.labels["worst_residual"] <= 1e-3
         assert dragged.self_intersections.shape == (110,)
 
     def test_frames_are_at_their_times(self, dragged: ClothRun) -> None:
@@ -141,7 +141,7 @@ class TestClothRun:
 
     def test_kernel_is_recorded(self) -> None:
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=2, kernel="baseline").run()
-        assert scene.kernel == "baseline"
+        assert scene.labels["kernel"] == "baseline"
         with pytest.raises(ValueError, match="kernel: must be one that this processor runs, baseline"):
             cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=2, kernel="best").run()
 

@@ -80,8 +80,9 @@ def scaled(name: str, factor: float) -> float:
 def outcome(scene: str, constants: Mapping[str, float] = MappingProxyType({})) -> Outcome:
     """Run a scene of `SCENES` with some constants replaced."""
     cloth = SCENES[scene](replace(preset_named("certified"), constants=dict(constants)))
+    found = cloth.total
     return Outcome(
-        cloth.positions, cloth.newton, cloth.krylov, cloth.factorizations, cloth.unconverged_steps, cloth.least_distance
+        cloth.positions, found.newton, found.krylov, found.factorizations, found.unconverged, found.least_distance
     )
 
 

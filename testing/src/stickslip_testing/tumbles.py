@@ -72,8 +72,8 @@ def watch(tumble: Tumble, steps: int | None = None) -> Watched:
             others, triangles = surface.at(cloth.time), np.asarray(surface.triangles)
             crossed += crossings(at, own, others, triangles) + crossings(others, triangles, at, own)
         crossing += crossed > 0
-    least = cloth.least_distance / THICKNESS
-    return Watched(cloth.steps, cloth.unconverged_steps, crossing, least, cloth.newton, seconds)
+    least = cloth.total.least_distance / THICKNESS
+    return Watched(cloth.total.steps, cloth.total.unconverged, crossing, least, cloth.total.newton, seconds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.arrays import Floats, check_positive
 
 ORTHONORMAL = 1e-6
 """Largest deviation of the scalar products of a rotation's axes from 0 and 1."""
@@ -108,12 +108,14 @@ def plane(mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLi
 
 def sphere(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
     """Return a ball. Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step."""
-    return Body(mu, 1, ORIGIN, _length("radius", radius), origin, rotation)
+    check_positive(radius=radius)
+    return Body(mu, 1, ORIGIN, radius, origin, rotation)
 
 
 def cylinder(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
     """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
-    return Body(mu, 1, (0.0, 0.0, np.inf), _length("radius", radius), origin, rotation)
+    check_positive(radius=radius)
+    return Body(mu, 1, (0.0, 0.0, np.inf), radius, origin, rotation)
 
 
 def capsule(
@@ -123,7 +125,8 @@ def capsule(
 
     `length` is that of the cylinder between the two half balls [m], `origin` its middle (3,) [m].
     """
-    return Body(mu, 1, (0.0, 0.0, 0.5 * _length("length", length)), _length("radius", radius), origin, rotation)
+    check_positive(length=length, radius=radius)
+    return Body(mu, 1, (0.0, 0.0, 0.5 * length), radius, origin, rotation)
 
 
 def box(
@@ -139,14 +142,9 @@ def box(
     if whole.shape != (3,) or not (np.isfinite(whole).all() and (whole > 0.0).all()):
         raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
     half = 0.5 * float(whole.min())
-    radius = min(ROUNDING, half) if rounding is None else _length("rounding", rounding)
+    radius = min(ROUNDING, half) if rounding is None else rounding
+    check_positive(rounding=radius)
     if radius > half:
         raise ValueError(f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}")
     a, b, c = (0.5 * whole - radius).tolist()
     return Body(mu, 1, (a, b, c), radius, origin, rotation)
-
-
-def _length(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name}: must be finite and > 0, got {value}")
-    return value

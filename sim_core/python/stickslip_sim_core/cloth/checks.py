@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from stickslip_sim_core._sim_core import StepReport
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.presets import STEP_ERROR
 from stickslip_sim_core.cloth.solver import Cloth
@@ -27,6 +28,11 @@ class Seen:
 
     crossings: int
     """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact."""
+
+    @property
+    def total(self) -> StepReport:
+        """Of all steps."""
+        return self.cloth.total
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ CHECKS = (
         "jumps",
         "distance of a body, holder or surface from an even motion within a step, over the preset's step error",
         "1",
-        lambda seen: seen.cloth.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
+        lambda seen: seen.total.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
         1.0,
         "steps are halved until it is 0.25; where the shortest are not enough, something jumps or is shaken by 40 g",
     ),
@@ -67,7 +73,7 @@ CHECKS = (
         "unconverged",
         "steps that ended above the tolerance, over those that the preset allows",
         "1",
-        lambda seen: _ratio(seen.cloth.unconverged_steps, seen.cloth.preset.unconverged_share_max * seen.cloth.steps),
+        lambda seen: _ratio(seen.total.unconverged, seen.cloth.preset.unconverged_share_max * seen.total.steps),
         1.0,
         "the preset allows a share of 0.002",
     ),
@@ -92,7 +98,7 @@ CHECKS = (
         "sum over steps and vertices of max(0, R_n (g_1 - g_0) + R_t . u) over the flow of energy: work that bodies do "
         "on the motion against them, with the force R, the gap g at the start and end of the step, and the slip u",
         "1",
-        lambda seen: _ratio(seen.cloth.seen.contact_work, seen.cloth.seen.flow),
+        lambda seen: _ratio(seen.total.seen.contact_work, seen.total.seen.flow),
         1e-3,
         "contact takes energy from the motion against a body and never gives any; a body that pushes out what is in it "
         "does",
@@ -101,7 +107,7 @@ CHECKS = (
         "energy_gain",
         "largest energy gained beyond the work of gravity, holders and bodies, over the flow of energy",
         "1",
-        lambda seen: _ratio(seen.cloth.seen.gain, seen.cloth.seen.flow),
+        lambda seen: _ratio(seen.total.seen.gain, seen.total.seen.flow),
         None,
         "recorded: good runs reach 0.9 %, and bad ones begin at 1 %",
     ),
@@ -110,7 +116,7 @@ CHECKS = (
         "largest depth in a body at the end of a step, beyond the sagitta of flat triangles on its round face, over "
         "the side of a cell",
         "cells",
-        lambda seen: seen.cloth.seen.depth,
+        lambda seen: seen.total.seen.depth,
         0.1,
         "contact keeps vertices out of bodies; held vertices and blunt triangles can be driven in",
     ),
@@ -119,7 +125,7 @@ CHECKS = (
         "triangles that pass the core of a body in a step: the centre of a ball, the axis of a rod, the middle plane "
         "of a box",
         "1",
-        lambda seen: float(seen.cloth.seen.passages),
+        lambda seen: float(seen.total.seen.passages),
         0.0,
         "cloth that passed a core went through the body",
     ),
@@ -127,7 +133,7 @@ CHECKS = (
         "stretch",
         "largest principal stretch of a triangle at the end of a step",
         "1",
-        lambda seen: seen.cloth.seen.stretch,
+        lambda seen: seen.total.seen.stretch,
         1.25,
         "the fabrics were measured up to 1 + 1/6; drops reach 1.09 and heaps 1.17",
     ),
@@ -135,7 +141,7 @@ CHECKS = (
         "sharpness",
         "side of a cell over the radius of the sharpest edge, ball or rod that bore cloth",
         "1",
-        lambda seen: 1.0 / seen.cloth.sharpest,
+        lambda seen: 1.0 / seen.total.sharpest,
         2.0,
         "cells catch on what has less than half their side as radius",
     ),
@@ -144,7 +150,7 @@ CHECKS = (
         "shortest steps that are further off than twice the preset's step error, over those that fit the scene",
         "1",
         lambda seen: _ratio(
-            seen.cloth.missed_steps * seen.cloth.preset.longest_step, seen.cloth.preset.finest * seen.cloth.time
+            seen.total.missed * seen.cloth.preset.longest_step, seen.cloth.preset.finest * seen.cloth.time
         ),
         0.5,
         "drags reach 0, falls 0.13 and tumbles 0.352 with `certified`; a preset too coarse for its scene reaches 1",

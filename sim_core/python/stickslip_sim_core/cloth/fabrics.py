@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.arrays import Floats, check_positive, check_range
 
 DENSITY_BOUNDS = (1e-3, 100.0)
 """Of the mass per area [kg/m^2]."""
@@ -48,8 +48,8 @@ class Fabric:
     """Proportional to mass [1/s]: a free motion slows down by exp(-damping t)."""
 
     def __post_init__(self) -> None:
-        _within("density", self.density, *DENSITY_BOUNDS)
-        _within("damping", self.damping, 0.0, DAMPING_MAX)
+        check_range("density", self.density, *DENSITY_BOUNDS)
+        check_range("damping", self.damping, 0.0, DAMPING_MAX)
         k, d = np.asarray(self.stretching, float), np.asarray(self.rigidity, float)
         if k.shape != (6, 4) or not ((k >= 0.0) & (k <= STRETCHING_MAX)).all():
             raise ValueError(f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, got {k.tolist()}")
@@ -59,7 +59,7 @@ class Fabric:
         if d.shape != (3, 3) or not np.isfinite(d).all() or np.abs(d - d.T).max() > 1e-12 * np.abs(d).max():
             raise ValueError(f"rigidity: must be a symmetric (3, 3) matrix of finite numbers, got {d.tolist()}")
         for value in np.linalg.eigvalsh(d):
-            _within("rigidity, an eigenvalue", float(value), *RIGIDITY_BOUNDS)
+            check_range("rigidity, an eigenvalue", float(value), *RIGIDITY_BOUNDS)
         object.__setattr__(self, "stretching", k)
         object.__setattr__(self, "rigidity", d)
 
@@ -116,9 +116,9 @@ def custom_fabric(
         if thickness is None:
             raise ValueError("thickness: must be given with young")
         poisson = 0.0 if poisson is None else poisson
-        _within("young", young, 1.0, 1e13)
-        _within("thickness", thickness, 1e-6, 0.1)
-        _within("poisson", poisson, 0.0, 0.5)
+        check_range("young", young, 1.0, 1e13)
+        check_range("thickness", thickness, 1e-6, 0.1)
+        check_range("poisson", poisson, 0.0, 0.5)
         plate = isotropic(
             density, young * thickness, young * thickness**3 / (12.0 * (1.0 - poisson**2)), poisson, name=name
         )
@@ -131,11 +131,6 @@ def custom_fabric(
         numbers = np.asarray(bending, float)
         rigidity = np.diag(numbers) if numbers.shape == (3,) else numbers
     return Fabric(name, float(density), table, rigidity, float(damping))
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not (np.isfinite(value) and low <= value <= high):
-        raise ValueError(f"{name}: must be in [{low:g}, {high:g}], got {value}")
 
 
 def isotropic(
@@ -152,11 +147,8 @@ def isotropic(
     Raises:
         ValueError: A number breaks its rule.
     """
-    for field, value in (("density", density), ("stretching", stretching), ("rigidity", rigidity)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{field}: must be finite and > 0, got {value}")
-    if not 0.0 <= poisson <= 0.5:
-        raise ValueError(f"poisson: must be in [0, 0.5], got {poisson}")
+    check_positive(density=density, stretching=stretching, rigidity=rigidity)
+    check_range("poisson", poisson, 0.0, 0.5)
     tension = stretching / (1.0 - poisson**2)
     row = [tension, poisson * tension, tension, stretching / (1.0 + poisson)]
     plate = rigidity * np.array([[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - poisson)]])

@@ -6,6 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stickslip_sim_core.arrays import check_positive
+
 Diagonals = Literal["alternating", "left", "right", "random"]
 
 
@@ -42,7 +44,7 @@ def grid(
     Raises:
         ValueError: A size is not positive, or there is no such pattern.
     """
-    _check(width=width, length=length, columns=columns, rows=rows)
+    check_positive(width=width, length=length, columns=columns, rows=rows)
     x, y = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1) * width, np.linspace(-0.5, 0.5, rows + 1) * length, indexing="xy"
     )
@@ -94,7 +96,7 @@ def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, 
     Raises:
         ValueError: A size is not positive, or the length is less than that of the aligned rows.
     """
-    _check(width=width, length=length, spacing=spacing)
+    check_positive(width=width, length=length, spacing=spacing)
     start = aligned * spacing
     if not start < length:
         raise ValueError(f"aligned: rows of {spacing} m must be shorter than the length of {length} m, got {aligned}")
@@ -167,9 +169,3 @@ def _delaunay(rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]) 
                 sides[edge] = t
         todo.extend([(a, d), (d, b), (b, c), (c, a)])
     return [(t[0], t[1], t[2]) for t in cells]
-
-
-def _check(**sizes: float) -> None:
-    for name, value in sizes.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: must be finite and > 0, got {value}")

@@ -7,15 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import (
-    ClothSolver,
-    Observed,
-    PairForces,
-    StepReport,
-    check_mesh,
-    cloth_kernels,
-    sheet_count,
-)
+from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, check_mesh, kernels, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.bodies import Body, BodyTuple
 from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, SelfContact, Surface
@@ -45,7 +37,7 @@ Path = Callable[[Floats], tuple[ArrayLike, ArrayLike]]
 
 def kernel_level() -> str:
     """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
-    return os.environ.get(KERNEL_VARIABLE) or cloth_kernels()[-1]
+    return os.environ.get(KERNEL_VARIABLE) or kernels()[-1]
 
 
 class Cloth:
@@ -60,7 +52,7 @@ class Cloth:
         self_contact: Contact within and between sheets. None: off, the cloth passes through itself.
         surfaces: Triangles that it touches.
         force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the lightest fabric.
-        kernel: Level of the kernels, one of `_sim_core.cloth_kernels()`: levels differ in the last digits. None takes
+        kernel: Level of the kernels, one of `_sim_core.kernels()`: levels differ in the last digits. None takes
             that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
 
     Raises:
@@ -128,25 +120,11 @@ class Cloth:
         )
         self._solver = self._make(held=self.held.tolist())
         self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
-        self.least_distance = np.inf
-        """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
-        self.sharpest = np.inf
-        """Least radius over the side of a cell of a body that cloth touched by more than its vertices."""
-        self.uneven = 0.0
-        """Largest distance of bodies, held vertices and surfaces from an even motion in a step of `advance` [m]."""
+        self.total = StepReport()
+        """Of all steps: counts, least distances and worst values, and `seen`, what `checks` judge."""
         self.spent = 0.0
         """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1 it stops."""
         self._spent = 0.0
-        self.steps = self.unconverged_steps = 0
-        self.missed_steps = 0
-        """Steps of `advance` that are further off than the preset's `step_error` allows: the shortest there are."""
-        self.worst_residual = 0.0
-        """Largest residual force of a node in any step, over `force_scale`."""
-        self.seen = Observed()
-        """What every step was seen to do, see `checks`."""
-        self.newton = self.krylov = 0
-        self.factorizations = 0.0
-        """Whole factorizations, plus shares of partial ones."""
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     def _touch(self, sheets: int) -> tuple[Floats, Floats]:
@@ -171,6 +149,11 @@ class Cloth:
     @property
     def kernel(self) -> str:
         return str(self._solver.kernel())
+
+    @property
+    def worst_residual(self) -> float:
+        """Largest residual force of a node in any step, over `force_scale`."""
+        return self.total.residual / self.force_scale
 
     @property
     def masses(self) -> Floats:
@@ -254,7 +237,8 @@ class Cloth:
             dt, self.gravity, ends, self._surfaces_at(self.time + dt), [body.as_tuple() for body in bodies], damping
         )
         self.time += dt
-        return self._count(report)
+        self.total.add(report)
+        return report
 
     def advance(
         self,
@@ -306,14 +290,11 @@ class Cloth:
         while self.time < end and self.spent <= 1.0:
             self._before = self.time, self.positions, self.velocities
             self.time, report = self._solver.advance(self.time, event, drive, track)
-            self._count(report)
-            if self.preset.step_error is not None:
-                self._spend(report.newton, self.time - self._before[0])
-
-    def _spend(self, iterations: int, seconds: float) -> None:
-        """Count the iterations of the last second of scene time."""
-        self._spent = max(0.0, self._spent - self.preset.newton_per_second * seconds) + iterations
-        self.spent = max(self.spent, self._spent / self.preset.newton_per_second)
+            self.total.add(report)
+            if self.preset.step_error is not None:  # iterations of the last second of scene time
+                allowed = self.preset.newton_per_second
+                self._spent = max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
+                self.spent = max(self.spent, self._spent / allowed)
 
     def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
@@ -341,27 +322,11 @@ class Cloth:
 
         It is the rate of momentum less weight and the force of the holders; zero before the first step.
         """
-        if not self.steps:
+        if not self.total.steps:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
         return np.asarray(self._solver.momentum_rate() - weight - holders)
-
-    def _count(self, report: StepReport) -> StepReport:
-        self.steps += report.steps
-        self.unconverged_steps += report.unconverged
-        self.missed_steps += report.missed
-        residual = report.residual / self.force_scale
-        if not residual <= self.worst_residual:  # a NaN stays
-            self.worst_residual = residual
-        self.newton += report.newton
-        self.krylov += report.krylov
-        self.factorizations += report.factorizations
-        self.least_distance = min(self.least_distance, report.least_distance)
-        self.sharpest = min(self.sharpest, report.sharpest)
-        self.uneven = max(self.uneven, report.uneven)
-        self.seen.add(report.seen)
-        return report
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""

@@ -80,11 +80,11 @@ def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float
     cloth.set_state(straight)
     held = clamped.held
     dt, at_rest = preset.time_step, False
-    while cloth.steps < STEPS_MAX and not at_rest:
+    while cloth.total.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
         cloth.step(dt, held=straight[held], damping=DAMPING)
         at_rest = 2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
-        if cloth.steps > STEADY_STEPS:
+        if cloth.total.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
     reach, _, drop = cloth.positions[clamped.tip].mean(axis=0)
     return float(-drop / reach) if at_rest else np.nan, cloth

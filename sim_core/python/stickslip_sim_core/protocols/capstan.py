@@ -112,10 +112,10 @@ class Strip:
         first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
-            before = self.cloth.newton
+            before = self.cloth.total.newton
             self.cloth.step(dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING)
             if step > first:
-                self.iterations += (self.cloth.newton - before) / (last - first)
+                self.iterations += (self.cloth.total.newton - before) / (last - first)
                 pulls.append(self.cloth.reactions[self.held].sum(axis=0) / self.breadth)
         heavy = np.array(pulls)
         mean = heavy.mean(axis=0)

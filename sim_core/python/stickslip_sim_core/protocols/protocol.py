@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise, product
 from typing import Any, ClassVar
 
-import numpy as np
-
-from stickslip_sim_core._sim_core import build_info
+from stickslip_sim_core._sim_core import StepReport, build_info
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.result import Curve, Numbers, ProtocolResult, Refinement, Setting
@@ -19,17 +17,13 @@ from stickslip_sim_core.protocols.strip import DIAGONALS, LENGTH, MeshKind, cell
 class Tally:
     """Diagnostics of all simulations of one protocol."""
 
-    steps: int = 0
-    unconverged_steps: int = 0
-    least_distance: float = np.inf  # m
+    total: StepReport = field(default_factory=StepReport)
     largest: float = 0.0
     """Of a quantity of the protocol's own, such as drift."""
 
     def count(self, cloth: Cloth) -> None:
         """Add a cloth that was simulated."""
-        self.steps += cloth.steps
-        self.unconverged_steps += cloth.unconverged_steps
-        self.least_distance = min(self.least_distance, cloth.least_distance)
+        self.total.add(cloth.total)
 
     def note(self, value: float) -> None:
         """Raise `largest` to a value."""
@@ -117,10 +111,11 @@ class ClothProtocol(Protocol):
 
     def reported(self) -> dict[str, Setting]:
         found: dict[str, Setting] = {"preset": self.solver.name, self.time_step_name: self.solver.time_step}
-        if self.tally.steps:
-            found |= {"steps": self.tally.steps, "unconverged_steps": self.tally.unconverged_steps}
+        total = self.tally.total
+        if total.steps:
+            found |= {"steps": total.steps, "unconverged_steps": total.unconverged}
         if self.thickness is not None:
-            found["least_distance_over_thickness"] = self.tally.least_distance / self.thickness
+            found["least_distance_over_thickness"] = total.least_distance / self.thickness
         return found
 
 

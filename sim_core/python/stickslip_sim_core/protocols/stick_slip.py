@@ -57,8 +57,7 @@ class Press:
     static_error: float
     """Largest |relative error| of Q/P while the tip stuck, over the second half of its range; NaN if there is none."""
 
-    steps: int
-    unconverged_steps: int
+    cloth: Cloth
 
 
 @dataclass(kw_only=True, eq=False)
@@ -100,8 +99,7 @@ class StickSlip(RefinedProtocol):
             self.diagram += _phases(mu, found, end)
         if cells == self.cells[-1] and np.isfinite(found.static_error):
             self.tally.note(found.static_error)
-        self.tally.steps += found.steps
-        self.tally.unconverged_steps += found.unconverged_steps
+        self.tally.count(found.cloth)
         return found
 
     def reported(self) -> dict[str, Setting]:
@@ -162,7 +160,7 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, 
     )
     some = np.flatnonzero(on_curve)[:: max(1, int(on_curve.sum()) // 20)]
     static = np.abs(ratio[some] / master_curves.stick_slip(strain_at[some]) - 1.0)
-    return Press(slip, extended, float(static.max()) if len(static) else np.nan, cloth.steps, cloth.unconverged_steps)
+    return Press(slip, extended, float(static.max()) if len(static) else np.nan, cloth)
 
 
 def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:

@@ -1,23 +1,31 @@
 """Master curves: the values that physics predicts for the protocols, computed here and never tabulated.
 
 Every curve of a rod, or of a strip that bends in one direction, comes from the differential equations of the continuous
-rod, solved by collocation to 1e-10 (boundary_value.py); that of a plate from plate_buckling.py, to 5e-5. They share
-nothing with the solvers that are measured, so that a protocol compares two independent computations. Symbols,
-definitions and figures: docs/protocols.md.
+rod, solved by scipy's collocation to 1e-9; that of a plate from plate_buckling.py, to 5e-5. They share nothing with the
+solvers that are measured, so that a protocol compares two independent computations. Symbols, definitions and figures:
+docs/protocols.md.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from scipy.special import jv
 
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.reference import boundary_value, plate_buckling
-from stickslip_sim_core.reference.boundary_value import NotSolvedError, Numbers, Solution
+from stickslip_sim_core.reference import plate_buckling
+
+TOLERANCE = 1e-9
+"""Residual of the differential equations, relative."""
+
+
+class NotSolvedError(RuntimeError):
+    """A boundary value problem has no solution near the guess, or not the one that is meant."""
 
 
 def cantilever(gamma: ArrayLike) -> Floats:
@@ -40,24 +48,26 @@ def cantilever(gamma: ArrayLike) -> Floats:
 
 
 def _cantilever(gamma: float) -> float:
-    # Widths of the layers at the clamp and at the free end; the fields are psi and psi' / rate.
+    # Widths of the layers at the clamp and at the free end; the fields are psi, psi' / rate, and H and W, both scaled.
     rate = max(1.0, np.sqrt(gamma))
     clamp, tip = 1.0 / rate, min(1.0, gamma ** (-1.0 / 3.0))
     mesh = np.unique(np.concatenate([np.geomspace(0.25 * clamp, 0.5, 16), 1.0 - tip * np.linspace(0.0, 0.5, 5), [0.0]]))
 
-    def change(s: Floats, y: Numbers, _: Numbers) -> Numbers:
-        psi, bend = y
-        return np.stack([rate * bend, gamma / rate * (1.0 - s) * np.sin(psi)])
+    light = min(1.0, gamma)
 
-    def ends(first: Numbers, last: Numbers, _: Numbers) -> Numbers:
-        return np.stack([first[0] - np.pi / 2.0, last[1]])
+    def change(s: Floats, y: Floats) -> Floats:
+        psi, bend, _, _ = y
+        return np.stack([rate * bend, gamma / rate * (1.0 - s) * np.sin(psi), np.cos(psi) / light, rate * np.sin(psi)])
+
+    def ends(clamp: Floats, tip: Floats) -> Floats:
+        return np.stack([clamp[0] - np.pi / 2.0, tip[1], clamp[2], clamp[3]])
 
     hanging = np.pi / 2.0 * np.exp(-mesh * np.sqrt(gamma))
-    found = boundary_value.solve(change, ends, mesh, np.stack([hanging, -hanging * np.sqrt(gamma) / rate]))
-    psi = found.y[0]
-    if psi.min() < -1e-12 or psi.max() > np.pi / 2.0 + 1e-12:
+    found = _solved(change, ends, mesh, np.stack([hanging, -hanging * np.sqrt(gamma) / rate, mesh, mesh]))
+    psi, _, drop, reach = found.y
+    if psi.min() < -1e-9 or psi.max() > np.pi / 2.0 + 1e-9:
         raise NotSolvedError(f"cantilever: the solution at gamma = {gamma} is not the hanging one")
-    return found.integral(lambda y: np.cos(y[0])) / found.integral(lambda y: np.sin(y[0]))
+    return float(light * rate * drop[-1] / reach[-1])
 
 
 def lateral_buckling_rod() -> float:
@@ -151,7 +161,7 @@ def stick_slip_triple_point() -> tuple[float, float]:
     return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
 
 
-def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> tuple[float, float]:
+def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple[float, float]:
     """Return (strain, Q/P) of the strip that fulfils one more condition on w(1) and (P, q, a), from a guessed strain.
 
     With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may be as small as it
@@ -162,13 +172,13 @@ def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> 
     For a = 0 its solution is w = (q / P) (1 - cos(k s) - k sin(k s)), tan k = k, P = k^2.
     """
 
-    def change(_: Floats, y: Numbers, p: Numbers) -> Numbers:
+    def change(_: Floats, y: Floats, p: Floats) -> Floats:
         w, bend = y[0], y[1]
         P, q, a = p
         sine = np.sin(a * w) / a
         return np.stack([bend, q * np.cos(a * w) - P * sine, sine, 0.5 * (np.sin(0.5 * a * w) / (0.5 * a)) ** 2])
 
-    def ends(first: Numbers, last: Numbers, p: Numbers) -> Numbers:
+    def ends(first: Floats, last: Floats, p: Floats) -> Floats:
         at_clamp = [first[0], first[2], first[3]]
         return np.stack([*at_clamp, last[1], last[2], last[3] - 1.0, condition(last[0], p)])
 
@@ -178,10 +188,10 @@ def _pressed(condition: Callable[[Numbers, Numbers], Numbers], guess: float) -> 
     bend = k * (np.sin(k * s) - k * np.cos(k * s))
     scale = 0.44510  # q / P that makes int w^2 = 2
     y = np.stack([scale * w, scale * bend, 0.0 * s, s])
-    found = boundary_value.solve(change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)]))
-    P, q, a = found.parameters
+    found = _solved(change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)]))
+    P, q, a = found.p
     w = found.y[0]
-    if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] == w.max()):
+    if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] > w.max() - 1e-9):
         raise NotSolvedError(f"stick_slip: near strain = {guess} the solution found is not the first mode")
     return float(a**2), float(a * q / P)
 
@@ -227,13 +237,14 @@ def bend_twist_onset(poisson: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _BoundaryPoint:
-    """A planar rod on the Bend-Twist boundary; fields (theta, q, mu0, mu1, eta) over sigma / Lambda."""
+    """A planar rod on the Bend-Twist boundary."""
 
     Lambda: float
     """Gamma^{1/3}."""
 
     phi: float
-    solution: Solution
+    fields: Callable[[Floats], Floats]
+    """(theta, q, mu0, mu1, eta) over sigma / Lambda."""
 
 
 class _Boundary:
@@ -264,25 +275,21 @@ class _Boundary:
         return best
 
     def gamma_at(self, phi: float) -> float:
-        """Gamma on the upper side of the curve, NaN if there is none; a secant that keeps its bracket."""
+        """Gamma on the upper side of the curve, NaN if there is none."""
         if phi < self.onset.phi:
             return np.nan
         rung = 0
         while self._rung(rung).phi < phi:
             rung += 1
-        low = self._rung(rung - 1) if rung > 0 else self.onset
-        high = self._rung(rung)
-        before, last = low, high
-        while True:
-            middle = 0.5 * (low.Lambda + high.Lambda)
-            rise = last.phi - before.phi
-            secant = last.Lambda + (phi - last.phi) * (last.Lambda - before.Lambda) / rise if rise else middle
-            # Near the onset phi grows as the square of the distance in Lambda, and a secant may miss.
-            Lambda = secant if low.Lambda < secant < high.Lambda else middle
-            if min(abs(Lambda - last.Lambda), high.Lambda - low.Lambda) <= self.TOLERANCE * Lambda:
-                return float(Lambda**3)
-            before, last = last, self._solve(Lambda, last)
-            low, high = (last, high) if last.phi < phi else (low, last)
+        last = low = self._rung(rung - 1) if rung > 0 else self.onset
+        known = {end.Lambda: end for end in (low, self._rung(rung))}
+
+        def missed(Lambda: float) -> float:
+            nonlocal last
+            last = known.get(Lambda) or self._solve(Lambda, last)
+            return last.phi - phi
+
+        return float(brentq(missed, min(known), max(known), xtol=1e-15, rtol=self.TOLERANCE)) ** 3
 
     def _rung(self, rung: int) -> _BoundaryPoint:
         """Rung of the ladder: 0 is the anchor, positive ones are above."""
@@ -293,23 +300,22 @@ class _Boundary:
 
     def _solve(self, Lambda: float, near: _BoundaryPoint) -> _BoundaryPoint:
         """Find phi for this Lambda, from a point near by."""
-        mesh, guess = near.solution.mesh, near.solution.y
+        mesh = place = _mesh(Lambda)
         # Rods of more than a few units of sigma look alike in sigma, shorter ones in s.
         if not 0.95 < Lambda / near.Lambda < 1.05:
-            mesh, known = _mesh(Lambda), mesh * near.Lambda
-            guess = np.stack([np.interp(mesh * Lambda, known, y) for y in guess])  # beyond its clamp as at its clamp
+            place = np.minimum(mesh * Lambda / near.Lambda, 1.0)  # beyond its clamp as at its clamp
 
-        def change(x: Floats, y: Numbers, p: Numbers) -> Numbers:
+        def change(x: Floats, y: Floats, p: Floats) -> Floats:
             return Lambda * _rates(Lambda * x, y, p[0] / Lambda, self.C)
 
-        def ends(tip: Numbers, clamp: Numbers, _: Numbers) -> Numbers:
+        def ends(tip: Floats, clamp: Floats, _: Floats) -> Floats:
             return np.stack([tip[1], tip[2], tip[3], tip[4] - 1.0, clamp[0], clamp[4]])
 
         phi = near.phi * max(Lambda / near.Lambda, 1.0)
-        found = boundary_value.solve(change, ends, mesh, guess, np.array([phi]))
+        found = _solved(change, ends, mesh, near.fields(place), np.array([phi]))
         if found.y[4].min() < -1e-9:
             raise NotSolvedError(f"bend_twist: at Lambda = {Lambda} another mode becomes unstable first")
-        return _BoundaryPoint(Lambda, float(found.parameters[0]), found)
+        return _BoundaryPoint(Lambda, float(found.p[0]), found.sol)
 
     def _anchor(self) -> _BoundaryPoint:
         """Follow the planar rod from large weights down until eta has passed zero at the clamp.
@@ -323,21 +329,24 @@ class _Boundary:
         for ratio in np.arange(1.2, 0.3, -0.03):
             Lambda = float(ratio) * phi
 
-            def change(x: Floats, y: Numbers, _: Numbers, Lambda: float = Lambda) -> Numbers:
+            def change(x: Floats, y: Floats, Lambda: float = Lambda) -> Floats:
                 return Lambda * _rates(Lambda * x, y, phi / Lambda, self.C)
 
-            def ends(tip: Numbers, clamp: Numbers, _: Numbers) -> Numbers:
+            def ends(tip: Floats, clamp: Floats) -> Floats:
                 return np.stack([tip[1], tip[2], tip[3], clamp[4] - 1.0, clamp[0]])
 
-            found = boundary_value.solve(change, ends, mesh, fields)
-            fields = found.y
-            if found.y[4, 0] < 0.0:
-                fields[2:] /= found.y[4, 0]
-                return self._solve(Lambda, _BoundaryPoint(Lambda, phi, found))
-        raise NotSolvedError("bend_twist: the planar rod of phi = 7 stays stable")
+            found = _solved(change, ends, mesh, fields)
+            fields = found.sol(mesh)
+            tip = found.y[4, 0]
+            if tip < 0.0:
+                break
+        else:
+            raise NotSolvedError("bend_twist: the planar rod of phi = 7 stays stable")
+        scale = np.array([1.0, 1.0, tip, tip, tip])[:, None]
+        return self._solve(Lambda, _BoundaryPoint(Lambda, phi, lambda x: found.sol(x) / scale))
 
 
-def _rates(sigma: Floats, y: Numbers, k: Numbers | float, C: float) -> Numbers:
+def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:
     """d/dsigma of (theta, q, mu0, mu1, eta): see bend_twist."""
     theta, q, mu0, mu1, eta = y
     sine, cosine = np.sin(theta), np.cos(theta)
@@ -441,8 +450,7 @@ def heavy_fold(gap: float) -> HeavyFold:
         kappa' = H sin(theta) - (V + s) cos(theta),   x' = cos(theta),   y' = sin(theta),
         theta = kappa = y = 0 at s = 0,   theta = pi, kappa = 0, y = gap at the end.
 
-    kappa^2/2 + n . t - y is constant, so that H = -gap/2: friction changes nothing. It is
-    solved in three parts, up to the nose, up to the top and up to the landing.
+    kappa^2/2 + n . t - y is constant, so that H = -gap/2: friction changes nothing.
 
     Args:
         gap: Height of the upper layer over the lower one where it lands, over L_gb, in (0, 0.5].
@@ -452,46 +460,41 @@ def heavy_fold(gap: float) -> HeavyFold:
     """
     _within("gap", gap, 0.0, 0.5, open_below=True)
 
-    def change(_: Floats, y: Numbers, p: Numbers) -> Numbers:
-        H, V = p[:2]
-        out, begun = [], 0.0 * p[0]
-        for part in range(3):
-            theta, kappa = y[4 * part], y[4 * part + 1]
-            length = p[2 + part]
-            pull = V + begun + length * y[12]
-            out += [kappa, H * np.sin(theta) - pull * np.cos(theta), np.cos(theta), np.sin(theta)]
-            out[-4:] = [length * rate for rate in out[-4:]]
-            begun = begun + length
-        return np.stack([*out, 1.0 + 0.0 * y[12]])
+    def change(s: Floats, y: Floats, p: Floats) -> Floats:
+        (theta, kappa, _, _), (H, V, length) = y, p
+        bend = H * np.sin(theta) - (V + s * length) * np.cos(theta)
+        return np.asarray(length * np.stack([kappa, bend, np.cos(theta), np.sin(theta)]))
 
-    def ends(first: Numbers, last: Numbers, p: Numbers) -> Numbers:
-        joined = [first[4 + i] - last[i] for i in range(8)]
-        landing = [last[8] - np.pi, last[9], last[11] - gap]
-        return np.stack([*first[:4], first[12], last[0] - np.pi / 2.0, last[4] - np.pi, *joined, *landing])
+    def ends(first: Floats, last: Floats, _: Floats) -> Floats:
+        return np.array([*first, last[0] - np.pi, last[1], last[3] - gap])
 
-    # A guess that rises to 1.17 pi and comes back: the solution for gap = 1/16, by eye.
-    s = np.linspace(0.0, 1.0, 9)
-    rise, over, back = np.pi / 2.0 * s**2, np.pi / 2.0 * (1.0 + s), np.pi * (1.0 + 0.17 * np.sin(np.pi * s))
-    lengths = np.array([1.5, 0.9, 2.25])
-    y = np.zeros((13, 9))
-    x = height = 0.0
-    for part, (theta, length) in enumerate(zip((rise, over, back), lengths, strict=True)):
-        step = length / 8.0
-        y[4 * part], y[4 * part + 1] = theta, np.gradient(theta, step)
-        for row, start, rate in ((2, x, np.cos(theta)), (3, height, np.sin(theta))):
-            y[4 * part + row] = start + step * np.append(0.0, np.cumsum(0.5 * (rate[1:] + rate[:-1])))
-        x, height = y[4 * part + 2, -1], y[4 * part + 3, -1]
-    y[12] = s
-    found = boundary_value.solve(change, ends, s, y, np.array([-0.5 * gap, -3.7, *lengths]))
-    if not (found.y[8].max() > np.pi and found.parameters[2:].min() > 0.0 and found.parameters[1] < 0.0):
+    # A guess that rises to 1.3 pi and comes back, by eye.
+    s = np.linspace(0.0, 1.0, 101)
+    theta = np.where(s < 0.5, np.pi * 1.3 * np.sin(np.pi * s) ** 2, np.pi * (1.0 + 0.3 * np.sin(np.pi * s) ** 2))
+    x, y = (0.05 * np.cumsum(rate(theta)) for rate in (np.cos, np.sin))
+    found = _solved(change, ends, s, np.stack([theta, np.gradient(theta, 0.05), x, y]), np.array([0.0, -3.0, 5.0]))
+    H, V, length = found.p
+    nose, top = (
+        found.sol(brentq(lambda s, angle=angle: found.sol(s)[0] - angle, 0.0, found.x[found.y[0].argmax()]))
+        for angle in (np.pi / 2.0, np.pi)
+    )
+    if not (found.y[0].max() > np.pi and length > 0.0 and V < 0.0):
         raise NotSolvedError(f"heavy_fold: the solution at gap = {gap} is not the fold")
     return HeavyFold(
-        height=float(found.y[7, -1]),
-        loop_length=float(found.parameters[2:].sum()),
-        nose_to_landing=float(found.y[2, -1] - found.y[10, -1]),
-        landing_force=float(found.parameters[1:].sum()),
-        tension=-float(found.parameters[0]),
+        height=float(top[3]),
+        loop_length=float(length),
+        nose_to_landing=float(nose[2] - found.y[2, -1]),
+        landing_force=float(V + length),
+        tension=-float(H),
     )
+
+
+def _solved(rate: Any, ends: Any, mesh: Floats, y: Floats, parameters: Floats | None = None) -> Any:
+    """Solve y' = rate(x, y, p) with ends(y(first), y(last), p) = 0, from a guess; p where there are parameters."""
+    found = solve_bvp(rate, ends, mesh, y, parameters, tol=TOLERANCE, max_nodes=100_000)
+    if not found.success:
+        raise NotSolvedError(found.message)
+    return found
 
 
 def _positive(name: str, values: ArrayLike) -> Floats:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.rods.general import CLAMP_FRAME, STIFFNESS, clamp_quaternions, rod_stiffness
 from stickslip_sim_core.rods.solve import finite_array
@@ -104,18 +105,12 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
     b = interpolation_matrix(points, middle + gauss) @ curvature
     # For R' = R [kappa]x: theta = h (a + b) / 2 + sqrt(3)/12 h^2 a x b.
     theta = 0.5 * h * (a + b) + np.sqrt(3.0) / 12.0 * h**2 * np.cross(a, b)
-    angle = np.linalg.norm(theta, axis=2)[..., None]
-    half = np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * theta], axis=2)
-    q = clamp_quaternions(clamp_frame, n)
-    frames = [q]
-    for i in range(steps):
-        q = _product(q, half[:, i])
-        if i % 2 == 1:
-            q = q / np.linalg.norm(q, axis=1, keepdims=True)
-            frames.append(q)
+    clamps = clamp_quaternions(clamp_frame, n)
+    # A chain of these turns: its curvature is that of the turn of each element.
+    frames = [_sim_core.chain_frames(rod / h, clamp)[::2] for rod, clamp in zip(theta, clamps, strict=True)]
     from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
 
-    quaternions = np.roll(np.stack(frames, axis=1), -1, axis=2).reshape(-1, 4)
+    quaternions = np.roll(np.reshape(frames, (-1, 4)), -1, axis=1)
     return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(n, points, 3, 3)
 
 
@@ -124,12 +119,6 @@ def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
     array = np.asarray(field)
     tail = (3,) * rank
     return array.reshape(-1, *tail) if array.shape == (*leading, *tail) else array
-
-
-def _product(p: Floats, q: Floats) -> Floats:
-    """Multiply quaternions (w, x, y, z), shape (n, 4)."""
-    w = p[:, :1] * q[:, :1] - (p[:, 1:] * q[:, 1:]).sum(axis=1, keepdims=True)
-    return np.concatenate([w, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])], axis=1)
 
 
 def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:

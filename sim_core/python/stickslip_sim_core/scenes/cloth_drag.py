@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.arrays import Floats, check_range
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.bodies import Body, plane
 from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
@@ -16,7 +16,7 @@ from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.scenes.hanging import Hung, hung
 from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import Record
-from stickslip_sim_core.scenes.scene import ClothRun, Scene, check_range, cloth_kind, fabric_labels
+from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kind, fabric_labels
 
 SIDE = 0.2
 """Side of the square of cloth [m]."""
@@ -157,7 +157,7 @@ def holder_pose(time: ArrayLike) -> Floats:
 def _forces(cloth: Cloth, hung: Hung) -> Record:
     """Return the forces of the floor and of the holders (3,) [N]; before the first step the holders bear the weight."""
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
-    holders = cloth.reactions[hung.held].sum(axis=0) if cloth.steps else -weight
+    holders = cloth.reactions[hung.held].sum(axis=0) if cloth.total.steps else -weight
     return {"contact_force": cloth.contact_force(), "holder_force": holders}
 
 

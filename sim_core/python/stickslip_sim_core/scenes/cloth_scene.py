@@ -168,7 +168,7 @@ class _Forces:
         force = np.zeros((self._things + self._sheets,) * 2 + (3,))
         state = np.zeros(vertices, np.uint8)
         pulls = np.zeros((len(self._holders), 3))
-        if cloth.steps:
+        if cloth.total.steps:
             reactions, contacts, pairs = cloth.reactions, cloth.contacts, cloth.pair_forces
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)

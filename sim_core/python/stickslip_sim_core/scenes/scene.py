@@ -46,7 +46,7 @@ class ClothRun:
     """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it [N]."""
 
     labels: Mapping[str, Any]
-    """Numbers of the scene by name, such as the bias that breaks its symmetry."""
+    """Numbers by name: those of the solver, the checks, and of the scene, such as the bias that breaks its symmetry."""
 
     self_intersections: NDArray[np.int32]
     """(frames,): pairs of triangles that cross."""
@@ -54,20 +54,8 @@ class ClothRun:
     least_distance: float
     """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
 
-    kernel: str
-    """Level of the solver's kernels: levels differ in the last digits."""
-
-    steps: int
-    unconverged_steps: int
-
-    worst_residual: float
-    """Largest residual force of a node in any step, in weights of 25 mm^2 of the lightest fabric."""
-
     rest_time: float
     """When all came to rest, if the scene ends then [s]; NaN if it did not."""
-
-    checks: Mapping[str, float]
-    """Worst value of each check by its name, see `cloth.checks`."""
 
     code: str
     """Code of the reason why the run is not valid: the name of the first check that failed; or empty."""
@@ -206,19 +194,20 @@ class Scene:
             triangles=self.mesh.triangles,
             times=times,
             record={**record, **self.record},
-            labels={},
+            labels={
+                "kernel": cloth.kernel,
+                "steps": cloth.total.steps,
+                "unconverged_steps": cloth.total.unconverged,
+                "worst_residual": cloth.worst_residual,
+                **worst,
+            },
             self_intersections=np.array(crossed, np.int32),
-            least_distance=cloth.least_distance,
-            kernel=cloth.kernel,
-            steps=cloth.steps,
-            unconverged_steps=cloth.unconverged_steps,
-            worst_residual=cloth.worst_residual,
+            least_distance=cloth.total.least_distance,
             rest_time=rest_time,
-            checks=worst,
             code=code,
             reason=reason,
         )
-        return replace(run, labels=self.labels(run))
+        return replace(run, labels={**run.labels, **self.labels(run)})
 
     def _crossings(self, positions: Floats) -> int:
         """Return how many pairs of triangles cross; none where positions (V, 3) [m] are not finite."""
@@ -244,20 +233,12 @@ class Scene:
         """Run the scene and return the arrays and labels to store."""
         run = self.run(on_frame)
         if not run.valid:
-            worst = ", ".join(f"{name} {value:.4g}" for name, value in run.checks.items())
+            worst = ", ".join(f"{check.name} {run.labels[check.name]:.4g}" for check in checks.CHECKS)
             return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
-        labels = {
-            "kernel": run.kernel,
-            "steps": run.steps,
-            "unconverged_steps": run.unconverged_steps,
-            "worst_residual": run.worst_residual,
-            **run.checks,
-            **run.labels,
-        }
         single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
-        return Outcome({**single, "self_intersections": crossings}, labels)
+        return Outcome({**single, "self_intersections": crossings}, run.labels)
 
 
 def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
@@ -285,13 +266,3 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
     name, numbers = known.pop("material"), known.pop("fabric", None)
     made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
     return {**known, "material": made.scaled(**factors)}
-
-
-def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Check that a number is in [low, high].
-
-    Raises:
-        ValueError: It is outside.
-    """
-    if not low <= value <= high:
-        raise ValueError(f"{name}: must be in [{low:g}, {high:g}], got {value}")
