@@ -20,7 +20,7 @@ from stickslip_schemas.spec.fabrics import Texture
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.stage import Stage
 from stickslip_blender.cloth.textures import custom_texture, texture_image
-from stickslip_blender.raster import Window, projected, see
+from stickslip_blender.raster import Window, projected, scaled, see
 
 SIDE = 320
 """Of a picture [px]."""
@@ -53,7 +53,9 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
     stage = Stage(scene["scene"], sheet, scene["segments"], record, picture)
     geometry = Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage)
     given = [Camera.model_validate(camera) for camera in scene["cameras"]]
-    cameras = [_scaled(camera) for camera in given] or [stage.camera(name, geometry, SIDE) for name in FRAMING]
+    cameras = [scaled(camera, SIDE / camera.width) for camera in given] or [
+        stage.camera(name, geometry, SIDE) for name in FRAMING
+    ]
     colors = _colors(geometry)
     rows = []
     for instant, positions in enumerate(record[f"{sheet}.positions"]):
@@ -64,14 +66,6 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
     clip = np.stack([np.concatenate(row, axis=1) for row in rows])
     (out / "motion.webp").write_bytes(moving(clip))
     return [*(f"{camera.name}.png" for camera in cameras), "motion.webp"]
-
-
-def _scaled(camera: Camera) -> Camera:
-    """Return a camera whose frame is `SIDE` wide."""
-    scale = SIDE / camera.width
-    middle = {"cx": scale * (camera.cx + 0.5) - 0.5, "cy": scale * (camera.cy + 0.5) - 0.5}
-    size = {"width": SIDE, "height": round(scale * camera.height), "fx": scale * camera.fx, "fy": scale * camera.fy}
-    return camera.model_copy(update=middle | size)
 
 
 def _colors(geometry: Geometry) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, TaskResult
-from stickslip_schemas.format.codecs import encode_chunk, encode_clip
+from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
 
@@ -98,15 +98,9 @@ class Workshop:
             self._renderer = scene, build()
         return self._renderer[1]
 
-    def chunk(self, values: Array) -> ChunkRef:
+    def chunk(self, values: Array, encode: Callable[[Array], bytes] = encode_chunk) -> ChunkRef:
         """Publish the values of one sample as a chunk."""
-        return self._published(encode_chunk(np.ascontiguousarray(values)))
-
-    def clip(self, clip: Array) -> ChunkRef:
-        """Publish a clip (frames, height, width, 3) as a chunk."""
-        return self._published(encode_clip(clip))
-
-    def _published(self, chunk: bytes) -> ChunkRef:
+        chunk = encode(np.ascontiguousarray(values))
         return ChunkRef(digest=self.store.publish(chunk), offset=0, length=len(chunk))
 
 

@@ -156,8 +156,8 @@ def test_cameras_frame_what_moves_and_nothing_else(usual: Any, name: str) -> Non
     stage, geometry, track = usual
     camera = stage.camera(name, geometry, 224)
     assert camera.position[1] < -0.2  # front: nothing hides the cloth there
-    assert camera.overflow(track) == pytest.approx(camera.overflow(stage.moving(geometry)))
-    assert -14.0 < camera.overflow(stage.moving(geometry)) < -6.0
+    assert camera.overflow(track) == pytest.approx(camera.overflow(stage.moving()))
+    assert -14.0 < camera.overflow(stage.moving()) < -6.0
     assert camera.position[2] > 0.1
     assert camera.overflow(stage.placed(0, track[0])[0]) > 0.0  # the rug lies still
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from stickslip_schemas.base.keys import content_key, referred
 from stickslip_schemas.base.states import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
-from stickslip_schemas.format.codecs import decode_chunk, encode_chunk
+from stickslip_schemas.format.codecs import decode_chunk, encode_chunk, encode_clip
 from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture
@@ -238,7 +238,7 @@ def _results(
                 continue
             video = bent(video, clip.camera)
             preview = workshop.store.publish(moving(video, side=_PREVIEW_SIDE)) if task.preview else None
-            chunks = {"video": workshop.clip(video), **known}
+            chunks = {"video": workshop.chunk(video, encode_clip), **known}
             output = RenderOutput(chunks=chunks, preview=preview, labels=shared | measured.labels | labels)
             yield name, TaskResult(outcome="succeeded", output=output)
         if not poor:

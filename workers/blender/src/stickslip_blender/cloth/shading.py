@@ -26,7 +26,18 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.substrates import Substrate
-from stickslip_blender.raster import GRID, Seen, Textures, Window, _raster, projected, see, see_albedo, window_about
+from stickslip_blender.raster import (
+    GRID,
+    Seen,
+    Textures,
+    Window,
+    _raster,
+    projected,
+    scaled,
+    see,
+    see_albedo,
+    window_about,
+)
 
 SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
 """The cloth's base colours in a shading, where the camera sees it and where other rays meet it."""
@@ -76,7 +87,7 @@ class Composer:
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
         8-bit sRGB, chosen as in raster/composition.hpp, shape (textures, height, width, 3).
         """
-        window, parts = self._window(points, camera).times(FINE), _finer(camera, FINE)
+        window, parts = self._window(points, camera).times(FINE), scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
@@ -101,7 +112,7 @@ class Composer:
 
     def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1) -> Floats:
         """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is rendered directly."""
-        window, parts = self._window(points, camera).times(fine), _finer(camera, fine)
+        window, parts = self._window(points, camera).times(fine), scaled(camera, fine)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
@@ -165,13 +176,6 @@ class Composer:
         color = blurred[..., 1:] / np.maximum(share, 1e-6)
         mean = overall.ravel()
         return (mean + known * (color - mean)).astype(np.float32), window
-
-
-def _finer(camera: Camera, fine: int) -> Camera:
-    """Return a camera with fine x fine pixels in each."""
-    numbers = {name: fine * getattr(camera, name) for name in ("width", "height", "fx", "fy")}
-    centre = {name: fine * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
-    return camera.model_copy(update=numbers | centre)
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:

@@ -94,7 +94,7 @@ class Stage:
         """Return the middle of the box about the sheet."""
         return np.asarray(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
 
-    def moving(self, geometry: Geometry) -> Array:
+    def moving(self) -> Array:
         """Return the places (n, 3) [m], over time, of all that moves, and of all of the sheet."""
         track = self._record[f"{self._sheet}.positions"]
         instants = np.unique(np.linspace(0, len(track) - 1, _WATCHED).astype(int))
@@ -107,7 +107,7 @@ class Stage:
 
     def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
         """Return the camera that frames all that moves, turned about it until enough of the sheet is in sight."""
-        points, track = self.moving(geometry), self._record[f"{self._sheet}.positions"]
+        points, track = self.moving(), self._record[f"{self._sheet}.positions"]
         instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
         shown = [_shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes) for turn in _TURNS]

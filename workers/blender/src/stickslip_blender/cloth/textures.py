@@ -53,19 +53,11 @@ def _phase(x: Field, count: float) -> Field:
     return np.asarray(np.mod(x * count, 1.0))
 
 
-def _checker(u: Field, v: Field) -> Field:
-    return _mix((_phase(u, 4) < 0.5) == (_phase(v, 4) < 0.5), (34, 37, 46), (236, 230, 214))
-
-
 def _dots(u: Field, v: Field) -> Field:
     """Draw dots on a staggered grid."""
     odd = np.mod(np.floor(v * 8), 2) == 1
     x, y = _phase(u + np.where(odd, 1 / 16, 0.0), 8) - 0.5, _phase(v, 8) - 0.5
     return _mix(np.hypot(x, y) < 0.3, (240, 234, 220), (38, 62, 122))
-
-
-def _stripes(u: Field, v: Field) -> Field:
-    return _mix(_phase(u, 8) < 0.5, (176, 38, 44), (238, 230, 216))
 
 
 def _plaid(u: Field, v: Field) -> Field:
@@ -79,11 +71,6 @@ def _plaid(u: Field, v: Field) -> Field:
         return _mix(np.minimum(place, 1.0 - place) < 0.045, (198, 40, 40), sett)
 
     return 0.5 * (threads(u) + threads(v))
-
-
-def _gingham(u: Field, v: Field) -> Field:
-    share = 0.5 * ((_phase(u, 6) < 0.5).astype(float) + (_phase(v, 6) < 0.5))
-    return _mix(share, (46, 104, 176), (244, 242, 236))
 
 
 def _herringbone(u: Field, v: Field) -> Field:
@@ -148,10 +135,6 @@ def _camouflage(u: Field, v: Field) -> Field:
     return picture
 
 
-def _chevron(u: Field, v: Field) -> Field:
-    return _mix(_phase(v + np.abs(_phase(u, 5) - 0.5) / 5, 7) < 0.5, (232, 188, 64), (62, 66, 74))
-
-
 def _terrazzo(u: Field, v: Field) -> Field:
     """Strew chips of five colours over off-white, seeded; the pattern repeats at the edges."""
     picture = np.broadcast_to(np.asarray((226, 222, 214), dtype=np.float64), (*u.shape, 3))
@@ -167,16 +150,20 @@ def _terrazzo(u: Field, v: Field) -> Field:
 
 
 _DRAWN_BY: dict[Texture, Callable[[Field, Field], Field]] = {
-    Texture.checker: _checker,
+    Texture.checker: lambda u, v: _mix((_phase(u, 4) < 0.5) == (_phase(v, 4) < 0.5), (34, 37, 46), (236, 230, 214)),
     Texture.dots: _dots,
-    Texture.stripes: _stripes,
+    Texture.stripes: lambda u, _: _mix(_phase(u, 8) < 0.5, (176, 38, 44), (238, 230, 216)),
     Texture.plaid: _plaid,
-    Texture.gingham: _gingham,
+    Texture.gingham: lambda u, v: _mix(
+        0.5 * ((_phase(u, 6) < 0.5).astype(float) + (_phase(v, 6) < 0.5)), (46, 104, 176), (244, 242, 236)
+    ),
     Texture.herringbone: _herringbone,
     Texture.houndstooth: _houndstooth,
     Texture.floral: _floral,
     Texture.argyle: _argyle,
     Texture.camouflage: _camouflage,
-    Texture.chevron: _chevron,
+    Texture.chevron: lambda u, v: _mix(
+        _phase(v + np.abs(_phase(u, 5) - 0.5) / 5, 7) < 0.5, (232, 188, 64), (62, 66, 74)
+    ),
     Texture.terrazzo: _terrazzo,
 }

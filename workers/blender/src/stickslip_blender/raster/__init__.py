@@ -123,6 +123,14 @@ def projected(camera: Camera, points: npt.ArrayLike) -> Points:
     return np.ascontiguousarray(np.concatenate([pixels, depth[:, None]], axis=1))
 
 
+def scaled(camera: Camera, factor: float) -> Camera:
+    """Return a camera whose frame has `factor` times as many pixels along each side, rounded to whole ones."""
+    size = {name: round(factor * getattr(camera, name)) for name in ("width", "height")}
+    focal = {name: factor * getattr(camera, name) for name in ("fx", "fy")}
+    centre = {name: factor * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
+    return camera.model_copy(update=size | focal | centre)
+
+
 def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
     """Return the part of the frame that projected points are in, with so many pixels around it."""
     places = points[np.isfinite(points[:, 0]), :2]  # the others are behind the camera
