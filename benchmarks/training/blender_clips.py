@@ -78,12 +78,12 @@ def main() -> None:
                 "crease_seed": int(random.integers(2**31)),
             }
         )
-        made = renderer.clip(look, cameras[view.value], positions[run][frames])
+        made = renderer.clip(look, cameras[view], positions[run][frames])
         videos += list(made.clips(made.shading(), [texture_image(texture) for texture in chosen])[0])
         if args.segmentation:
             seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
         for texture in chosen:
-            told.append({"run": run, "viewpoint": view.value, "texture": texture.value, **floor, **about[run]})
+            told.append({"run": run, "viewpoint": view, "texture": texture.value, **floor, **about[run]})
             print(json.dumps(told[-1]), flush=True)
     arrays: dict[str, Any] = {
         "video": np.stack(videos),

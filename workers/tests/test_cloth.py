@@ -28,7 +28,7 @@ from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore
 from stickslip_sim_core import ClothRun, Fabric, Scene, fabric, preset_named
-from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth import checks, meshes
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_sim_core.scenes.scene import cloth_kind
 from stickslip_testing.samples import samples
@@ -166,7 +166,7 @@ def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: C
     core.changes = {"code": "stretch", "reason": "stretch: must be at most 1.25, got 2.5"}
     (result,) = run_tasks([_task()], store)
     assert (result.outcome, result.reason) == ("rejected", Reason.stretch)
-    worst = ", ".join(f"{name} 0" for name in CHECKS)
+    worst = ", ".join(f"{check.name} 0" for check in checks.CHECKS)
     assert result.message == (
         f"stretch: must be at most 1.25, got 2.5; worst values: {worst} at material = gray-interlock, density = 1, "
         "bending = 1, stretching = 1, mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
