@@ -20,8 +20,7 @@ std::vector<KernelLevel> kernel_levels();
 // Their names.
 std::vector<std::string> kernel_names();
 
-// That of this name, or, where it is empty, the widest. Throws std::invalid_argument, naming `kernel`, where there is
-// none.
+// That of this name, or, if it is empty, the widest. Throws std::invalid_argument, naming `kernel`.
 KernelLevel kernel_level(const std::string& name);
 
 }  // namespace sim_core
