@@ -37,7 +37,7 @@ from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import FLOOR, Holders
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.looks import drawn_light, grained, look_of
-from stickslip_blender.cloth.scene import Shot
+from stickslip_blender.cloth.scene import Points
 from stickslip_blender.cloth.substrates import HARD, Substrate, drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.blender import import_bpy
@@ -94,11 +94,11 @@ class Bench:
         build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[:12]
         self.references = references and references / build
 
-    def set_up(self, shot: View) -> tuple[Shot, npt.NDArray[np.float32]]:
+    def set_up(self, shot: View) -> tuple[Points, npt.NDArray[np.float32]]:
         """Return where everything is, and the floor's factor."""
         camera = self.rig[shot.view]
-        self.scene.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look)
-        return self.scene.shot(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
+        self.scene.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look, self.track)
+        return self.geometry.points(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
 
     def reference(self, view: View, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
         """Return the window and what it should look like."""
@@ -112,7 +112,7 @@ class Bench:
         light[window.slices] = self.scene.direct(
             shot, self.pictures[texture], REFERENCE if view.substrate.name == "matt" else SMOOTH, window
         )
-        picture = encode(light * self.scene.composer.floor_factor(shot.points, camera, floor))[window.slices]
+        picture = encode(light * self.scene.composer.floor_factor(shot, camera, floor))[window.slices]
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             np.save(kept, picture)
@@ -125,15 +125,15 @@ class Bench:
         shading = self.scene.shading(shot, sampling, seed=7)
         traced = time.process_time()
         camera = self.rig[view.view]
-        pictures = np.empty((len(TEXTURES), camera.height, camera.width, 3), dtype=np.uint8)
-        self.scene.composer.compose(shading, shot.points, camera, view.substrate, floor, self.textures, pictures)
+        pictures = np.zeros((len(TEXTURES), camera.height, camera.width, 3), dtype=np.uint8)
+        self.scene.composer.compose(shading, shot, camera, view.substrate, floor, self.textures, pictures)
         ended = time.process_time()
         return pictures, traced - placed, ended - traced + self._per_frame(view)
 
     def _per_frame(self, view: View) -> float:
         """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
         start = time.process_time()
-        self.scene.shot(self.track[view.frame], view.frame)
+        self.geometry.points(self.track[view.frame], view.frame)
         return time.process_time() - start
 
     def direct(self, view: View, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
@@ -142,7 +142,7 @@ class Bench:
         start = time.process_time()
         light = self.scene.direct(shot, self.pictures[texture], sampling)
         spent = time.process_time() - start
-        return encode(light * self.scene.composer.floor_factor(shot.points, self.rig[view.view], floor)), spent
+        return encode(light * self.scene.composer.floor_factor(shot, self.rig[view.view], floor)), spent
 
     def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""

@@ -37,8 +37,10 @@ int code(float light) {
 
 bool is_near(int exact, int level) { return std::abs(exact - fine * level) <= tolerance * fine; }
 
-// Write a pixel near the exact values: a colour takes the level of the one before it where that is near.
+// Write a pixel near the exact values: it stays as it is where that is near. Else a colour takes the level of the one
+// before it where that is near.
 void settle(const std::uint16_t* exact, std::uint8_t* pixel) {
+  if (is_near(exact[0], pixel[0]) && is_near(exact[1], pixel[1]) && is_near(exact[2], pixel[2])) return;
   for (int k = 0; k < 3; ++k)
     pixel[k] = k > 0 && is_near(exact[k], pixel[k - 1]) ? pixel[k - 1]
                                                         : static_cast<std::uint8_t>((exact[k] + fine / 2) / fine);

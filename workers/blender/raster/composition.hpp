@@ -25,7 +25,8 @@ struct Part {
   std::span<const float> albedo;
 };
 
-// Write pictures of colours / 3 textures, height x width x 3 each and `stride` bytes apart, 8-bit sRGB.
+// Write pictures of colours / 3 textures, height x width x 3 each and `stride` bytes apart, 8-bit sRGB. They hold the
+// frame before, or zeros.
 //
 // `cloth` and `coverage` are in pixels of the light, and their window has whole pixels of a picture: a print and a fold
 // that meet in a pixel have light of their own. A pixel is the mean of its parts.
@@ -35,9 +36,9 @@ struct Part {
 void compose(const Shading& shading, std::span<const float> overall, const Part& cloth, std::span<const float> coverage,
              const Part& reflected, std::span<const float> floor, std::uint8_t* pictures, std::size_t stride);
 
-// Largest difference of a pixel of a clip from its exact value [8-bit levels]. Red is rounded; green takes the level of
-// red, and blue that of green, where it is as near as this, or is rounded. Grey stays grey, which is smaller when
-// coded.
+// Largest difference of a pixel of a clip from its exact value [8-bit levels]. A pixel stays as it was in the frame
+// before where all colours are as near as this. Else red is rounded; green takes the level of red, and blue that of
+// green, where it is as near, or is rounded. What stays, and grey that stays grey, is smaller when coded.
 constexpr int tolerance = 1;
 
 // Return values (height x width x count), blurred about each pixel by radii of its own, in rows `down` and in columns

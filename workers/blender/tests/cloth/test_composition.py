@@ -54,13 +54,13 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
 
 
 def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
-    """Nearly grey light keeps its hue within a level; colours that differ are rounded."""
+    """Nearly grey light keeps its hue within a level; colours that differ are rounded; a level that is near stays."""
     random = np.random.Generator(np.random.PCG64(4))
     overall = np.array([0.5, 0.51, 0.49, 0.9, 0.2, 0.5], dtype=np.float32)
     light = random.uniform(0.0, 0.6, (24, 60)).astype(np.float16)
     shading = np.stack([(a * light).astype(np.float16) for a in ELSEWHERE], axis=-1)
     nothing, nowhere = np.empty((0, 0), dtype=np.float32), (0, 0, 0, 0)
-    pictures = np.empty((2, 24, 60, 3), dtype=np.uint8)
+    pictures = np.zeros((2, 24, 60, 3), dtype=np.uint8)
     none = np.empty((0, 0, 6), dtype=np.float32)
     floor = np.ones((24, 60, 3), dtype=np.float32)
     _raster.compose(shading.view(np.uint16), ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, pictures)
@@ -70,6 +70,15 @@ def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
     assert np.abs(colorful - exact[..., 3:]).max() <= 0.9
     hues, rounded = (np.ptp(picture, axis=-1) for picture in (grey.astype(int), np.rint(exact[..., :3])))
     assert (hues == 0).mean() > (rounded == 0).mean() + 0.2
+
+    brighter, fresh, kept = (np.float16(1.01) * shading).view(np.uint16), np.zeros_like(pictures), pictures.copy()
+    for made in (fresh, kept):
+        _raster.compose(brighter, ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, made)
+    stays = (kept == pictures).all(axis=-1)
+    exact = np.stack(np.split(_srgb(1.01 * light[..., None].astype(np.float64) * overall), 2, axis=-1))
+    assert np.abs(kept - exact).max() <= TOLERANCE + 0.3
+    assert np.array_equal(kept[~stays], fresh[~stays])
+    assert stays.mean() > (fresh == pictures).all(axis=-1).mean() + 0.2
 
 
 def _side(inside: Any, middle: int, radius: float) -> npt.NDArray[np.float64]:

@@ -27,7 +27,7 @@ from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.lens import bent
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
 from stickslip_blender.cloth.quality import BAND, HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
-from stickslip_blender.cloth.scene import ClothScene, Shot
+from stickslip_blender.cloth.scene import ClothScene, Points
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
@@ -70,8 +70,8 @@ class ClothRenderer:
         light = drawn_light(look.lighting, look.light_seed, look.lamp)
         substrate = drawn_substrate(look.substrate, look.light_seed, look.finish)
         pinhole = camera.pinhole()
-        self.scene.set_up(pinhole, light, substrate, fabric)
-        shots = [self.scene.shot(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
+        self.scene.set_up(pinhole, light, substrate, fabric, track)
+        shots = [self.geometry.points(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
         height = self.geometry.surroundings.floor
         floor = (
             np.ones((pinhole.height, pinhole.width, 3), dtype=np.float32)
@@ -98,7 +98,7 @@ class ClipRenderer:
     camera: Camera
     pinhole: Camera
     """Renders what the camera's lens then bends."""
-    shots: Sequence[Shot]
+    shots: Sequence[Points]
     floor: npt.NDArray[np.float32]
     fabric: Look
     sampling: ClothSampling
@@ -117,13 +117,14 @@ class ClipRenderer:
         """
         packed = Textures(list(map(self._grained, textures)))
         camera = self.pinhole
-        videos = np.empty((packed.count, len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
-        sights = [
-            self.scene.composer.compose(
-                light, shot.points, camera, self.scene.substrate, self.floor, packed, videos[:, number]
+        videos = np.zeros((packed.count, len(self.shots), camera.height, camera.width, 3), dtype=np.uint8)
+        sights = []
+        for number, (shot, light) in enumerate(zip(self.shots, shading, strict=True)):
+            frame = videos[:, number]
+            frame[:] = videos[:, number - 1]
+            sights.append(
+                self.scene.composer.compose(light, shot, camera, self.scene.substrate, self.floor, packed, frame)
             )
-            for number, (shot, light) in enumerate(zip(self.shots, shading, strict=True))
-        ]
         labels = self.labels | {
             "frame_share": float(np.mean([sight.frame_share for sight in sights])),
             "visible_share": float(np.mean([sight.visible_share for sight in sights])),
@@ -138,12 +139,12 @@ class ClipRenderer:
             shot = self.shots[frame]
             window = self.scene.window(shot, BAND + 1)
             light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
-            factor = self.scene.composer.floor_factor(shot.points, self.pinhole, self.floor, FINE)[..., 1:2]
+            factor = self.scene.composer.floor_factor(shot, self.pinhole, self.floor, FINE)[..., 1:2]
             for number, half in enumerate(light, 1):
                 sampling = Sampling(HALF_SAMPLES, "none", self.seed + number, skipped=HALF_SAMPLES)
                 parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
                 half[window.slices] = parts.reshape(-1, FINE, window.right - window.left, FINE, 3).mean(axis=(1, 3))
-            yield Reference(frame, light, regions(self.scene.geometry, shot.points, self.pinhole))
+            yield Reference(frame, light, regions(self.scene.geometry, shot, self.pinhole))
 
     def _grained(self, texture: Clip) -> Clip:
         return grained(texture, self.fabric, self.scene.geometry.surface)
@@ -152,10 +153,9 @@ class ClipRenderer:
         """Return ground truth of every pixel (frames, height, width, ...), by name."""
         if not names:
             return {}
-        points = [shot.points for shot in self.shots]
         known = [
             ground_truth(self.scene.geometry, here, following, self.camera)
-            for here, following in zip(points, [*points[1:], points[-1]], strict=True)
+            for here, following in zip(self.shots, [*self.shots[1:], self.shots[-1]], strict=True)
         ]
         return {name: np.stack([getattr(frame, name) for frame in known]) for name in names}
 

@@ -86,9 +86,6 @@ class Surroundings(Protocol):
     def placed(self, instant: int, vertices: Array) -> list[Array]:
         """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V, 3) [m]."""
 
-    def aim(self, instant: int, vertices: Array) -> Array:
-        """Return the point that the lamp follows (3,) [m]."""
-
 
 @dataclass(frozen=True)
 class Printed:
@@ -207,11 +204,10 @@ HOLDER = (0.004, 0.01, 0.01)
 ROD = (0.003, 0.003, 0.5)
 """Size of the rod that the clip hangs on [m]."""
 HOLDER_COLOR, HOLDER_ROUGHNESS = np.array([[0.05, 0.05, 0.05]]), 0.45
-_AIM = 0.05  # [m], the height that the lamp points to, under the holders
 
 
 class Holders:
-    """The two holders of a dragged cloth, at its upper corners [thesis, 4.2.3]; the lamp follows them."""
+    """The two holders of a dragged cloth, at its upper corners [thesis, 4.2.3]."""
 
     floor: float | None = FLOOR
     ground, segment = GROUND, CLOTH
@@ -230,10 +226,6 @@ class Holders:
     def placed(self, _instant: int, vertices: Array) -> list[Array]:
         """Move the holders with the corners that they hold."""
         return [prop.vertices + at for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)]
-
-    def aim(self, _instant: int, vertices: Array) -> Array:
-        """Return a point below the middle of the holders."""
-        return np.array([vertices[self._held, 0].mean(), 0.0, _AIM])
 
 
 def _holder() -> tuple[Array, list[tuple[int, ...]]]:

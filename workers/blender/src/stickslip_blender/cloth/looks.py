@@ -115,8 +115,8 @@ class Source:
 
     ranges: tuple[tuple[float, float], ...]
     """Azimuth, elevation [degree] and power over the nominal power."""
-    diameter: float = 0.5
-    """Of the lamp [m], which is 1.2 m from the cloth."""
+    diameter: float = 3.0
+    """Of the lamp [m], which is 7.2 m from the cloth."""
     surround: float = 0.012
     """Radiance from all around, of which cameras see none: a studio has black curtains."""
 
@@ -124,17 +124,17 @@ class Source:
 SOURCES = {
     "drawn": Source(((-75.0, 15.0), (42.0, 62.0), (0.8, 1.25))),
     "held-out": Source(((25.0, 80.0), (25.0, 40.0), (0.6, 0.8))),  # what no training light has
-    "room": Source(((-75.0, 15.0), (55.0, 80.0), (0.5, 0.8)), diameter=1.6, surround=0.45),
-    "window": Source(((-125.0, -95.0), (20.0, 34.0), (0.9, 1.3)), diameter=1.2, surround=0.12),
+    "room": Source(((-75.0, 15.0), (55.0, 80.0), (0.5, 0.8)), diameter=9.6, surround=0.45),
+    "window": Source(((-125.0, -95.0), (20.0, 34.0), (0.9, 1.3)), diameter=7.2, surround=0.12),
 }
 
 
 @dataclass(frozen=True)
 class Light:
-    """The lamp of one clip; it follows the cloth, which is then lit alike everywhere [thesis, 4.2.3]."""
+    """The lamp of one clip. It stands still, so far away that the cloth is lit alike everywhere [thesis, 4.2.3]."""
 
     azimuth: float
-    """Seen from the cloth, from +x towards +y [degree]."""
+    """Seen from the middle of the cloth's way, from +x towards +y [degree]."""
     elevation: float
     """Above the floor [degree]."""
     power: float

@@ -1,10 +1,8 @@
 """The Blender scene of every kind of cloth: a cloth over a floor, under one lamp, before black.
 
-The cloth is the solver's mesh, refined so that no facet shows. The lamp follows it [thesis, 4.2.3]. The module of a
-kind in `stickslip_blender.scenes` adds the props.
+The cloth is the solver's mesh, refined so that no facet shows. The lamp stands still. The module of a kind in
+`stickslip_blender.scenes` adds the props.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +28,8 @@ from stickslip_blender.cycles.objects import (
 from stickslip_blender.cycles.pixels import FrameReader
 from stickslip_blender.raster import Window, projected, window_about
 
-_LAMP_DISTANCE = 1.2  # [m]
-_LAMP_POWER = 24.0  # [W]
+_LAMP_DISTANCE = 7.2  # [m]
+_LAMP_POWER = 940.0  # [W]
 _FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
 _DISCARDED, _RAMP = 2, 4  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
@@ -39,18 +37,12 @@ _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the w
 _MIRROR_PATHS = 2  # times as many paths for the frame then
 
 
-@dataclass(frozen=True)
-class Shot:
-    """The positions of everything at one instant."""
-
-    points: npt.NDArray[np.float64]
-    """All vertices, shape (V, 3) [m]."""
-    aim: npt.NDArray[np.float64]
-    """The point that the lamp is turned to, shape (3,) [m]."""
+Points = npt.NDArray[np.float64]
+"""All vertices at one instant, shape (V, 3) [m]."""
 
 
 class ClothScene:
-    """A scene with one cloth, built once; only vertices, textures, camera, floor and lamp change between frames."""
+    """A scene with one cloth, built once; vertices change between frames, camera, lamp and looks between clips."""
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -79,12 +71,18 @@ class ClothScene:
         add_view(self._scene)
         self._reader = FrameReader(self._scene)
 
-    def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look) -> None:
-        """Set the camera, the lamp, the floor and the fabric of the next clips."""
+    def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look, track: Points) -> None:
+        """Set the camera, the lamp, the floor and the fabric of the next clips.
+
+        The lamp is turned to the middle of all that the solver's vertices pass in the track (frames, V', 3) [m].
+        """
         set_view(self._scene, camera)
-        self._camera, self._light, self.substrate = camera, light, substrate
+        self._camera, self.substrate = camera, substrate
         self._fabric.set_look(**_shader(look))
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
+        a, e = np.radians(light.azimuth), np.radians(light.elevation)
+        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        self._lamp.aim(0.5 * (track.min(axis=(0, 1)) + track.max(axis=(0, 1))), outward, _LAMP_DISTANCE)
         set_curtains(self._scene, light.source.surround)
         if self._floor is not None:
             set_roughness(self._floor, substrate.roughness)
@@ -95,17 +93,17 @@ class ClothScene:
                 Specular_IOR_Level=substrate.specular,
             )
 
-    def shading(self, shot: Shot, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
+    def shading(self, points: Points, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
         """Render one instant for all textures: linear light at three albedos, shape (FINE height, FINE width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not flicker.
         """
         self._fabric.set_color(SHOWN, ELSEWHERE)
-        self._place(shot)
+        self._place(points)
         paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
         set_sampling(self._scene, Sampling(paths, "quick", seed))
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
-        part = self.window(shot, _DISCARDED + _RAMP)
+        part = self.window(points, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
         down = _share(part.top, part.bottom, self._camera.height)
         across = _share(part.left, part.right, self._camera.width)
@@ -115,30 +113,28 @@ class ClothScene:
         return light
 
     def direct(
-        self, shot: Shot, image: npt.NDArray[np.uint8], sampling: Sampling, window: Window | None = None, fine: int = 1
+        self,
+        points: Points,
+        image: npt.NDArray[np.uint8],
+        sampling: Sampling,
+        window: Window | None = None,
+        fine: int = 1,
     ) -> npt.NDArray[np.float16]:
         """Render an instant, or a window of it, with a texture on the cloth: linear light (fine h, fine w, 3)."""
         self._fabric.set_picture(image)
-        self._place(shot)
+        self._place(points)
         set_sampling(self._scene, sampling)
         return self._reader.read_light(window, fine)
 
-    def window(self, shot: Shot, margin: int = _WINDOW_MARGIN) -> Window:
+    def window(self, points: Points, margin: int = _WINDOW_MARGIN) -> Window:
         """Return the part of the frame that shows the cloth."""
-        cloth = shot.points[: self.geometry.cloth_vertices]
+        cloth = points[: self.geometry.cloth_vertices]
         return window_about(projected(self._camera, cloth), self._camera, margin)
 
-    def shot(self, positions: npt.NDArray[np.float64], instant: int) -> Shot:
-        """Return the positions of everything at an instant, the solver's vertices at positions (V', 3) [m]."""
-        return Shot(self.geometry.points(positions, instant), self.geometry.surroundings.aim(instant, positions))
-
-    def _place(self, shot: Shot) -> None:
-        """Move everything to its position in a shot."""
-        for mesh, points in zip(self._meshes, self.geometry.parts(shot.points), strict=True):
-            move_mesh(mesh, points)
-        a, e = np.radians(self._light.azimuth), np.radians(self._light.elevation)
-        outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        self._lamp.aim(shot.aim, outward, _LAMP_DISTANCE)
+    def _place(self, points: Points) -> None:
+        """Move everything."""
+        for mesh, part in zip(self._meshes, self.geometry.parts(points), strict=True):
+            move_mesh(mesh, part)
 
 
 def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:

@@ -14,8 +14,8 @@ Off the cloth L is linear in the albedo of light that the cloth threw there: m, 
 the cloth, blurred as much as its roughness does. Marks of the floor and colours of props lie on top, as factors of
 their light: whatever is not the cloth is grey in Cycles.
 
-Each level of a picture is within TOLERANCE of the exact value, and chosen so that the colours of grey are equal: clips
-are a tenth smaller for it.
+Each level of a picture is within TOLERANCE of the exact value, and chosen so that pixels stay as they are in the frame
+before (clips are 6 % smaller for it), and that the colours of grey are equal (a tenth smaller).
 """
 
 from dataclasses import dataclass, replace
@@ -85,7 +85,7 @@ class Composer:
         """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
-        8-bit sRGB, chosen as in raster/composition.hpp, shape (textures, height, width, 3).
+        those of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3).
         """
         window, parts = self._window(points, camera).times(FINE), scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)

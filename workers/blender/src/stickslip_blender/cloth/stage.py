@@ -90,10 +90,6 @@ class Stage:
         """Move everything to its place at an instant."""
         return [place(instant) for place in self._placers]
 
-    def aim(self, _instant: int, vertices: Array) -> Array:
-        """Return the middle of the box about the sheet."""
-        return np.asarray(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
-
     def moving(self) -> Array:
         """Return the places (n, 3) [m], over time, of all that moves, and of all of the sheet."""
         track = self._record[f"{self._sheet}.positions"]
