@@ -27,7 +27,8 @@ times themselves are printed; `benchmarks/results/faults.json` has those of quie
 
 
 def wait_for(what: str, probe: Callable[[], T | None], timeout: float) -> T:
-    """Poll `probe` until it returns something; fail naming `what` after `timeout` seconds."""
+    """Poll `probe` until it returns something; fail naming `what` after PATIENCE times `timeout` seconds."""
+    timeout *= PATIENCE
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         answer = probe()

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 import stickslip_workers
 import yaml
-from harness import PATIENCE, wait_for
+from harness import wait_for
 from machines import BUCKET, URL, Lab, Machine, dispatch
 
 CHART = Path(__file__).parents[1] / "deploy" / "helm" / "stickslip"
@@ -123,7 +123,7 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
 
         def expect(what: str, is_so: Callable[[], bool], limit: float) -> None:
             """Wait; the limit [s] is that of a quiet machine."""
-            seconds = lab.wait(what, is_so, PATIENCE * limit)
+            seconds = lab.wait(what, is_so, limit)
             with capsys.disabled():
                 print(f"    {what:65} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
