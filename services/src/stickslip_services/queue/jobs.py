@@ -26,10 +26,11 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Frames, StageTimings, read_progress, rejected_samples
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import RUNNABLE, SETTLED
+from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.recompute import check_results, check_samples, terms_of
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
+_UNSETTLED = [state for state in TaskState if not state.is_settled]
 _RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1))
 
 
@@ -110,7 +111,7 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
         planned = connection.execute(select(jobs.c.planned).where(jobs.c.seq == job)).scalar_one()
         page_slots = range(first, min(first + page.size, planned))
         check_samples(rows, page_slots if state is None else [row.slot for row in rows])
-        settled = [row.seq for row in rows if row.state in SETTLED]
+        settled = [row.seq for row in rows if row.state not in _UNSETTLED]  # a damaged state, too
         check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
         return [document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels)) for row in rows]
 

@@ -255,6 +255,7 @@ class _Boundary:
 
     UP, DOWN = 1.1, 0.97  # ratios of neighbours on the ladder: below the anchor rods differ more
     TOLERANCE = 1e-12  # on Lambda, relative
+    LONG = 40.0  # phi from which rods are alike: their fields fall as exp(-(2/3) sigma^1.5), to 1e-30 at the clamp
 
     def __init__(self, poisson: float) -> None:
         self.C = 1.0 / (1.0 + poisson)
@@ -278,6 +279,8 @@ class _Boundary:
         """Gamma on the upper side of the curve, NaN if there is none."""
         if phi < self.onset.phi:
             return np.nan
+        if phi > self.LONG:
+            return self.gamma_at(self.LONG) * (phi / self.LONG) ** 3
         rung = 0
         while self._rung(rung).phi < phi:
             rung += 1
