@@ -108,6 +108,7 @@ class TestStickSlip:
             master_curves.stick_slip_strain(master_curves.stick_slip(strain)), strain, rtol=1e-10
         )
 
+    @pytest.mark.physics
     def test_grows(self) -> None:
         assert (np.diff(master_curves.stick_slip(np.geomspace(1e-6, 0.3302, 40))) > 0).all()
 
