@@ -9,17 +9,22 @@ import stickslip_sim_core
 import yaml
 from pydantic import ValidationError
 from stickslip_schemas.documents.certificate import Certificate
-from stickslip_schemas.kinds import KINDS, job_spec_adapter
+from stickslip_schemas.format.layout import layout
+from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec
-from stickslip_schemas.kinds.rod_hang import ROD_PRESET
+from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
+from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.fabrics import FabricNumbers, Material
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, PresetName
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
+from stickslip_services.queue.plan import Terms, expand, terms_for
 from stickslip_sim_core._sim_core import kernels
 from stickslip_sim_core.cloth.bodies import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_drag
+from stickslip_testing.samples import samples
+from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
 from stickslip_workers.kinds import kind
 
@@ -82,3 +87,29 @@ def test_the_core_takes_every_fabric_that_a_spec_may_have(numbers: dict[str, Any
 def test_every_layer_knows_every_kind(name: str) -> None:
     assert kind(name).batch >= 1
     assert (ROOT / f"workers/blender/src/stickslip_blender/scenes/{name}.py").is_file()
+
+
+class SilkFlySpec(RodHangSpec):
+    """A spec that nobody registered, complete though it is."""
+
+
+class OtherClothSpec(ClothDragSpec):
+    """Another one."""
+
+
+@pytest.mark.parametrize("of", [SilkFlySpec, OtherClothSpec])
+def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[JobSpec]) -> None:
+    rods = {"gamma": 1.0, "phi0": 1.0, "phi1": 1.0}
+    cloth = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
+    name = "cloth_drag" if issubclass(of, ClothDragSpec) else "rod_hang"
+    spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothDragSpec) else rods})
+    with pytest.raises(UnknownKindError, match="kind must be one of"):
+        expand(spec, Terms(BUILDS, None))
+    with pytest.raises(UnknownKindError, match="kind must be one of"):
+        layout(spec)
+    with pytest.raises(UnknownKindError, match="kind must be one of"):
+        next(iter(samples(spec, BUILDS)))
+    with pytest.raises(UnknownKindError, match="kind must be one of"):
+        next(iter(keyed_points(spec, BUILDS)))
+    with pytest.raises(UnknownKindError, match="kind must be one of"):
+        terms_for(None, spec)  # type: ignore[arg-type]  # it is refused before anything is looked up

@@ -1,13 +1,14 @@
 """Which arrays the dataset of a spec has."""
 
+from stickslip_schemas.kinds import registered
 from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
-    """Return the arrays of the dataset of `spec`."""
-    return (*spec.arrays(), *COMMON_ARRAYS)
+    """Return the arrays of the dataset of `spec`; raise UnknownKindError where nobody registered its class."""
+    return (*registered(spec).arrays(), *COMMON_ARRAYS)
 
 
 def samples_per_file(array: ArrayLayout, spec: JobSpec) -> int:

@@ -40,7 +40,14 @@ job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
 
 
 class UnknownKindError(ValueError):
-    """A kind that is not in the table."""
+    """A kind, or a class of one, that is not in the table."""
+
+
+def registered(spec: JobSpec) -> JobSpec:
+    """Return a spec as it is if its class is that of its kind; raise UnknownKindError."""
+    if KINDS.get(spec.kind) is not type(spec):
+        raise UnknownKindError(f"kind must be one of {', '.join(KINDS)}; got {spec.kind!r} of {type(spec).__name__}")
+    return spec
 
 
 def kind_named(name: str) -> type[JobSpec]:

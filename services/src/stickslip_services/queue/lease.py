@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, select, update
-from stickslip_schemas.base.states import Reason, TaskState
+from stickslip_schemas.base.states import JobState, Reason, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,
@@ -211,10 +211,9 @@ def _drop(book: Ledger, held: Sequence[Any], started: set[int]) -> set[int]:
     """
     seqs = [task.seq for task in held]
     needed, running = live_jobs(book.connection, seqs), live_jobs(book.connection, seqs, RUNNABLE)
-    unneeded = [task for task in held if task.seq not in needed]
-    unneeded = [
-        task for task in unneeded if task.seq not in started or book.jobs_of(task.seq)
-    ]  # an open job cancels it
+    left = [task for task in held if task.seq not in needed]
+    cancelling = live_jobs(book.connection, [task.seq for task in left], (JobState.cancelling,))
+    unneeded = [task for task in left if task.seq in cancelling or task.seq not in started]
     halted = [task for task in held if task.seq in needed and task.seq not in started | running.keys()]
     cancel(book, unneeded)
     book.move(halted, TaskState.pending)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import Connection
 from stickslip_schemas.base.keys import Sha256
 from stickslip_schemas.base.states import Stage
+from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import Shard, publish_key, shards
 from stickslip_schemas.spec.jobs import JobSpec
@@ -34,10 +35,11 @@ class Terms:
 def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
     """Return builds and certificate for a job of `spec`, None if no worker has ever registered.
 
-    Raises KindNotAvailableError where no worker makes the kind, and PresetNotCertifiedError where the spec needs a
-    certificate and its preset has none that passed for the workers' build with all protocols that the spec needs.
+    Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is not registered,
+    and PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'
+    build with all protocols that the spec needs.
     """
-    builds = builds_for(connection, spec.kind)
+    builds = builds_for(connection, registered(spec).kind)
     if builds is None:
         return None
     standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)

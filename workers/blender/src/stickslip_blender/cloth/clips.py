@@ -27,12 +27,12 @@ from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.lens import bent
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
 from stickslip_blender.cloth.quality import BAND, HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
-from stickslip_blender.cloth.scene import ClothScene, Points
+from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
-from stickslip_blender.raster import Textures
+from stickslip_blender.raster import Points, Textures
 from stickslip_blender.workshop import Workshop, rejected, why_unfit
 
 if TYPE_CHECKING:
@@ -99,6 +99,7 @@ class ClipRenderer:
     pinhole: Camera
     """Renders what the camera's lens then bends."""
     shots: Sequence[Points]
+    """All vertices at each instant."""
     floor: npt.NDArray[np.float32]
     fabric: Look
     sampling: ClothSampling
@@ -121,7 +122,8 @@ class ClipRenderer:
         sights = []
         for number, (shot, light) in enumerate(zip(self.shots, shading, strict=True)):
             frame = videos[:, number]
-            frame[:] = videos[:, number - 1]
+            if number > 0:
+                frame[:] = videos[:, number - 1]
             sights.append(
                 self.scene.composer.compose(light, shot, camera, self.scene.substrate, self.floor, packed, frame)
             )

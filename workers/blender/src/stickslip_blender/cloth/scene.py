@@ -26,7 +26,7 @@ from stickslip_blender.cycles.objects import (
     set_view,
 )
 from stickslip_blender.cycles.pixels import FrameReader
-from stickslip_blender.raster import Window, projected, window_about
+from stickslip_blender.raster import Points, Window, projected, window_about
 
 _LAMP_DISTANCE = 7.2  # [m]
 _LAMP_POWER = 940.0  # [W]
@@ -35,10 +35,6 @@ _WINDOW_MARGIN = 4  # [px] about the cloth
 _DISCARDED, _RAMP = 2, 4  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
 _MIRROR_PATHS = 2  # times as many paths for the frame then
-
-
-Points = npt.NDArray[np.float64]
-"""All vertices at one instant, shape (V, 3) [m]."""
 
 
 class ClothScene:
