@@ -57,7 +57,7 @@ demo: setup
 
 # Three tiers. Fast: no test over one CPU second, none that starts Ray, Blender, PostgreSQL or a server. The second is what
 # a change must pass, with `check` beside the tests. Slow: the long, the random, and what repeats on another database.
-# Slow tests mostly wait: twice as many run at once, with three times the time, and those with time limits of their own
+# Slow tests mostly wait: twice as many run at once, with four times the time, and those with time limits of their own
 # one after the other.
 # A process of tests that dies ends the run: xdist waits for ever for the tests of one that it starts anew.
 PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup --no-loadscope-reorder --max-worker-restart=0
@@ -75,7 +75,7 @@ test-blender:
 	$(BLENDER_PY) -m pytest --quiet workers/blender
 
 test-slow: setup
-	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=900 -m slow
+	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow
 	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
 check: setup

@@ -110,13 +110,13 @@ class Service:
         """Stop as Ctrl-C does, and expect it to be over in time."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
-            self.process.wait(timeout=60)
+            self.process.wait(timeout=60 * PATIENCE)
 
     def kill(self) -> None:
         """Kill the supervisor without a word."""
         assert self.process is not None
         self.process.kill()
-        self.process.wait(timeout=10)
+        self.process.wait(timeout=10 * PATIENCE)
 
     def child(self, module: str) -> int:
         """Return the pid of the supervisor's child that runs `module`."""
@@ -143,7 +143,7 @@ class Service:
 
     def get(self, path: str) -> Any:
         """Return the JSON of a GET."""
-        response = httpx.get(self.url + path, timeout=30)
+        response = httpx.get(self.url + path, timeout=60)
         response.raise_for_status()
         return response.json()
 

@@ -270,7 +270,7 @@ def kill_some(service: Service, victim: str) -> None:
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "3"))
 
 
-@pytest.mark.timeout(300 + 60 * KILLS)
+@pytest.mark.timeout(900 + 120 * KILLS)
 def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
     count, seed = KILLS, int(os.environ.get("STICKSLIP_SEED", "0"))
     random.seed(seed)
@@ -338,7 +338,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
                 node.stop()
 
 
-@pytest.mark.timeout(600 + 90 * KILLS)
+@pytest.mark.timeout(1200 + 180 * KILLS)
 def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
     nodes: tuple[Service, Service], capsys: pytest.CaptureFixture[str]
 ) -> None:

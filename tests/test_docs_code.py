@@ -76,7 +76,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(tmp_path, ignore_errors=True)
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize(
     "page",
     [
@@ -108,7 +108,7 @@ def test_every_block_runs(
                 assert any(line.startswith(start) for line in printed.getvalue().splitlines()), (where, promised)
         elif block.language == "sh":
             script = f"set -euo pipefail; source {state}; set -a\n{block.code}\nexport -p > {state}\n"
-            done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=500)
+            done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
             assert done.returncode == 0, f"{where}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
         elif block.language == "yaml":
             document = yaml.safe_load(block.code)

@@ -25,7 +25,7 @@ from machines import BUCKET, URL, Lab, Machine, dispatch
 
 CHART = Path(__file__).parents[1] / "deploy" / "helm" / "stickslip"
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200), pytest.mark.xdist_group("network")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(2400), pytest.mark.xdist_group("network")]
 
 
 def test_work_goes_on_whatever_happens_to_machines(

@@ -188,7 +188,7 @@ def test_a_revoked_key_opens_nothing_within_two_seconds(closed: FastAPI, strange
     with database.write() as connection:
         key, secret = create_key(connection, "leaver", [Scope.read], time.time())
     headers = {"Authorization": f"Bearer {secret}"}
-    wait_until(lambda: stranger.get("/v1/jobs", headers=headers).status_code == 200, seconds=3)
+    wait_until(lambda: stranger.get("/v1/jobs", headers=headers).status_code == 200)
     with database.write() as connection:
         revoke_key(connection, key, time.time())
     wait_until(lambda: stranger.get("/v1/jobs", headers=headers).status_code == 401, seconds=2)
@@ -206,7 +206,7 @@ def test_on_loopback_a_key_for_something_else_does_not_make_a_worker(app: FastAP
         secret = create_key(connection, "reader", [Scope.read], time.time())[1]
     headers = {"Authorization": f"Bearer {secret}"}
     for path in WORKER_PATHS:
-        wait_until(lambda path=path: client.post(path, headers=headers).status_code == 403, seconds=3)  # type: ignore[misc]
+        wait_until(lambda path=path: client.post(path, headers=headers).status_code == 403)  # type: ignore[misc]
         assert client.post(path, headers=headers).json()["code"] == "scope_missing"
     assert client.get("/v1/jobs", headers={"Authorization": "Bearer wrong"}).status_code == 401
 

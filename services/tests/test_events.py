@@ -178,4 +178,4 @@ def test_an_address_has_only_so_many_streams_and_so_have_all(
         with client.stream("GET", path) as again:
             return again.status_code == 200
 
-    wait_until(is_free, seconds=5)
+    wait_until(is_free)

@@ -155,7 +155,7 @@ def test_requests_of_a_worker_may_go_to_any_coordinator(pair: Pair) -> None:
     api = HttpApi(pair.servers[0].url, "", post)
     worker = PretendWorker(api, DirectoryStore(pair.settings.store_place), name="w").register()
     job = pair.submit(0, gamma=[11.0, 12.0])
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while pair.client.get(f"{pair.servers[1].url}/v1/jobs/{job}").json()["finished_at"] is None:
         assert time.monotonic() < deadline
         leases = worker.lease(simulate=3, render=3, pack=1, publish=1)
@@ -168,7 +168,7 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
     job = pair.submit(0, gamma=[21.0, 22.0])
     heard: list[tuple[str, float]] = []
     with (
-        httpx.Client(base_url=other, timeout=20) as client,
+        httpx.Client(base_url=other, timeout=60) as client,
         connect_sse(client, "GET", f"/v1/jobs/{job}/events") as source,
     ):
         for event in source.iter_sse():
@@ -363,7 +363,7 @@ def test_what_was_rolled_back_is_not_announced(settings: Settings) -> None:
 
 
 async def _until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 100
     while not condition():
         assert time.monotonic() < deadline, "it did not come to pass"
         await asyncio.sleep(0.02)

@@ -25,7 +25,7 @@ EXAMPLES = 3
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(1200)
 def test_every_check_of_schemathesis_passes(tmp_path: Path) -> None:
     app = make_app(Settings(data=tmp_path, durable=False))
     command = Path(sys.executable).with_name("schemathesis")
@@ -60,7 +60,6 @@ def test_every_check_of_schemathesis_passes(tmp_path: Path) -> None:
                 cwd=ROOT,
                 capture_output=True,
                 text=True,
-                timeout=230,
             )
         finally:
             stop.set()

@@ -51,7 +51,7 @@ def fill(disk: Path, *, but: int = 0) -> Path:
 
 
 def job_of(server: RunningServer, job: str) -> dict[str, object]:
-    answer = httpx.get(f"{server.url}/v1/jobs/{job}", timeout=5, trust_env=False)
+    answer = httpx.get(f"{server.url}/v1/jobs/{job}", timeout=30, trust_env=False)
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 

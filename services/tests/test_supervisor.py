@@ -67,14 +67,14 @@ class Up:
     def stop(self, number: int = signal.SIGTERM) -> str:
         if self.process.poll() is None:
             self.process.send_signal(number)
-        return self.process.communicate(timeout=20)[0]
+        return self.process.communicate(timeout=100)[0]
 
 
 @pytest.fixture(scope="module")
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     """One for the tests that follow each other: the last kills it."""
     running = Up(tmp_path_factory.mktemp("up"))
-    wait_until(lambda: bool(running.dispatchers() and running.started("head")) and running.answers(), seconds=60)
+    wait_until(lambda: bool(running.dispatchers() and running.started("head")) and running.answers(), seconds=250)
     yield running
     running.stop()
 
@@ -95,7 +95,7 @@ def test_up_starts_all_once(up: Up) -> None:
     assert (up.data / "logs" / "coordinator.log").exists()
     for data, at, message in (("data", "0", "in use by another"), ("other", port, "cannot listen on")):
         second = Up(up.data.parent, data=data, port=at)
-        assert message in second.process.communicate(timeout=30)[0]
+        assert message in second.process.communicate(timeout=150)[0]
         assert second.process.returncode == 1
 
 
@@ -104,7 +104,7 @@ def test_children_that_are_killed_come_back(up: Up) -> None:
     os.kill(first, signal.SIGKILL)
     os.kill(up.dispatchers()[-1], signal.SIGKILL)
     wait_until(
-        lambda: up.coordinator() not in (0, first) and up.answers() and len(up.dispatchers()) > before, seconds=60
+        lambda: up.coordinator() not in (0, first) and up.answers() and len(up.dispatchers()) > before, seconds=250
     )
     assert up.url == url
 
@@ -118,7 +118,7 @@ def test_children_do_not_outlive_the_supervisor(up: Up) -> None:
     up.process.kill()
     wait_until(lambda: not any(is_running(pid) for pid in ours))
     again = Up(up.data.parent)
-    wait_until(lambda: again.answers() and len(again.dispatchers()) > before, seconds=60)
+    wait_until(lambda: again.answers() and len(again.dispatchers()) > before, seconds=250)
     ours = pids()
     output = again.stop(signal.SIGINT)
     assert again.process.returncode == 0, output
@@ -128,7 +128,7 @@ def test_children_do_not_outlive_the_supervisor(up: Up) -> None:
 
 def test_a_child_that_keeps_dying_ends_the_whole(tmp_path: Path) -> None:
     failing = Up(tmp_path, stub="import sys; sys.exit('no blender here')")
-    output = failing.process.communicate(timeout=60)[0]
+    output = failing.process.communicate(timeout=300)[0]
     assert failing.process.returncode == 1
     assert "no blender here" in output
     assert "exited with status 1" in output
@@ -141,7 +141,7 @@ def test_only_the_coordinator_is_told_the_database(
     monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.clean())
     up = Up(tmp_path)
     try:
-        wait_until(lambda: bool(up.dispatchers()) and up.answers(), seconds=60)
+        wait_until(lambda: bool(up.dispatchers()) and up.answers(), seconds=250)
         coordinator, dispatcher = (Path(f"/proc/{pid}") for pid in (up.coordinator(), *up.dispatchers()))
         assert b"STICKSLIP_DATABASE" in (coordinator / "environ").read_bytes()
         assert b"postgresql" not in (coordinator / "cmdline").read_bytes()

@@ -234,7 +234,7 @@ def test_a_copy_of_the_database_has_no_secret(
     assert (context.settings.data / "secrets-key").stat().st_mode & 0o777 == 0o600
     run_job(context, worker, 1.0)
     WebhookDelivery(context.database, context.clock, Fernet(Fernet.generate_key())).run()
-    wait_until(lambda: "sealed with another secrets key" in fault_of(context, name), seconds=5)
+    wait_until(lambda: "sealed with another secrets key" in fault_of(context, name))
     assert receiver.told == []
     clock.advance(WAITS[0])
     messenger.run()

@@ -28,7 +28,7 @@ T = TypeVar("T")
 NAME = f"end-to-end-{os.getpid()}"
 
 
-def _wait_for(what: str, probe: Callable[[], T | None], timeout: float = 120) -> T:
+def _wait_for(what: str, probe: Callable[[], T | None], timeout: float = 600) -> T:
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         if (answer := probe()) is not None:
@@ -99,7 +99,7 @@ class Services:
         for process in reversed(self._processes):
             process.terminate()
         for process in self._processes:
-            process.wait(timeout=30)
+            process.wait(timeout=150)
 
 
 @pytest.fixture
@@ -141,5 +141,5 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
     assert (group["views"][...].reshape(24, -1).max(axis=1) > 0).all()
 
     second.send_signal(signal.SIGTERM)
-    assert second.wait(timeout=30) == 0
+    assert second.wait(timeout=150) == 0
     _wait_for("the end of Ray's processes", lambda: True if not _processes() else None, 10)

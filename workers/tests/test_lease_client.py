@@ -43,7 +43,7 @@ class SlowCoordinator:
 
     def heartbeat(self, _: Heartbeat) -> HeartbeatAnswer:
         self.asked.set()
-        assert self.may_answer.wait(timeout=4)
+        assert self.may_answer.wait(timeout=60)
         return HeartbeatAnswer(drop=())
 
     def close(self) -> None:
@@ -55,7 +55,7 @@ def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
     registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
     session = Session(cast(Any, coordinator), lambda: registration)
     session.start()
-    assert coordinator.asked.wait(timeout=10)
+    assert coordinator.asked.wait(timeout=60)
     assert session.worker_id == "worker-1"
     threading.Timer(0.2, coordinator.may_answer.set).start()
     session.close()
@@ -70,7 +70,7 @@ def test_what_the_coordinator_refuses_ends_the_session() -> None:
     registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
     session = Session(cast(Any, Refusing()), lambda: registration)
     session.start()
-    session.join(timeout=10)
+    session.join(timeout=60)
     with pytest.raises(CoordinatorError, match="wrong key"):
         _ = session.worker_id
 

@@ -127,7 +127,7 @@ def postgresql_server(programs: Path) -> Iterator[PostgresqlServer]:
 
 
 def _wait_until_ready(server: PostgresqlServer, process: "subprocess.Popen[bytes]", log: Path) -> None:
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while True:
         try:
             server.execute("SELECT 1")

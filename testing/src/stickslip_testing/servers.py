@@ -63,7 +63,7 @@ class ServerProcess(RunningServer):
     def stop(self) -> None:
         """Stop the process."""
         self.process.terminate()
-        self.process.wait(20)
+        self.process.wait(100)
         if self.process.stdout is not None:
             self.process.stdout.close()
 
@@ -138,7 +138,7 @@ def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> Serv
     return ServerProcess(words[-1], data, process)
 
 
-def wait_until(condition: Callable[[], bool], *, seconds: float = 20.0) -> None:
+def wait_until(condition: Callable[[], bool], *, seconds: float = 100.0) -> None:
     """Return when `condition` holds; fail after `seconds`."""
     deadline = time.monotonic() + seconds
     while not condition():
