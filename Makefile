@@ -5,6 +5,8 @@ PYTHON ?= python3.11
 PY = .venv/bin/python
 BLENDER_PY = .venv-blender/bin/python
 PIP_FLAGS = --quiet --disable-pip-version-check
+# Python keeps what it compiled, also where the environment says otherwise: tests would be compiled by every process.
+export PYTHONDONTWRITEBYTECODE =
 
 SOURCES = $(addsuffix /src,schemas services testing training workers workers/blender) sim_core/python examples benchmarks tools
 # Modules of tests are named from here on: different components have some of the same name. The other tests are not typed.
