@@ -30,10 +30,12 @@ setup: .venv/core.stamp .venv-blender/raster.stamp
 	@tools/check_system.sh $(PYTHON)
 	@echo "setting up .venv (a few minutes the first time)"
 	@test -x $(PY) || $(PYTHON) -m venv .venv
+	@$(PY) -m pip install $(PIP_FLAGS) nanobind cmeel-eigen --constraint constraints.txt
 	@$(PY) -m pip install $(PIP_FLAGS) --requirement requirements.txt --constraint constraints.txt
 	@touch $@ .venv/core.stamp
 
-# The editable install builds the C++ core once: a changed source builds it again.
+# The editable install builds the C++ core once: a changed source builds it again. nanobind and Eigen stand in .venv before:
+# a wheel finds them at the same places, and reuses what has been compiled.
 .venv/core.stamp: $(CORE_SOURCES) | .venv/setup.stamp
 	@if [ -n "$$(find $(CORE_SOURCES) -newer $@ 2>&1)" ]; then \
 	  echo "building sim_core"; \

@@ -19,7 +19,7 @@ for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write i
 os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: the other tests would starve those that use Ray
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of NumPy and torch wait by spinning, which the other tests pay
 
-SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql"}
+SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "s3": "s3"}
 """Fixtures that start a server, and the group of the tests that share it. These tests are marked `real`."""
 
 CPU_SECONDS = pytest.StashKey[float]()

@@ -257,6 +257,7 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
     return data[:position] + bytes([data[position] ^ 1 << rng.randrange(8)]) + data[position + 1 :]
 
 
+@pytest.mark.physics
 def test_no_flipped_bit_of_the_sealed_files_is_silent(origin: tuple[str, str], tmp_path: Path) -> None:
     with Client(origin[0]) as client:
         pull(client, origin[1], 1, tmp_path)
@@ -285,6 +286,7 @@ def test_no_flipped_bit_arrives_in_silence(origin: tuple[str, str], tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.physics
 def test_swapped_shards_are_found(origin: tuple[str, str], tmp_path: Path) -> None:
     with Client(origin[0]) as client:
         pull(client, origin[1], 1, tmp_path)

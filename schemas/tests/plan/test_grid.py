@@ -81,7 +81,7 @@ def test_splits_are_about_what_is_expected() -> None:
         assert abs(real - expected) < 5 * (expected * (1 - expected / 10_000)) ** 0.5
 
 
-@pytest.mark.parametrize("combine", ["product", "zip"])
+@pytest.mark.parametrize("combine", ["product", pytest.param("zip", marks=pytest.mark.physics)])
 def test_a_million_samples_are_counted(combine: str) -> None:
     size = 100 if combine == "product" else 1_000_000
     axis = {"type": "linspace", "start": 1, "stop": 9, "num": size}

@@ -89,7 +89,7 @@ def bucket(proxy: "Proxy", name: str, monkeypatch: pytest.MonkeyPatch) -> Place:
 _numbers = itertools.count()
 
 
-@pytest.fixture(params=["directory", "bucket"])
+@pytest.fixture(params=["directory", pytest.param("bucket", marks=pytest.mark.real)])
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
     """An empty store of each sort."""
     if request.param == "directory":

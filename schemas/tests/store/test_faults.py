@@ -17,6 +17,8 @@ import obstore.exceptions
 from stickslip_schemas.store.bucket import BucketStore
 from stickslip_testing.s3 import Proxy, make_bucket, no_fault, s3_proxy, variables
 
+pytestmark = pytest.mark.real
+
 SMALL = np.random.default_rng(1).bytes(100_000)
 LARGE = np.random.default_rng(2).bytes(3_000_000)
 FAULTS = ("503", "409", "500", "late", "torn upload", "torn download", "lost answer")

@@ -135,11 +135,13 @@ class TestBodies:
         assert carried == pytest.approx(cloth.masses.sum() * GRAVITY, rel=0.05)
         assert (cloth.contacts == 1).any()
 
+    @pytest.mark.physics
     def test_box_carries(self) -> None:
         cloth = self.fall([plane(0.5), box(0.5, (0.06, 0.06, 0.1))])
         assert cloth.positions[:, 2].max() == pytest.approx(0.05, abs=2e-3)
         assert (cloth.contacts == 1).any()
 
+    @pytest.mark.physics
     def test_turned_box_is_the_same_box(self) -> None:
         """Half a turn about x maps a box onto itself."""
         first = self.fall([box(0.5, (0.06, 0.06, 0.1))], 20)

@@ -25,6 +25,7 @@ def varying(n: int) -> Floats:
     return natural
 
 
+@pytest.mark.physics
 def test_uniform_rods(thesis_rods: Floats, solved: RodSolution) -> None:
     gamma, phi0, phi1 = thesis_rods.T
     expected = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None]

@@ -17,6 +17,8 @@ pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[ser
 import obstore.store
 from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 
+pytestmark = pytest.mark.real
+
 
 @pytest.fixture(scope="module")
 def server():

@@ -37,6 +37,7 @@ def equal(first, second):
     return all(torch.equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.physics
 def test_it_learns_and_keeps_the_best_weights():
     fitted = fit(Line(), replace(SETTINGS, steps=400, averaging=0.0))
     losses = [report.validation_loss for report in fitted.history]
