@@ -18,7 +18,7 @@ if os.environ["SLOW"] == "all" or "agent" in line:
 """
 
 # One after the other, and after those of test_chaos.py: each waits for minutes, alone.
-pytestmark = [pytest.mark.slow, pytest.mark.real, pytest.mark.timeout(2400), pytest.mark.xdist_group("chaos")]
+pytestmark = [pytest.mark.slow, pytest.mark.real, pytest.mark.timeout(1500), pytest.mark.xdist_group("chaos")]
 
 
 @pytest.mark.parametrize("what", ["agents", "all"])

@@ -67,22 +67,8 @@ def test_few_test_rods_are_told(trained):
     assert trained[1]["notes"][0].startswith(f"There are only {trained[1]['rods']['test']} test rods")
 
 
-@pytest.mark.slow
 @pytest.mark.physics
-def test_the_same_config_gives_the_same_weights_and_another_seed_others(config, tmp_path):
-    first = train_curvature(config)
-    again = replace(config, out=tmp_path / "again")
-    second = train_curvature(again)
-    other = replace(config, out=tmp_path / "other", seed=1)
-    train_curvature(other)
-    assert [epoch["train_loss"] for epoch in first["history"]] == [epoch["train_loss"] for epoch in second["history"]]
-    for name, tensor in weights(config).items():
-        assert torch.equal(tensor, weights(again)[name])
-    assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
-
-
-@pytest.mark.physics
-def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path):
+def test_a_run_of_the_same_config_and_seed_gives_the_same_weights_also_where_it_was_resumed(config, tmp_path):
     straight = train_curvature(config)
     stopped = replace(config, out=tmp_path / "stopped", steps=4)
     assert train_curvature(stopped)["steps"] == 4  # within the second epoch
@@ -92,6 +78,9 @@ def test_a_run_that_is_resumed_goes_on_as_if_it_had_not_stopped(config, tmp_path
     ]
     for name, tensor in weights(config).items():
         assert torch.equal(tensor, weights(stopped)[name])
+    other = replace(config, out=tmp_path / "other", seed=1)
+    assert train_curvature(other)["history"][0]["train_loss"] != straight["history"][0]["train_loss"]
+    assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
     with pytest.raises(ValueError, match=r"noise must be that of the run that is resumed, 0\.005, and is 0\.1"):
         train_curvature(replace(stopped, noise=0.1), resume=True)
     with pytest.raises(ValueError, match="there is nothing to resume"):
@@ -136,10 +125,12 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
 
 
 @pytest.mark.physics
-def test_evaluation_of_a_part_is_told(config):
-    report = train_curvature(replace(config, steps=3, evaluation_rods=3))
+def test_evaluation_of_a_part_is_told_and_the_number_of_threads_put_back(config):
+    before = torch.get_num_threads()
+    report = train_curvature(replace(config, steps=3, evaluation_rods=3, threads=before + 1))
     assert report["rods"]["test"] == 3
     assert report["notes"][0].startswith("Evaluated on 3 of ")
+    assert torch.get_num_threads() == before
 
 
 def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
@@ -165,10 +156,3 @@ def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
 def test_a_config_is_checked_where_it_is_built(config, changes, message):
     with pytest.raises(ValueError, match=message):
         replace(config, **changes)
-
-
-@pytest.mark.physics
-def test_the_number_of_threads_is_put_back(config):
-    before = torch.get_num_threads()
-    train_curvature(replace(config, steps=3))
-    assert torch.get_num_threads() == before
