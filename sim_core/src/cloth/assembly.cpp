@@ -64,9 +64,8 @@ void Assembly::reserve_folds() {
 void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   std::fill(gradient.begin(), gradient.end(), 0.0);
   if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
-  const MembranePart part = definite ? MembranePart::tension : MembranePart::exact;
   membrane_energy =
-      kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, part);
+      kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, definite);
   bending_energy =
       kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(), with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();
@@ -103,7 +102,7 @@ Eigen::Matrix3d Assembly::own_block(int node) const {
 
 ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbers) {
   numbers.blocks.assign(blocks_.size(), 0.0f);
-  kernel.membrane(membrane_.data(), x.data(), unused_.data(), numbers.blocks.data(), MembranePart::definite);
+  kernel.membrane(membrane_.data(), x.data(), unused_.data(), numbers.blocks.data(), true);
   numbers.scalars.assign(numbering.compact_bending.node.size(), 0.0f);
   kernel.bending_matrix(compact_bending_.data(), stiffening_.data(), numbers.scalars.data());
   ClothMatrix out = matrix;

@@ -38,7 +38,7 @@ class Assembly {
   Buffer<double> gradient;                             // (nodes, 4), N
   double membrane_energy = 0.0, bending_energy = 0.0;  // J
   ClothMatrix matrix{};
-  // Whether the matrix has the positive part of the stress only, as that of a convex energy does.
+  // Whether the matrix has the positive part of the stress and of the law only, as that of a convex energy does.
   bool definite = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);

@@ -41,7 +41,7 @@ struct NewtonSettings {
   int hops = 1;
   // Decrease of the squares of forces that is slow for the matrix of a convex energy: Newton's method with the exact
   // one, which halves forces at least, takes its place. Sweep: 0.125 and 0.5 take 20 and 11 % more in a crumple.
-  double slow = 0.25;
+  double slow = 0.5;
   // Decrease of the squares of forces, a hundredth of the forces, from which an attempt goes on beyond its iterations.
   // Sweep: within 4 %.
   double nearly = 1e-4;

@@ -25,10 +25,6 @@ constexpr long tile_floats(long width, long below) {
 // Krylov vectors that one linear solve may use.
 constexpr int krylov_max = 40;
 
-// Which part of the membrane's matrix is taken: all of it, that with the stress's positive part, or that with the law's
-// positive part, too, which is positive semi-definite.
-enum class MembranePart { exact, tension, definite };
-
 // The table of [Wang et al. 2011] ends at this stretch less one.
 constexpr double table_stretch = 1.0 / 6.0;
 
@@ -143,7 +139,7 @@ struct Factor {
 struct ClothKernel {
   const char* name;
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
-  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, MembranePart part);
+  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, bool definite);
   void (*membrane_lag)(const MembraneData&, const double* x, double share, double* lag);
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);

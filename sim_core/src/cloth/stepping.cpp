@@ -185,7 +185,7 @@ bool Stepper::attempt(double dt, const Drive& drive, StepReport& report) {
   tried_dt_ = dt;
   predicted_ = x;
   if (sweeps(bodies_before_, drive.bodies, dt)) return false;
-  assembly_.definite = false;
+  assembly_.definite = near();
   const StepProblem problem{dt, drive.damping, start_, inertial_, v, bodies_before_, drive.bodies};
   newton.predict(problem, x, predicted_, false);
   newton.strained_max = constants_.strained_soon;

@@ -87,10 +87,10 @@ void membrane_lag(const MembraneData& data, const double* x, double share, doubl
   }
 }
 
-// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative, of which
-// `part` may leave out what is not positive: of the stress, or of the stress and the law [Teran et al. 2005].
+// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative; where
+// it is to be `definite`, of the stress and of the law the positive part alone [Teran et al. 2005].
 template <bool matrix>
-double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, MembranePart part) {
+double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, bool definite) {
   constexpr int W = membrane_lanes;
   Lane energy{};
   for (int group = 0; group < data.groups; ++group) {
@@ -118,7 +118,7 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
     if constexpr (matrix) {
       const Lane zero{};
       Lane t00 = area * s00, t11 = area * s11, t01 = area * s01;
-      if (part != MembranePart::exact) {
+      if (definite) {
         const Lane mean = 0.5 * (s00 + s11), half = 0.5 * (s00 - s11);
         const Lane radius = root(half * half + s01 * s01) + 1e-30;
         const Lane big = mean + radius, small = mean - radius;
@@ -127,8 +127,8 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
         t00 = area * (middle + spread_ratio * half);
         t11 = area * (middle - spread_ratio * half);
         t01 = area * spread_ratio * s01;
+        make_definite(law);
       }
-      if (part == MembranePart::definite) make_definite(law);
       // Of (s00, s11, s01) by (G00, G11, 2 G01).
       const Lane quarter = 0.25 * area;
       const Lane c00 = quarter * (law.aa + 2.0 * law.ah + law.hh), c11 = quarter * (law.aa - 2.0 * law.ah + law.hh);
@@ -164,9 +164,9 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
   return total;
 }
 
-double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, MembranePart part) {
-  return blocks ? membrane_groups<true>(data, x, gradient, blocks, part)
-                : membrane_groups<false>(data, x, gradient, nullptr, part);
+double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, bool definite) {
+  return blocks ? membrane_groups<true>(data, x, gradient, blocks, definite)
+                : membrane_groups<false>(data, x, gradient, nullptr, definite);
 }
 
 }  // namespace
