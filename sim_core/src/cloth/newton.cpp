@@ -121,10 +121,11 @@ Norms Newton::move(const StepProblem& problem, const Buffer<double>& x, double s
   return look(problem, trial_, share);
 }
 
-// Of the convex matrix and the exact one, takes the exact one while the convex one converges slowly, until forces grow.
-void Newton::choose_matrix(const Buffer<double>& x, double before, double now, bool whole) {
-  const bool grew = now > before;
-  if (assembly_.definite ? grew || !whole || !(now > constants_.slow * before) : !grew) return;
+// Of the convex matrix and the exact one, takes the exact one near the solution, or where the convex one converges
+// slowly, until forces grow.
+void Newton::choose_matrix(const Buffer<double>& x, double before, double now, bool whole, bool close) {
+  const bool grew = now > before, exact = close || now > constants_.slow * before;
+  if (assembly_.definite ? grew || !whole || !exact : !grew) return;
   assembly_.definite = !assembly_.definite;
   assembly_.evaluate(x, true);
 }
@@ -165,7 +166,7 @@ StepOutcome Newton::solve(const StepProblem& problem, Buffer<double>& x, bool fr
     std::swap(x, trial_);
     last_share = share;
     const double before = std::exchange(norms, next).squared;
-    if (convex) choose_matrix(x, before, norms.squared, share == 1.0);
+    if (convex) choose_matrix(x, before, norms.squared, share == 1.0, norms.squared <= constants_.nearly * first);
     if (iteration == 0 && resumed) std::fill(window.begin(), window.end(), norms.squared);
     window[iteration % window.size()] = norms.squared;
     if (pairs && pairs->smoothing > 0.0 && sharpen(problem, x, share, norms)) {

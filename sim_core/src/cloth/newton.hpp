@@ -49,7 +49,7 @@ class Newton {
   Norms look(const StepProblem& problem, const Buffer<double>& x, double share = 0.0);
   void begin(const StepProblem& problem, Buffer<double>& x, bool from_rest, bool smoothly);
   Norms move(const StepProblem& problem, const Buffer<double>& x, double share, bool smoothly);
-  void choose_matrix(const Buffer<double>& x, double before, double now, bool whole);
+  void choose_matrix(const Buffer<double>& x, double before, double now, bool whole, bool close);
   bool arrived(const Buffer<double>& x) const;
   double reach() const;
   bool sharpen(const StepProblem& problem, const Buffer<double>& x, double share, Norms& norms);
