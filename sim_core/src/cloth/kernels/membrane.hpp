@@ -87,8 +87,8 @@ void membrane_lag(const MembraneData& data, const double* x, double share, doubl
   }
 }
 
-// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative; where
-// it is to be `definite`, of the stress and of the law the positive part alone [Teran et al. 2005].
+// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative; a
+// `definite` one has only the positive part of the stress and of the law [Teran et al. 2005].
 template <bool matrix>
 double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, bool definite) {
   constexpr int W = membrane_lanes;
