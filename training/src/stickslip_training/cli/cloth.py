@@ -29,7 +29,9 @@ def train(
     validation: Annotated[
         str | None, typer.Option(help="a packed file of simulations to validate; a dataset has a split for it")
     ] = None,
-    steps: Annotated[int, typer.Option(help="of training, with 16 clips each")] = 1500,
+    steps: Annotated[int, typer.Option(help="of training")] = 1500,
+    batch: Annotated[int, typer.Option(help="clips of a step; 256 keep a GPU busy")] = 16,
+    width: Annotated[int, typer.Option(help="of the network, a multiple of 48")] = 96,
     seed: Annotated[int, typer.Option(help="of the weights and of all that is drawn")] = 0,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
@@ -51,7 +53,9 @@ def train(
 
     console = Console()
     with readable_errors():
-        settings = ClothTraining(steps=steps, learning_rate=rate, seed=seed, threads=threads, device=device)
+        settings = ClothTraining(
+            steps=steps, batch_size=batch, width=width, learning_rate=rate, seed=seed, threads=threads, device=device
+        )
         first = None if start is None else load_friction(start)
         if first is not None:
             # The network knows the order of mu: its targets are as narrow as at the end.

@@ -93,7 +93,7 @@ class Clips(Truth):
 class RenderedClips:
     """Clips of another renderer, over dark floors, to train on besides the pictures that are rendered while training.
 
-    Half of each batch is then of `train`, with worlds drawn about their cloth; `validation` chooses the weights and the
+    They are a share of each batch, with worlds drawn about their cloth; `validation` chooses the weights and the
     temperature.
     """
 
@@ -141,28 +141,29 @@ def render_clips(
     spread: float = 0.0,
     wanted: tuple[int, ...] = INSTANTS,
     drawn_world: bool = False,
+    device: str = "cpu",
 ) -> Clips:
     """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
 
     `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world` each picture has a
-    world of its own, and a dark floor without.
+    world of its own, and a dark floor without. `device` renders.
     """
     frames, instants = frames_at(runs.instants, wanted)
-    rig = training_cameras()
     number = np.repeat(np.arange(len(runs)), renders)
     crops, covers, directions = [], [], []
-    for start in range(0, len(number), CHUNK):
-        chosen = number[start : start + CHUNK]
-        generator = torch.Generator().manual_seed(seed_of_step(seed, VALIDATION, start))
-        views = [rig[(start + place) % len(rig)] for place in range(len(chosen))]
-        seen = randomly_turned(Cameras.of(views), spread, generator)
-        looks = draw_style(len(chosen), len(frames), generator)
-        meshes = torch.from_numpy(runs.positions[chosen][:, frames])
-        world = draw_world(len(chosen), generator) if drawn_world else None
-        picture, cover = render_crops(meshes, seen, instants, looks, generator, world)
-        crops.append(picture)
-        covers.append(cover)
-        directions.append(seen.rotation[:, 2])
+    with torch.device(device):
+        rig = Cameras.of(training_cameras())
+        for start in range(0, len(number), CHUNK):
+            chosen = number[start : start + CHUNK]
+            generator = torch.Generator(device).manual_seed(seed_of_step(seed, VALIDATION, start))
+            seen = randomly_turned(rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator)
+            looks = draw_style(len(chosen), len(frames), generator)
+            meshes = torch.from_numpy(runs.positions[chosen][:, frames]).to(device)
+            world = draw_world(len(chosen), generator) if drawn_world else None
+            picture, cover = render_crops(meshes, seen, instants, looks, generator, world)
+            crops.append(picture.cpu())
+            covers.append(cover.cpu())
+            directions.append(seen.rotation[:, 2].cpu())
     shown = runs[number]
     return Clips(
         crops=torch.cat(crops),

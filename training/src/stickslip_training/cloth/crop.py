@@ -53,7 +53,7 @@ class Cameras:
             torch.tensor([(camera.cx, camera.cy) for camera in cameras], dtype=torch.float32),
         )
 
-    def __getitem__(self, chosen: slice) -> "Cameras":
+    def __getitem__(self, chosen: slice | torch.Tensor) -> "Cameras":
         return Cameras(self.rotation[chosen], self.translation[chosen], self.focal[chosen], self.center[chosen])
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

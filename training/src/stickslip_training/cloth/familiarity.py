@@ -110,14 +110,14 @@ class Familiarity:
     """(validation clips,): ascending."""
 
     @staticmethod
-    def of(train: Runs, instants: tuple[int, ...], seed: int, good: SingleFloats) -> "Familiarity":
+    def of(train: Runs, instants: tuple[int, ...], seed: int, good: SingleFloats, device: str = "cpu") -> "Familiarity":
         """Render the known clips from runs; `good` are silhouettes that a network sees in good validation clips."""
         frames, _ = frames_at(train.instants, instants)
         runs = replace(train, positions=train.positions[:, frames], instants=instants)
         held = holders_at(instants)
         sorts = [runs, *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER)]
         shown = [
-            render_clips(some, 4 if place == 0 else 1, seed + place, wanted=instants, drawn_world=True).cover
+            render_clips(some, 1 if place else 4, seed + place, wanted=instants, drawn_world=True, device=device).cover
             for place, some in enumerate(sorts)
         ]
         pixels = pooled(torch.cat(shown)).flatten(1).numpy()

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,8 @@ class ClothTraining(FitSettings):
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
+    clip_share: float = 0.25
+    """Of a batch, where there are clips of another renderer. With 0.5 a long training learns 512 of them by heart."""
     worlds: bool = True
     """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
     instants: tuple[int, ...] = INSTANTS
@@ -84,8 +87,11 @@ class ClothTraining(FitSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self, "batch_size", "learning_rate", "repeats", "width")
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout must be from 0 to less than 1, and is {self.dropout}")
+        if self.width % 48:
+            raise ValueError(f"width must be a multiple of 48, and is {self.width}")
+        for name in ("dropout", "clip_share"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must be from 0 to less than 1, and is {getattr(self, name)}")
         if not all(0 < deviation < math.inf for deviation in self.smoothing):
             raise ValueError(f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}")
         for name in ("gap", "turn"):
@@ -145,19 +151,19 @@ class FrictionLearner(Learner):
         self.frames, self.instants = frames_at(train.instants, settings.instants)
         self.train = train
         self.judged = validation
-        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames]))
+        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames])).to(settings.device)
         self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
-        self.rig = training_cameras()
+        with torch.device(settings.device):
+            self.rig = Cameras.of(training_cameras())
         self.clips = clips
-        drawn: dict[str, Any] = {"wanted": settings.instants, "drawn_world": settings.worlds}
+        wanted, worlds = settings.instants, settings.worlds
+        self.render = partial(render_clips, wanted=wanted, drawn_world=worlds, device=settings.device)
         self.validation = (
-            render_clips(validation, 6, settings.seed, spread=settings.turn, **drawn)
-            if clips is None
-            else clips.validation
+            self.render(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
         )
-        self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32))
+        self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32)).to(settings.device)
         with seeded(settings.seed):
             sizes = {"materials": len(train.materials), "bins": MU_BINS.count, "frames": len(self.frames)}
             self.net = PosteriorNet(**sizes, width=settings.width, dropout=settings.dropout)
@@ -185,15 +191,11 @@ class FrictionLearner(Learner):
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
         target = _blurred(self.centers, mu, deviation)
-        device = self.settings.device
-        silhouettes = silhouettes.to(device)
-        seen = net.features(crops.to(device), direction.to(device), silhouettes if self.settled else None)
-        log_material, log_mu = net.read(seen)
-        rows = torch.arange(len(mu), device=device)
-        given = log_mu[rows, material.to(device)]
-        loss = -(log_material[rows, material.to(device)] + (target.to(device) * given).sum(dim=1)).mean()
+        log_material, log_mu = net.read(net.features(crops, direction, silhouettes if self.settled else None))
+        rows = torch.arange(len(mu), device=mu.device)
+        loss = -(log_material[rows, material] + (target * log_mu[rows, material]).sum(dim=1)).mean()
         if not self.settled:
-            found = net.silhouettes(crops[::SILHOUETTES].to(device))
+            found = net.silhouettes(crops[::SILHOUETTES])
             loss = loss + functional.binary_cross_entropy_with_logits(found, silhouettes[::SILHOUETTES])
         return torch.as_tensor(loss)
 
@@ -203,50 +205,50 @@ class FrictionLearner(Learner):
         last = range(max(0, newest - KEPT + 1), newest + 1)
         self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
         random, count = np.random.default_rng((self.settings.seed, CHOICE, step)), self.settings.batch_size
-        places = zip(random.choice(last, count).tolist(), random.integers(count, size=count).tolist(), strict=True)
-        parts = [[column[place] for column in self.drawn[number]] for number, place in places]
-        crops, direction, material, mu, silhouettes = (torch.stack(column) for column in zip(*parts, strict=True))
-        turned = torch.from_numpy(random.random(count) < 0.5)[:, None]
-        direction = torch.where(turned, direction * torch.tensor([1.0, -1.0, 1.0]), direction)
+        some = torch.from_numpy(random.integers(len(last) * count, size=count)).to(self.settings.device)
+        parts = zip(*self.drawn.values(), strict=True)
+        crops, direction, material, mu, silhouettes = (torch.cat(part)[some] for part in parts)
+        turned = torch.from_numpy(random.random(count) < 0.5)[:, None].to(self.settings.device)
+        direction = torch.where(turned, direction * direction.new_tensor([1.0, -1.0, 1.0]), direction)
         crops, silhouettes = (torch.where(turned[:, None, None], part.flip(3), part) for part in (crops, silhouettes))
         return crops, direction, material, mu, silhouettes
 
     def batch(self, number: int) -> tuple[torch.Tensor, ...]:
         """Return the crops, directions of view, materials, mu and silhouettes, as seen by a start or as they are."""
-        seeds = (self.settings.seed, TRAINING, number)
-        random = np.random.default_rng(seeds)
-        generator = torch.Generator().manual_seed(seed_of_step(*seeds))
-        some = 0 if self.clips is None else self.settings.batch_size // 2
-        count = self.settings.batch_size - some
-        chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
-        share = random.random(count, dtype=np.float32)
-        near = torch.from_numpy(share)[:, None, None, None, None]
-        meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
-        views = [self.rig[place] for place in random.integers(len(self.rig), size=count)]
-        cameras = randomly_turned(Cameras.of(views), self.settings.turn, generator)
-        looks = draw_style(count, len(self.frames), generator)
-        world = draw_world(count, generator) if self.settings.worlds else None
-        crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
-        first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
-        mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32))
-        parts = [crops, cameras.rotation[:, 2], torch.from_numpy(self.train.material[chosen[:, 0]]), mu, cover]
-        if self.clips is not None:
-            given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
-            parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
-        *parts, cover = parts
-        return *parts, self.seen(parts[0].to(self.settings.device)).cpu() if self.settled else pooled(cover)
+        device, seeds = self.settings.device, (self.settings.seed, TRAINING, number)
+        with torch.device(device):
+            random, generator = np.random.default_rng(seeds), torch.Generator(device).manual_seed(seed_of_step(*seeds))
+            some = 0 if self.clips is None else round(self.settings.clip_share * self.settings.batch_size)
+            count = self.settings.batch_size - some
+            chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
+            share = random.random(count, dtype=np.float32)
+            near = torch.from_numpy(share).to(device)[:, None, None, None, None]
+            meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
+            views = torch.from_numpy(random.integers(len(self.rig.focal), size=count))
+            cameras = randomly_turned(self.rig[views], self.settings.turn, generator)
+            looks = draw_style(count, len(self.frames), generator)
+            world = draw_world(count, generator) if self.settings.worlds else None
+            crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
+            first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
+            mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(device)
+            codes = torch.from_numpy(self.train.material[chosen[:, 0]])
+            parts = [crops, cameras.rotation[:, 2], codes.to(device), mu, cover]
+            if self.clips is not None:
+                given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
+                parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
+            *parts, cover = parts
+            return *parts, self.seen(parts[0]) if self.settled else pooled(cover)
 
     def elsewhere(self, clips: Clips, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
         """Return clips of another renderer as part of a batch, each in a drawn world."""
-        looks = draw_style(len(clips), len(self.frames), generator)
-        world = draw_world(len(clips), generator)
-        cloth, world, cover = cloth_of_clip(clips.crops, clips.cover, looks, world, generator)
-        axes = torch.stack([torch.tensor(camera.rotation[2]) for camera in self.rig])
-        near = torch.cdist(clips.direction, axes).argmin(dim=1)
-        cameras = Cameras.of([self.rig[place] for place in near.tolist()])
+        device = self.settings.device
+        shown, cover, direction = (part.to(device) for part in (clips.crops, clips.cover, clips.direction))
+        looks, world = draw_style(len(clips), len(self.frames), generator), draw_world(len(clips), generator)
+        cloth, world, cover = cloth_of_clip(shown, cover, looks, world, generator)
+        cameras = self.rig[torch.cdist(direction, self.rig.rotation[:, 2]).argmin(dim=1)]
         crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
-        mu = torch.from_numpy(clips.mu.astype(np.float32))
-        return crops, clips.direction, torch.from_numpy(clips.material), mu, cover
+        material, mu = (torch.from_numpy(part).to(device) for part in (clips.material, clips.mu))
+        return crops, direction, material, mu.float(), cover
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
@@ -262,13 +264,14 @@ class FrictionLearner(Learner):
         net = fitted.net.cpu()
         assert isinstance(net, PosteriorNet)
         settings, train, clips = self.settings, self.train, self.validation
-        drawn = render_clips(self.judged, 6, settings.seed + 2, wanted=settings.instants, drawn_world=settings.worlds)
         # Exposures and registrations differ as those of new clips may.
         generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
-        good = Clips.joined([replace(clips, crops=jittered(clips.crops, generator)), drawn])
+        varied = replace(clips, crops=jittered(clips.crops, generator))
+        good = Clips.joined([varied, self.render(self.judged, 6, settings.seed + 2)])
         log_p = log_histograms(net, features(net, good))
         of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
         of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
+        known = Familiarity.of(train, settings.instants, settings.seed + 1, silhouettes(net, good), settings.device)
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),
@@ -282,7 +285,7 @@ class FrictionLearner(Learner):
             instants=self.instants,
             bins=MU_BINS,
             temperature=(of_material, of_mu),
-            familiarity=Familiarity.of(train, settings.instants, settings.seed + 1, silhouettes(net, good)),
+            familiarity=known,
             card=card,
         )
 

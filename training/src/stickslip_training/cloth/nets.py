@@ -22,7 +22,7 @@ class PosteriorNet(nn.Module):
     def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96, dropout: float = 0.0) -> None:
         super().__init__()
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
-        channels = (1, 16, 32, 48, 64)
+        channels = (1, width // 6, width // 3, width // 2, 2 * width // 3)
         layers: list[nn.Module] = []
         for number, (before, after) in enumerate(pairwise(channels)):
             kernel = 5 if number == 0 else 3

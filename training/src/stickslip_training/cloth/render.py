@@ -19,7 +19,7 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
-from stickslip_training.cloth.world import Cloth, World, blurred, coded, light_of
+from stickslip_training.cloth.world import Cloth, World, blurred, coded, enlarged, light_of
 
 POINTS = 56
 """Points along a side of the refined mesh."""
@@ -84,36 +84,25 @@ def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
     """Draw reflectances of cloth, (clips, POINTS, POINTS): plain, stripes, checks, dots, blots, and mixtures of
     them."""
     v, u = torch.meshgrid(torch.linspace(0, 1, POINTS), torch.linspace(0, 1, POINTS), indexing="ij")
-    made = []
-    for _ in range(clips):
-        r = torch.rand(16, generator=generator).tolist()
-        first, second = (_wave(u, v, r[5 * i : 5 * i + 5]) for i in (0, 1))
-        pattern = (
-            torch.full_like(u, 0.5),
-            first,
-            first * second,
-            torch.maximum(first, second),
-            0.5 * (first + second),
-            _blots(generator),
-        )[int(r[10] * 6)]
-        low, high = sorted((0.12 + 0.75 * r[11], 0.12 + 0.75 * r[12]))
-        dark = r[13] < 0.5
-        made.append(low + (high - low) * (pattern if dark else 1 - pattern))
-    return torch.stack(made)
+    r = torch.rand(14, clips, 1, 1, generator=generator)
+    first, second = (_wave(u, v, r[start : start + 5]) for start in (0, 5))
+    plain, mean = torch.full_like(first, 0.5), 0.5 * (first + second)
+    sorts = [plain, first, first * second, torch.maximum(first, second), mean, _blots(clips, generator)]
+    pattern = torch.stack(sorts)[(6 * r[10, :, 0, 0]).long(), torch.arange(clips)]
+    low, high = 0.12 + 0.75 * r[11:13].amin(dim=0), 0.12 + 0.75 * r[11:13].amax(dim=0)
+    return low + (high - low) * torch.where(r[13] < 0.5, pattern, 1 - pattern)
 
 
-def _wave(u: torch.Tensor, v: torch.Tensor, r: list[float]) -> torch.Tensor:
+def _wave(u: torch.Tensor, v: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
     """Return stripes, 0 to 1: of any direction, width and sharpness."""
-    angle = math.pi * r[0] if r[1] < 0.4 else math.pi / 2 * round(r[0])
-    wave = torch.sin(2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * math.cos(angle) + v * math.sin(angle)) + r[3]))
+    angle = math.pi * torch.where(r[1] < 0.4, r[0], r[0].round() / 2)
+    wave = torch.sin(2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * torch.cos(angle) + v * torch.sin(angle)) + r[3]))
     return torch.sigmoid((1 + 12 * r[4]) * (wave - 0.6 * (r[3] - 0.5)))
 
 
-def _blots(generator: torch.Generator) -> torch.Tensor:
-    coarse = int(torch.randint(5, 18, (1,), generator=generator))
-    noise = torch.rand(1, 1, coarse, coarse, generator=generator)
-    fine = torch.nn.functional.interpolate(noise, (POINTS, POINTS), mode="bicubic", align_corners=True)[0, 0]
-    return torch.sigmoid(12 * (fine - 0.5))
+def _blots(clips: int, generator: torch.Generator) -> torch.Tensor:
+    coarse = torch.randint(5, 18, (clips, 1), generator=generator).expand(-1, 2)
+    return torch.sigmoid(12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5))
 
 
 def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:
@@ -152,8 +141,9 @@ def render_crops(
     true = cameras if world is None else world.seen_by(cameras)
     shade = shading(positions, true, style)
     parts = []
-    for clip in range(len(positions)):  # one clip's points fit into a processor's cache, a batch's do not
-        one = slice(clip, clip + 1)
+    count = 1 if positions.device.type == "cpu" else len(positions)  # one clip's points fit into a processor's cache
+    for clip in range(0, len(positions), count):
+        one = slice(clip, clip + count)
         fine = _refined(torch.cat([positions[one], shade[one, ..., None]], dim=-1), POINTS)
         points, colors = fine[..., :3], fine[..., 3] * style.texture[one, None]
         place = true[one], crops[one].off_by(style.shift[one], style.stretch[one])
@@ -189,7 +179,7 @@ def pictured(
 
 def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
     """Refine fields on meshes (B, F, side, side, n) to (B, F, points, points, n), smoothly."""
-    weights = _spline(fields.shape[2], points)
+    weights = _spline(fields.shape[2], points).to(fields.device)
     clips, frames, side, _, count = fields.shape
     rows = weights @ fields.reshape(clips * frames, side, side * count)
     fine = weights @ rows.reshape(clips * frames * points, side, count)

@@ -113,31 +113,33 @@ def draw_world(clips: int, generator: torch.Generator) -> World:
     drawn["contrast"] = drawn["contrast"] ** 2 / RANGES["contrast"][1]
     for name, exact in (("zoom", 1.0), ("roll", 0.0), ("slip", 0.0)):
         drawn[name] = torch.where(there["tame"] > 0, exact, drawn[name])
-    pattern = torch.stack([_pattern(generator) for _ in range(clips)])
-    return World(drawn, there, pattern)
+    return World(drawn, there, _patterns(clips, generator))
 
 
-def _pattern(generator: torch.Generator) -> torch.Tensor:
-    """Draw a floor: smooth or fine blots, wood (long in one direction), veins of marble, tiles or checks."""
-    r = torch.rand(5, generator=generator).tolist()
-    found = torch.zeros(PATTERN, PATTERN)
+def _patterns(clips: int, generator: torch.Generator) -> torch.Tensor:
+    """Draw floors: smooth or fine blots, wood (long in one direction), veins of marble, tiles or checks."""
+    sort, heading, rough, size, tiled = torch.rand(5, clips, 1, 1, generator=generator)
+    across = (heading[:, 0] < 0.5).long() == torch.arange(2)
+    found = torch.zeros(clips, PATTERN, PATTERN)
     for octave, coarse in enumerate((4, 9, 20, 44)):
-        cells = [coarse, coarse]
-        if r[0] < 0.4:
-            cells[int(r[1] < 0.5)] = max(2, coarse // 6)
-        noise = torch.randn(1, 1, *cells, generator=generator)
-        fine = functional.interpolate(noise, (PATTERN, PATTERN), mode="bicubic", align_corners=True)[0, 0]
-        found = found + (0.45 + 0.4 * r[2]) ** octave * fine
-    found = found / (found.std() + 1e-6)
-    if 0.4 <= r[0] < 0.6:
-        found = torch.sin(2.5 * found)
-    elif r[0] >= 0.9:
-        y, x = torch.meshgrid(torch.arange(PATTERN), torch.arange(PATTERN), indexing="ij")
-        side = 6 + int(20 * r[3])
-        checks = torch.where(((x // side) + (y // side)) % 2 == 0, 1.0, -1.0)
-        joints = -2.0 * ((x % side == 0) | (y % side == 0)).float()
-        found = 0.3 * found + (checks if r[4] < 0.5 else joints)
+        cells = torch.where((sort[:, 0] < 0.4) & across, max(2, coarse // 6), coarse)
+        noise = torch.randn(clips, coarse, coarse, generator=generator)
+        found = found + (0.45 + 0.4 * rough) ** octave * enlarged(noise, cells, PATTERN)
+    found = found / (found.std(dim=(1, 2), keepdim=True) + 1e-6)
+    y, x = torch.meshgrid(torch.arange(PATTERN), torch.arange(PATTERN), indexing="ij")
+    side = 6 + (20 * size).long()
+    checks = torch.where((x // side + y // side) % 2 == 0, 1.0, -1.0)
+    joints = -2.0 * ((x % side == 0) | (y % side == 0)).float()
+    found = torch.where((sort >= 0.4) & (sort < 0.6), torch.sin(2.5 * found), found)
+    found = torch.where(sort >= 0.9, 0.3 * found + torch.where(tiled < 0.5, checks, joints), found)
     return found.clamp(-2.5, 2.5)
+
+
+def enlarged(noise: torch.Tensor, cells: torch.Tensor, points: int) -> torch.Tensor:
+    """Enlarge the first `cells`, (B, 2) rows and columns, of noise (B, n, n) to (B, points, points), smoothly."""
+    down, along = (torch.linspace(0, 2, points) * ((cells - 1) / (noise.shape[1] - 1))[..., None] - 1).unbind(1)
+    grid = torch.stack([along[:, None].expand(-1, points, -1), down[..., None].expand(-1, -1, points)], dim=-1)
+    return functional.grid_sample(noise[:, None], grid, mode="bicubic", padding_mode="border", align_corners=True)[:, 0]
 
 
 @dataclass(frozen=True)
