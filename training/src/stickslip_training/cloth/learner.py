@@ -218,7 +218,7 @@ class FrictionLearner(Learner):
         device, seeds = self.settings.device, (self.settings.seed, TRAINING, number)
         with torch.device(device):
             random, generator = np.random.default_rng(seeds), torch.Generator(device).manual_seed(seed_of_step(*seeds))
-            some = 0 if self.clips is None else round(self.settings.clip_share * self.settings.batch_size)
+            some = 0 if self.clips is None else math.ceil(self.settings.clip_share * self.settings.batch_size)
             count = self.settings.batch_size - some
             chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
             share = random.random(count, dtype=np.float32)
@@ -233,7 +233,7 @@ class FrictionLearner(Learner):
             mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(device)
             codes = torch.from_numpy(self.train.material[chosen[:, 0]])
             parts = [crops, cameras.rotation[:, 2], codes.to(device), mu, cover]
-            if self.clips is not None:
+            if self.clips is not None and some:
                 given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
                 parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
             *parts, cover = parts
