@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from stickslip_blender.cloth import clips
+from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.quality import pooled, trio
@@ -40,7 +40,7 @@ def main() -> None:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
     pictures = {str(name): texture_image(name) for name in Texture}
-    instants, samples = clips.instants, clips.HALF_SAMPLES  # type: ignore[attr-defined]
+    instants, samples = quality.instants, quality.HALF_SAMPLES
     for viewpoint, substrate, seed in (SHOWN[number] for number in options.clips):
         look = ClothDragRender(
             rig="drag",
@@ -57,21 +57,24 @@ def main() -> None:
         camera = next(camera for camera in load_rig("drag") if camera.name == viewpoint)
         clip = renderer.clip(look, camera, track[list(look.instants)])
         start = time.process_time()
-        videos, _ = clip.clips(clip.shading(), [pictures[name] for name in TEXTURES])
+        shading = clip.shading()
+        videos, _ = clip.clips(shading, [pictures[name] for name in TEXTURES])
         made = time.process_time()
         groups = list(dict.fromkeys(map(trio, TEXTURES)))
         own = [list(clip.references([pictures[name] for name in g], options.measured, g[0].encode())) for g in groups]
+        weights, usual = clip.weights(shading)
         ended = time.process_time()
-        clips.instants, clips.HALF_SAMPLES = (lambda *_: INSTANTS), LONG  # type: ignore[attr-defined]
+        quality.instants, quality.HALF_SAMPLES = (lambda *_: INSTANTS), LONG
         object.__setattr__(clip, "seed", seed + 5000)
         long = list(clip.references([pictures[name] for name in groups[0]], 1.0))
-        clips.instants, clips.HALF_SAMPLES = instants, samples  # type: ignore[attr-defined]
+        quality.instants, quality.HALF_SAMPLES = instants, samples
         seconds = (made - start) / len(TEXTURES) / 30
         print(f"{viewpoint}, {substrate}: {seconds:.4f} CPU s a frame and texture", end=", ")
         print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)
         for channel, name in enumerate(groups[0]):
             video = videos[TEXTURES.index(name)]
-            stated, found = (pooled([(r.errors(video, channel), r.regions) for r in group]) for group in (own[0], long))
+            stated = pooled([(r.errors(video, channel), weights[r.frame]) for r in own[0]], usual)
+            found = pooled([(r.errors(video, channel), weights[r.frame] > 0.0) for r in long])
             said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
             print(f"  {name}:", "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said), flush=True)
 

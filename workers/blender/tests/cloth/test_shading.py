@@ -35,6 +35,20 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
     assert errors(white, bright, bright).max() < 1e-4
 
 
+def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
+    """One frame of three is measured, and errors of the others are expected to be four times as large."""
+    measured = np.ones((3, 64, 64))
+    found = pooled([(np.full((64, 64), 4.0), measured)], usual=(1.0, 3.0, 1.0))
+    exact = [10.0 * np.log10(255.0**2 / (4.0 * usual)) for usual in (1.0, 3.0, 1.0)]
+    assert found.psnr == pytest.approx(exact)
+    assert min(found.deviations) > 1.0  # of one frame
+
+
+def test_small_cloth_has_more_paths() -> None:
+    sampling = ClothSampling(1, 5, (0.0, 0.0, 0.0))
+    assert [sampling.over(area).window for area in (20_000.0, 13_000.0, 10_000.0, 8_000.0, 1.0)] == [5, 5, 6, 8, 8]
+
+
 def test_a_clip_below_its_floor_says_so() -> None:
     measured = Measured((33.0, 30.0, 27.0), (0.1, 2.0, 0.1))
     assert measured.shortfall((32.0, 33.0, 28.0)) == "psnr_edge must be at least 28 dB; got 27.0 dB (deviation 0.1 dB)"

@@ -151,7 +151,7 @@ def test_a_triangle_that_reaches_behind_the_camera_is_not_seen() -> None:
     behind = see(np.where(np.arange(6)[:, None] == 4, -1.0, points), triangles, window).triangle
     alone = see(points[:3], triangles[:1], window).triangle
     np.testing.assert_array_equal(behind, alone)
-    assert window_about(np.full((3, 3), np.nan), load_rig("drag")[0]).is_empty
+    assert window_about(np.full((3, 3), np.nan), load_rig("drag")[0]).area == 0
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:

@@ -22,13 +22,14 @@ from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture
 
 from stickslip_blender.build import build_digest
+from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.lens import bent
 from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
-from stickslip_blender.cloth.quality import BAND, HALF_SAMPLES, UNMEASURED, errors, instants, pooled, regions, trio
+from stickslip_blender.cloth.quality import BAND, UNMEASURED, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene
-from stickslip_blender.cloth.shading import FINE
+from stickslip_blender.cloth.shading import FINE, SHOWN
 from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
@@ -43,13 +44,10 @@ if TYPE_CHECKING:
     AnyLook = ClothDragRender | ClothSceneRender
 
 _PREVIEW_SIDE = 160  # [px]
-
-_KEPT_SHADINGS = 2
-"""Shadings that a process keeps: 36 MB each at 30 frames."""
+_KEPT_SHADINGS = 2  # of 36 MB each at 30 frames
 
 Clip = npt.NDArray[np.uint8]
-Light = npt.NDArray[np.float16]
-"""Linear, at the albedos of `shading.SHOWN`."""
+Light = npt.NDArray[np.float16]  # linear, at the albedos of `shading.SHOWN`
 
 
 class ClothRenderer:
@@ -78,7 +76,8 @@ class ClothRenderer:
             if height is None
             else floor_factor(substrate, pinhole, height)
         )
-        chosen = CLOTH_SAMPLING[look.quality] if sampling is None else sampling
+        area = sum(self.scene.window(shot).area for shot in shots) / len(shots)
+        chosen = sampling or CLOTH_SAMPLING[look.quality].over(area)
         labels = {
             "light_seed": look.light_seed,
             "light": light.numbers,
@@ -133,20 +132,28 @@ class ClipRenderer:
         }
         return videos, labels
 
+    def weights(self, shading: Light) -> tuple[npt.NDArray[np.float64], list[float]]:
+        """Return the weights of pixels by region, (frames, 3, height, width), and their means, for `pooled`."""
+        size = (len(shading), self.pinhole.height, FINE, self.pinhole.width, FINE)
+        light = (shading[..., 1] - shading[..., 0]).reshape(size).mean(axis=(2, 4), dtype=np.float32) / SHOWN[1]
+        masks = np.stack([regions(self.scene.geometry, shot, self.pinhole) for shot in self.shots])
+        weights = masks * np.maximum(light + quality.DARK, quality.DARK)[:, None] ** -0.5
+        return weights, (weights.sum(axis=(0, 2, 3)) / np.maximum(masks.sum(axis=(0, 2, 3)), 1)).tolist()
+
     def references(self, textures: Sequence[Clip], share: float, draw: bytes = b"") -> Iterator[Reference]:
         """Render instants directly with up to three textures, a share as `instants` says; `draw`: more of the seed."""
         greens = [self._grained(texture)[..., 1] for texture in textures]
         picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
-        for frame in instants(len(self.shots), share, FINE**2 * self.sampling.window, (self.seed, *draw)):
+        for frame in quality.instants(len(self.shots), share, FINE**2 * self.sampling.window, (self.seed, *draw)):
             shot = self.shots[frame]
             window = self.scene.window(shot, BAND + 1)
             light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
             factor = self.scene.composer.floor_factor(shot, self.pinhole, self.floor, FINE)[..., 1:2]
             for number, half in enumerate(light, 1):
-                sampling = Sampling(HALF_SAMPLES, "none", self.seed + number, skipped=HALF_SAMPLES)
+                sampling = Sampling(quality.HALF_SAMPLES, "none", self.seed + number, skipped=quality.HALF_SAMPLES)
                 parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
                 half[window.slices] = parts.reshape(-1, FINE, window.right - window.left, FINE, 3).mean(axis=(1, 3))
-            yield Reference(frame, light, regions(self.scene.geometry, shot, self.pinhole))
+            yield Reference(frame, light)
 
     def _grained(self, texture: Clip) -> Clip:
         return grained(texture, self.fabric, self.scene.geometry.surface)
@@ -169,13 +176,11 @@ class Reference:
     frame: int
     light: npt.NDArray[np.float32]
     """Linear, of two renderings, with the green of each texture in a channel, shape (2, height, width, 3)."""
-    regions: npt.NDArray[np.bool_]
-    """As `stickslip_blender.cloth.quality.regions` returns them."""
 
     def errors(self, clip: Clip, channel: int) -> npt.NDArray[np.float64]:
         """Return the squared errors of a frame of a clip (frames, height, width, 3) [levels^2]."""
         one, other = self.light[..., channel]
-        return errors(clip[self.frame, ..., 1], one, other)
+        return quality.errors(clip[self.frame, ..., 1], one, other)
 
 
 def render_clips(
@@ -230,11 +235,14 @@ def _results(
     for sampling in (clip.sampling, clip.sampling.finer):
         shading = _shading(clip, sampling, look, task, workshop)
         videos, shared = clip.clips(shading, [picture(name, workshop) for name in wanted])
+        weighed = clip.weights(shading) if references else None
         poor = {}
         for name, video in zip(wanted, videos, strict=True):
-            group = references.get(trio(name), [])
-            channel = trio(name).index(name)
-            measured = pooled([(r.errors(video, channel), r.regions) for r in group]) if group else UNMEASURED
+            measured = UNMEASURED
+            if weighed is not None:
+                (weights, usual), group = weighed, trio(name)
+                errors = [(r.errors(video, group.index(name)), weights[r.frame]) for r in references[group]]
+                measured = pooled(errors, usual)
             if shortfall := measured.shortfall(clip.sampling.floors):
                 poor[name] = shortfall
                 continue

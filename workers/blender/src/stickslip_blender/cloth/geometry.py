@@ -199,10 +199,8 @@ def mirrored(points: Array, floor: float) -> Array:
     return image
 
 
-HOLDER = (0.004, 0.01, 0.01)
-"""Size of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
-ROD = (0.003, 0.003, 0.5)
-"""Size of the rod that the clip hangs on [m]."""
+HOLDER = (0.004, 0.01, 0.01)  # of the clip at a corner [m]: across the cloth, and in its plane as in the simulation
+ROD = (0.003, 0.003, 0.5)  # of what the clip hangs on [m]
 HOLDER_COLOR, HOLDER_ROUGHNESS = np.array([[0.05, 0.05, 0.05]]), 0.45
 
 

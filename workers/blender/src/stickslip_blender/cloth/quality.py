@@ -6,8 +6,9 @@ are independent, so that in
 
     e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
-nothing of the noise of the references is left, however few samples they have. The mean of e over a region, pooled over
-instants, is the mean squared error of its PSNR. Blocks of pixels, and instants, tell how far chance goes.
+nothing of the noise of the references is left, however few samples they have. Frames with cloth in the shade, where a
+level is little light, are worst, and may be missed. So the sum of e over that of 1 / sqrt(light on the cloth), times
+the mean of the latter over all frames, is the mean squared error. Blocks of pixels, and instants, tell the deviation.
 
 One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a
 clip gets the same numbers alone or with others. A user's picture is measured by itself.
@@ -15,6 +16,7 @@ clip gets the same numbers alone or with others. A user's picture is measured by
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +40,7 @@ FEWEST = 30  # pixels of a region, over all measured instants, below which nothi
 DEVIATIONS = 2.0  # standard deviations below a floor that are taken for chance
 _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
 _TRUST = 4  # instants that it counts for
+DARK = 0.003  # light on the cloth below which errors do not grow
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
 _TRIO = 3
 
@@ -113,25 +116,28 @@ def errors(levels: npt.NDArray[np.uint8], one: Floats, other: Floats) -> Floats:
     return np.asarray(slope**2 * (light - np.minimum(one, top)) * (light - np.minimum(other, top)))
 
 
-def pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> Measured:
-    """Return the PSNR from errors (height, width) and regions (3, height, width) of all measured instants."""
-    found = [_pooled([(error, masks[region]) for error, masks in measured]) for region in range(len(REGIONS))]
-    return Measured(tuple(psnr for psnr, _ in found), tuple(deviation for _, deviation in found))
+def pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3) -> Measured:
+    """Return the PSNR from errors (height, width) of instants, and weights by region, (3, height, width), 0 outside.
+
+    `usual`: means of weights over the regions in all frames.
+    """
+    found = [_pooled([(error, weights[k]) for error, weights in measured], usual[k]) for k in range(len(REGIONS))]
+    return Measured(*zip(*found, strict=True))
 
 
-def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[np.bool_]]]) -> tuple[float, float]:
-    sums = np.concatenate([_blocks(np.where(mask, error, 0.0)) for error, mask in measured])
-    sizes = np.concatenate([_blocks(mask.astype(np.float64)) for _, mask in measured])
-    if (size := sizes.sum()) < FEWEST:
+def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: float) -> tuple[float, float]:
+    sums = np.concatenate([_blocks(np.where(weights > 0, error, 0.0)) for error, weights in measured])
+    sizes = np.concatenate([_blocks(weights.astype(np.float64)) for _, weights in measured])
+    if sum(np.count_nonzero(weights) for _, weights in measured) < FEWEST:
         return np.nan, np.nan
-    mean = sums.sum() / size
+    mean = sums.sum() / (size := sizes.sum())
     spread = float(np.sqrt(((sums - mean * sizes) ** 2).sum())) / size
     bounded = max(mean, spread)  # chance can make the mean of products negative
     count = len(measured)
-    own = [(np.sum(np.where(mask, error - bounded, 0.0)) * count / size / bounded) ** 2 for error, mask in measured]
-    between = (sum(own) + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
+    parts = np.array([np.sum(np.where(weights > 0, error - bounded * weights, 0.0)) for error, weights in measured])
+    between = (np.sum((parts * count / size / bounded) ** 2) + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
     deviation = float(np.sqrt((spread / bounded) ** 2 + between))
-    return float(10.0 * np.log10(255.0**2 / bounded)), 10.0 / np.log(10.0) * deviation
+    return float(10.0 * np.log10(255.0**2 / (bounded * usual))), 10.0 / np.log(10.0) * deviation
 
 
 def _blocks(values: Floats) -> Floats:

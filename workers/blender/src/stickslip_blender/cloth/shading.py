@@ -42,9 +42,7 @@ from stickslip_blender.raster import (
 SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
 """The cloth's base colours in a shading, where the camera sees it and where other rays meet it."""
 
-FINE = 2
-"""Pixels of a shading across one of a picture, and down."""
-
+FINE = 2  # pixels of a shading across one of a picture, and down
 TOLERANCE: int = _raster.TOLERANCE
 """Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/composition.hpp sets it."""
 
@@ -126,7 +124,7 @@ class Composer:
             return floor
         projections = projected(camera, points)
         window = window_about(projections[geometry.cloth_vertices :], camera)
-        if window.is_empty:
+        if not window.area:
             return floor
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
         seen = see(projections, props, window, _PROP_GRID)
@@ -154,7 +152,7 @@ class Composer:
         below = projected(camera, mirrored(points, floor))
         window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
         nothing = np.empty((0, 0, 3 * textures.count), dtype=np.float32), Window(0, 0, 0, 0)
-        if window.is_empty:
+        if not window.area:
             return nothing
         seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)
         sight = see_albedo(seen, self._geometry.uv, textures, cloth)

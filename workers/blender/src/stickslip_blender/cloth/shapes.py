@@ -10,8 +10,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Faces = list[tuple[int, ...]]
 
-ARC = 12
-"""Faces of a quarter of a circle."""
+ARC = 12  # faces of a quarter of a circle
 GORE = 6
 """Faces across one gore: gores are bright and dark by turns, so that a turn can be seen."""
 _JOINT = 1e-7  # [m]: vertices that are closer are one

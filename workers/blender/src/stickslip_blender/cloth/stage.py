@@ -16,23 +16,13 @@ from stickslip_blender.cloth.shapes import Faces, box, gores, rounded, square, t
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
-SUNK = -FLOOR
-"""Distance of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it."""
-
-ENDLESS, TILE = 1.0, 0.1
-"""Half the visible size of an endless cylinder, or of a plane that is no floor; side of the tiles of bodies [m]."""
-
-JAWS = 0.004
-"""By how much a holder is larger than what it holds, along each axis [m]."""
-
-ROUNDING = 0.005
-"""Radius of the edges of a box that gives none [m], as in the simulation."""
-
-MOVING = 0.005
-"""A vertex that goes farther than this moves [m]: cameras frame all that do."""
-
-PLAIN = (168, 164, 156)
-"""Colour of a sheet that neither a scene nor an axis gives a texture, sRGB."""
+SUNK = -FLOOR  # of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it
+ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane that is no floor [m]
+TILE = 0.1  # side of the tiles of bodies [m]
+JAWS = 0.004  # by how much a holder is larger than what it holds, along each axis [m]
+ROUNDING = 0.005  # radius of the edges of a box that gives none [m], as in the simulation
+MOVING = 0.005  # a vertex that goes farther than this moves [m]: cameras frame all that do
+PLAIN = (168, 164, 156)  # sRGB, of a sheet that neither a scene nor an axis gives a texture
 
 _USUAL_COLOR, _USUAL_ROUGHNESS = (0.2, 0.2, 0.2), 0.5  # as the document has them
 _TURNS = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0, 180.0)  # [degree]

@@ -15,10 +15,8 @@ from stickslip_schemas.spec.cameras import Camera
 if TYPE_CHECKING:
     from stickslip_schemas.spec.appearance import FloorNumbers
 
-GRAIN_SIZE = 512
-"""Side of the picture of a floor's grain [texels]."""
-GRAIN_EXTENT = 0.5
-"""What the picture covers; it repeats [m]."""
+GRAIN_SIZE = 512  # side of the picture of a floor's grain [texels]
+GRAIN_EXTENT = 0.5  # what the picture covers; it repeats [m]
 _SUBSAMPLES = 3
 HARD = ("aluminium", "aluminium-pet", "ceramic", "rough-glass", "smooth-glass", "polyester-mirror", "stainless-steel")
 """The substrates of the thesis, 4.2.2."""

@@ -14,11 +14,8 @@ import numpy.typing as npt
 from stickslip_blender.cloth.subdivision import Subdivision, subdivide
 from stickslip_blender.raster import _raster
 
-FINE_VERTICES = 6000
-"""A mesh is subdivided until it has so many vertices: a facet is then below a pixel."""
-
-CREASE = 0.0005
-"""Height of the strongest crease at strength 1 [m]."""
+FINE_VERTICES = 6000  # a mesh is subdivided until it has so many: a facet is then below a pixel
+CREASE = 0.0005  # height of the strongest crease at strength 1 [m]
 _CREASES = 14
 
 # Of the hem, from its inner edge over the upper side to the outer edge and back below: how far inside the edge of the

@@ -40,11 +40,17 @@ class ClothSampling:
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
+    def over(self, area: float) -> ClothSampling:
+        """Where the window has a smaller area than usual [px^2], trace up to 1.6 times the paths for the same cost."""
+        return replace(self, window=round(self.window * min(max(_USUAL_AREA / area, 1.0), 1.6)))
+
     @property
     def finer(self) -> ClothSampling:
         """Half the noise: for a clip that is below its floors."""
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
+
+_USUAL_AREA = 13_000.0  # [px^2]
 
 # Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
 SAMPLING = {

@@ -87,8 +87,7 @@ class FrameReader:
         """End the process if a frame takes far longer than its paths took in the frames before."""
         render = self._scene.render
         here = window or Window(0, 0, render.resolution_x, render.resolution_y)
-        size = fine**2 * max((here.right - here.left) * (here.bottom - here.top), 1)
-        paths, start = size * self._scene.cycles.samples, time.monotonic()
+        paths, start = fine**2 * max(here.area, 1) * self._scene.cycles.samples, time.monotonic()
         limit = self._besides + _SLOWER * self._path_seconds * paths
         faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__ or 2)  # Blender keeps Python's lock
         try:

@@ -37,9 +37,9 @@ class Window:
     bottom: int
 
     @property
-    def is_empty(self) -> bool:
-        """True where there is no pixel in it."""
-        return self.right <= self.left or self.bottom <= self.top
+    def area(self) -> int:
+        """Number of pixels in it."""
+        return max(self.right - self.left, 0) * max(self.bottom - self.top, 0)
 
     @property
     def slices(self) -> tuple[slice, slice]:

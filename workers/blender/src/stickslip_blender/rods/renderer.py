@@ -98,7 +98,7 @@ class RodRenderer:
         frame = np.full((camera.height, camera.width, 3), GROUND_LEVEL, dtype=np.uint8)
         points = projected(camera, vertices)
         window = window_about(points, camera)
-        if not window.is_empty:
+        if window.area:
             seen = see(points, self._triangles, window)
             light = self._reader.read_matte(window).astype(np.float32)
             frame[window.slices] = encode(self._before_ground(light, seen.share_below(len(self._triangles))))
