@@ -89,9 +89,11 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
     clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, (0.0, 0.0, 0.0)))
     names = trio("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
-    videos, _ = clip.clips(clip.shading(), pictures)
+    shading = clip.shading()
+    videos, _ = clip.clips(shading, pictures)
+    weights, usual = clip.weights(shading)
     (reference,) = clip.references(pictures, 0.0)
     for channel, video in enumerate(videos):
-        found = pooled([(reference.errors(video, channel), reference.regions)])
+        found = pooled([(reference.errors(video, channel), weights[0])], usual)
         assert min(found.psnr) > 28.0, names[channel]
         assert found.psnr[0] > 35.0, names[channel]
