@@ -130,16 +130,16 @@ class QueueMachine(RuleBasedStateMachine):
         dropped = worker.beat(lease, started=started)
         if dropped:
             # Either it was not the worker's, or no job needs it: then it is nobody's now.
-            if self._is_held(worker, lease):
+            if self._holds(worker, lease):
                 del self.holders[lease.task_id]
         else:
-            assert self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
+            assert self._holds(worker, lease)
             self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
 
     @rule(target=reported, held=consumes(leases), how=st.sampled_from(HOW))
     def report(self, held: Held, how: str) -> Held:
         worker, lease = held
-        mine = self._is_held(worker, lease) or self._expired_unnoticed(worker, lease)
+        mine = self._holds(worker, lease)
         bad = {
             "crashed": failure(),
             "broken": failure(Reason.internal_error),
@@ -253,18 +253,14 @@ class QueueMachine(RuleBasedStateMachine):
         self.context.close()
         self.directory.cleanup()
 
-    def _is_held(self, worker: PretendWorker, lease: Lease) -> bool:
-        held = self.holders.get(lease.task_id)
-        return held is not None and held[:2] == (worker.id, lease.token) and held[2] > self.clock()
-
     def _is_asked_for(self, task: str) -> bool:
         """Return whether a job that may run needs the task."""
         with self.context.database.read() as connection:
             seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
             return seq is not None and bool(live_jobs(connection, [seq], RUNNABLE))
 
-    def _expired_unnoticed(self, worker: PretendWorker, lease: Lease) -> bool:
-        """Return whether the time is over, but nobody has taken the task back: a late sign of life is welcome."""
+    def _holds(self, worker: PretendWorker, lease: Lease) -> bool:
+        """Return whether nobody has taken the task back: a late sign of life is welcome."""
         held = self.holders.get(lease.task_id)
         return held is not None and held[:2] == (worker.id, lease.token)
 
