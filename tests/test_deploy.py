@@ -244,6 +244,7 @@ def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, s
     assert ("requeue 7" in (tmp_path / "scontrol").read_text()) == is_requeued
 
 
+@pytest.mark.real
 def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
     """The script asks `ray symmetric-run` for what it takes, with a token that differs from job to job."""
     for name, text in (("scontrol", "printf 'n1\\nn2\\n'"), ("srun", 'echo "$RAY_AUTH_TOKEN" "$@"')):

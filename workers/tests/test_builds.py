@@ -111,6 +111,7 @@ def test_every_function_that_runs_is_in_the_build(name: str, tmp_path: Path) -> 
     assert left <= _files("simulate", name), left - _files("simulate", name)
 
 
+@pytest.mark.physics
 def test_every_module_that_is_imported_is_in_some_build() -> None:
     """A file that only passes names on, or that is compiled, is in none; the build of the core covers the latter."""
     covered = {path for name in KINDS for stage in STAGES for path in _files(stage, name)}

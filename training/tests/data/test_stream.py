@@ -42,7 +42,7 @@ def test_an_epoch_has_every_sample_once_in_an_order_of_its_own(samples):
     assert flat(slots(Stream(samples, 4, shuffle=False))) == samples.slots.tolist()
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.real)])
 def test_a_state_goes_on_bit_for_bit(samples, workers):
     options = {"num_workers": workers} | ({"multiprocessing_context": "fork"} if workers else {})
     whole = Stream(samples, 3, seed=1, **options)
