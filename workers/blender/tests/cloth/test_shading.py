@@ -8,12 +8,13 @@ from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.quality import UNMEASURED, Measured, errors, instants, pooled, trio
 from stickslip_blender.cloth.textures import texture_image
-from stickslip_blender.cycles.engine import ClothSampling
+from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling
 from stickslip_blender.cycles.pixels import encode
 from stickslip_blender.raster import decoded
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
 from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.jobs import Quality
 
 
 def test_encoding_is_srgb() -> None:
@@ -97,3 +98,8 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
         found = pooled([(reference.errors(video, channel), weights[0])], usual)
         assert min(found.psnr) > 28.0, names[channel]
         assert found.psnr[0] > 35.0, names[channel]
+
+
+@pytest.mark.parametrize(("area", "paths"), [(0.0, 8), (5_000.0, 8), (10_833.0, 6), (13_000.0, 5), (50_000.0, 5)])
+def test_small_windows_get_more_paths_and_cloth_out_of_the_frame_too(area: float, paths: int) -> None:
+    assert CLOTH_SAMPLING[Quality.standard].over(area).window == paths

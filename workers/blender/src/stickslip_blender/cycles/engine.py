@@ -41,8 +41,8 @@ class ClothSampling:
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     def over(self, area: float) -> ClothSampling:
-        """Where the window has a smaller area than usual [px^2], trace up to 1.6 times the paths for the same cost."""
-        return replace(self, window=round(self.window * min(max(_USUAL_AREA / area, 1.0), 1.6)))
+        """Where the window has a smaller area than usual [px^2], trace more paths for the same cost."""
+        return replace(self, window=round(self.window * min(max(_USUAL_AREA / max(area, 1.0), 1.0), _MORE_PATHS)))
 
     @property
     def finer(self) -> ClothSampling:
@@ -50,7 +50,7 @@ class ClothSampling:
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
-_USUAL_AREA = 13_000.0  # [px^2]
+_USUAL_AREA, _MORE_PATHS = 13_000.0, 1.6  # of a window that needs no more paths [px^2], and the most times as many
 
 # Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
 SAMPLING = {
