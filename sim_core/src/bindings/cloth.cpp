@@ -12,7 +12,7 @@
 #include <map>
 #include <tuple>
 
-#include "cloth/intersections.hpp"
+#include "cloth/mesh.hpp"
 #include "cloth/solver.hpp"
 
 namespace sim_core {
@@ -58,7 +58,7 @@ void bind_cloth(nb::module_& m) {
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
-      "Internal: constants of the cloth solver by name; see cloth/constants.hpp.");
+      "Internal: constants of the cloth solver by name; see cloth/settings.hpp.");
   nb::class_<Observed>(m, "Observed", "Worst values over the accepted steps, for the checks of a run.")
       .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
       .def_ro("depth", &Observed::depth, "Largest depth in a body beyond what round bodies allow [cells].")

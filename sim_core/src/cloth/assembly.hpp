@@ -5,15 +5,45 @@
 #include <memory>
 #include <vector>
 
-#include "cloth/bending.hpp"
-#include "cloth/factor_settings.hpp"
-#include "cloth/membrane.hpp"
+#include "cloth/mesh.hpp"
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
-#include "cloth/properties.hpp"
+#include "cloth/settings.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
+
+// The stencils of the plate element, laid out for the kernels.
+class Bending {
+ public:
+  Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Fabrics& fabrics,
+          const Numbering& numbering, const Pattern& pattern);
+  Bending(const Bending&) = delete;
+
+  const BendingData& data() const { return data_; }
+
+ private:
+  std::vector<int> begin_{0}, nodes_, slot_begin_, slots_, fabric_;
+  Buffer<double> weights_;
+  std::vector<double> area_, spacing2_, rigidity_;
+  BendingData data_{};
+};
+
+// Triangles in groups of one fabric, and the law of each fabric.
+class Membrane {
+ public:
+  Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics);
+  Membrane(const Membrane&) = delete;
+
+  const MembraneData& data() const { return data_; }
+  void lag_from(const ClothKernel& kernel, const double* x, double share);
+
+ private:
+  Buffer<int> nodes_, slots_, fabric_;
+  Buffer<double> shape_, area_, law_, lag_;
+  Buffer<char> tabulated_;
+  MembraneData data_{};
+};
 
 // Numbers of a matrix that a factor is of, which outlive the state that they are of.
 struct NeighbourNumbers {

@@ -1,5 +1,3 @@
-#include "cloth/contact_setup.hpp"
-
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -7,6 +5,7 @@
 #include <utility>
 
 #include "cloth/refusal.hpp"
+#include "cloth/solver.hpp"
 
 namespace sim_core {
 namespace {

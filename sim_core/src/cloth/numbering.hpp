@@ -1,15 +1,40 @@
-// Numbers of nodes: free vertices in the order of elimination, then held vertices, then the vertices of
-// surfaces and the points of skeletons, which are no cloth and move as prescribed.
+// Order of elimination by nested dissection, and the numbers of nodes that follow from it.
 #pragma once
 
 #include <cstdint>
 #include <vector>
 
-#include "cloth/ordering.hpp"
-#include "cloth/plate.hpp"
+#include "cloth/mesh.hpp"
 
 namespace sim_core {
 
+using Graph = std::vector<std::vector<int>>;  // neighbours of each node, sorted, itself included
+
+struct Dissection {
+  std::vector<int> order;        // nodes of the graph in the order of elimination
+  std::vector<int> pivot_begin;  // (fronts + 1): pieces of `order`, children before parents
+  std::vector<int> parent;       // (fronts): -1 at the root
+};
+
+// Bisects along the longest side of the remaining set, by coordinates in the plane or in space [George 1973].
+Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points);
+
+// Which nodes each row of a matrix has entries for, in compressed rows: those of row i are node[begin[i]] ... ,
+// ascending.
+struct Pattern {
+  std::vector<int> begin{0}, node;
+
+  void add_row(const std::vector<int>& nodes);
+  int rows() const { return static_cast<int>(begin.size()) - 1; }
+  // Place of (i, j) in `node`; -1 if there is none, as for held nodes.
+  int slot(int i, int j) const;
+};
+
+// The pattern of a graph in the order of elimination; `place`: of each node in it.
+Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place);
+
+// Free vertices in the order of elimination, then held vertices, then the vertices of surfaces and the points of
+// skeletons, which are no cloth and move as prescribed.
 struct Numbering {
   int vertices, others, bones, nodes, free_nodes;
   std::vector<int> node, vertex;  // of a vertex, another or a point of a skeleton, and back

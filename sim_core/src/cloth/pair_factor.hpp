@@ -10,8 +10,6 @@
 
 #include "cloth/assembly.hpp"
 #include "cloth/factor.hpp"
-#include "cloth/factor_settings.hpp"
-#include "cloth/fronts.hpp"
 #include "cloth/settings.hpp"
 #include "contact/contact_set.hpp"
 #include "contact/state.hpp"

@@ -1,10 +1,9 @@
-#include "cloth/plate.hpp"
-
 #include <Eigen/Dense>
 #include <algorithm>
 #include <map>
 #include <utility>
 
+#include "cloth/mesh.hpp"
 #include "cloth/refusal.hpp"
 
 namespace sim_core {

@@ -1,5 +1,5 @@
 // What the cloth kernels work on: plain arrays, owned by ClothSolver. Nothing here may pull in a template of the
-// standard library: kernels/kernel.hpp is compiled once per instruction set, and the linker must never merge their
+// standard library: kernels/kernel.cpp is compiled once per instruction set, and the linker must never merge their
 // instances.
 //
 // Nodes are numbered in the order of elimination: free nodes first, held ones after. Vectors over nodes have four
@@ -153,7 +153,7 @@ struct ClothKernel {
                 int iterations, double tolerance);
 };
 
-// One for each instruction set that they are compiled for; kernels/kernel.hpp is the code of all of them.
+// One for each instruction set that they are compiled for; kernels/kernel.cpp is the code of all of them.
 extern const ClothKernel cloth_baseline, cloth_x86_64_v3, cloth_x86_64_v4;
 
 }  // namespace sim_core

@@ -3,8 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cloth/contact_setup.hpp"
-#include "cloth/intersections.hpp"
+#include "cloth/mesh.hpp"
 #include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
 #include "kernel_levels.hpp"

@@ -10,15 +10,41 @@
 #include <utility>
 #include <vector>
 
-#include "cloth/constants.hpp"
-#include "cloth/contact_setup.hpp"
 #include "cloth/control.hpp"
-#include "cloth/properties.hpp"
+#include "cloth/mesh.hpp"
+#include "cloth/numbering.hpp"
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
-#include "contact/materials.hpp"
+#include "contact/contact_set.hpp"
+#include "contact/smooth.hpp"
+#include "contact/surface.hpp"
 
 namespace sim_core {
+
+// Triangles that are no cloth, the surface that each of their vertices belongs to, the initial positions of these, and
+// the angle from which edges of each surface are sharp, rad.
+struct SurfaceMeshes {
+  Triangles triangles;
+  std::vector<std::int32_t> surface_of_vertex;
+  Points3 positions;
+  std::vector<double> crease;
+};
+
+// Contact of a cloth with itself, its sheets and surfaces, set up from meshes (contact_setup.cpp).
+//
+// Side of a cell of the coarsest sheet, m.
+double cell_of(const ClothMesh& mesh);
+// The materials with skeletons of these bodies.
+ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
+                                const std::vector<Body>& bodies, double cell);
+
+// Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
+std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
+                                           const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                           const std::vector<Skeleton>& skeletons, const Constants& constants);
+std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
+                                                 const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                                 const SmoothSettings& settings);
 
 // What a solver is made of.
 struct ClothSetup {

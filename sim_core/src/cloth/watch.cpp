@@ -1,11 +1,10 @@
-#include "cloth/watch.hpp"
-
 #include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <cmath>
 
 #include "cloth/refusal.hpp"
+#include "cloth/stepping.hpp"
 
 namespace sim_core {
 

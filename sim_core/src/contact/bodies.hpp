@@ -1,9 +1,11 @@
-// Bodies that cloth touches: their gaps, normals and motion.
+// Bodies that cloth touches: their gaps, normals and motion, their cores and skeletons.
 #pragma once
 
 #include <Eigen/Core>
 #include <array>
 #include <vector>
+
+#include "contact/settings.hpp"
 
 namespace sim_core {
 
@@ -38,5 +40,40 @@ Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3
 
 // The body at a share of its motion from a to b: straight, and at an even turn.
 Body between(const Body& a, const Body& b, double share);
+
+// The core of a body, which no cloth may pass: the body that got thinner from all sides until one dimension was left
+// with no thickness. A ball's is its centre, a cylinder's its axis, and a box's a rectangle.
+struct Core {
+  double radius;         // m: distance from the core to the body's face, where that is nearest
+  Eigen::Vector2d half;  // m: half edges of the rectangle, the longer first; infinite along a cylinder
+  Eigen::Matrix3d axes;  // of the rectangle and across it, in the body's axes
+};
+
+// A plane's has an infinite radius.
+Core core_of(const Body& body);
+
+// Three corners in the axes of a core, at the start or the end of a step.
+using Corners = std::array<Eigen::Vector3d, 3>;
+
+// Whether a triangle whose corners go straight from `start` to `end` passes the core.
+bool passes(const Core& core, const Corners& start, const Corners& end);
+
+// The points, segments and faces of a body's core, which cloth touches by pairs of closest points at the distance of
+// the radius. What is small against a cell slips through between vertices, so vertices do not feel it.
+struct Skeleton {
+  int body;
+  double radius;  // m
+  bool whole;     // no vertex touches the body itself; else vertices do, and pairs hold what lies between them
+  std::vector<Eigen::Vector3d> points;  // in the body's axes, m
+  std::vector<std::array<int, 2>> segments;
+  std::vector<std::array<int, 3>> triangles;  // with two corners alike: a segment, for vertices
+
+  Eigen::Vector3d point(const Body& at, int i) const { return at.origin + at.rotation * points[i]; }
+};
+
+// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from the cloth, which
+// lies between `low` and `high`.
+std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell, const Eigen::Vector3d& low,
+                                   const Eigen::Vector3d& high, double beyond, const SkeletonSettings& settings);
 
 }  // namespace sim_core

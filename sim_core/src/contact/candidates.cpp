@@ -1,8 +1,8 @@
-#include "contact/candidates.hpp"
-
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+
+#include "contact/path.hpp"
 
 namespace sim_core {
 namespace {

@@ -1,12 +1,100 @@
 #include "contact/contact_set.hpp"
 
+#include <Eigen/Geometry>
+#include <Eigen/LU>
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <utility>
 
 namespace sim_core {
+namespace {
 
 using Eigen::Matrix3d;
+using Eigen::Vector3d;
+using Eigen::Vector4d;
+
+// How the closest points move over their pieces, and how the normal turns, by a pair's motions m, m_1, m_2: they lie
+// where rho is across the directions a_k = sum w_ki x_i, so that
+//
+//     sum_l a_k . a_l dtheta_l = -(a_k . m + rho . m_k),   dn = (1 - n n^T) (m + sum a_k dtheta_k)/d.
+void turn(Pair& pair, const Buffer<double>& x) {
+  pair.sliding.setZero();
+  pair.turning.setZero();
+  if (!pair.active() || pair.at.force.isZero(0.0)) return;
+  const FourPoints at = points_of(pair.who, x);
+  const int count = (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
+  const double distance = pair.at.gap + pair.thickness;
+  const Vector3d n = pair.at.normal, rho = distance * n;
+  Eigen::Matrix<double, 3, 2> a;
+  a << between_closest(pair.along_first, at), between_closest(pair.along_second, at);
+  Eigen::Matrix<double, 2, 9> asked = Eigen::Matrix<double, 2, 9>::Zero();
+  for (int k = 0; k < count; ++k) {
+    asked.block<1, 3>(k, 0) = -a.col(k).transpose();
+    asked.block<1, 3>(k, 3 + 3 * k) = -rho.transpose();
+  }
+  if (count == 2) {
+    const Eigen::Matrix2d inner = a.transpose() * a;
+    pair.sliding = inner.inverse() * asked;
+  } else if (count == 1) {
+    pair.sliding.row(0) = asked.row(0) / a.col(0).squaredNorm();
+  }
+  Eigen::Matrix<double, 3, 9> way = a * pair.sliding;
+  way.leftCols<3>() += Matrix3d::Identity();
+  pair.turning = pair.row.turning * (way - n * (n.transpose() * way)) / distance;
+}
+
+}  // namespace
+
+PairPast::PairPast(const Pair& pair)
+    : who(pair.who),
+      feature(pair.feature),
+      mode(pair.row.mode),
+      force(pair.at.force),
+      change(pair.change),
+      normal(pair.at.normal),
+      middle(pair.middle),
+      scale(pair.scale),
+      penalty_scale(pair.penalty_scale),
+      missed(violation(pair.at, pair.row.mode)) {}
+
+PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
+  PairMotions out = given;
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] >= free_nodes) continue;
+    const Vector3d way = at_node(change, who.node[c]).cast<double>();
+    out.segment<3>(0) += weights[c] * way;
+    out.segment<3>(3) += along_first[c] * way;
+    out.segment<3>(6) += along_second[c] * way;
+  }
+  return out;
+}
+
+Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
+  Eigen::Matrix<double, 9, 9> out;
+  out.topRows<3>() = -turning;
+  out.topLeftCorner<3, 3>() += row.stiffness;
+  out.middleRows<3>(3) = -at.force * sliding.row(0);
+  out.bottomRows<3>() = -at.force * sliding.row(1);
+  return out;
+}
+
+Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
+  Vector3d out = given.head<3>();
+  for (int c = 0; c < 4; ++c) {
+    if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
+  }
+  return out;
+}
+
+Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
+  const PairMotions way = motions(change, free_nodes);
+  return row.force - row.stiffness * way.head<3>() + turning * way;
+}
+
+double violation(const PairKinematics& at, int mode) {
+  return std::hypot(at.gap, mode == contact_stick ? at.slip.norm() : 0.0);
+}
 
 ContactSet::ContactSet(Surface surface, const ContactMaterials& materials, const ContactSettings& settings,
                        const PathSettings& path, double margin, int free_nodes)
@@ -104,6 +192,92 @@ void ContactSet::solved(const Buffer<float>& change) {
 void ContactSet::return_to_best() {
   base_ = best_;
   for (PairPast& pair : base_) pair.change.setZero();
+}
+
+bool ContactSet::resume() {
+  bool any = false;
+  for (Pair& pair : pairs_) {
+    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings_.closing_gap * pair.scale) continue;
+    PairKinematics touching = pair.at;
+    touching.gap = 0.0;
+    const PairLinearization row = linearize(touching);
+    if (row.mode == contact_open) continue;
+    pair.row = row;
+    pair.row.force -= row.stiffness * pair.at.gap * pair.at.normal;
+    any = true;
+  }
+  return any;
+}
+
+bool ContactSet::activate(const Buffer<float>& change) {
+  bool changed = false;
+  for (Pair& pair : pairs_) {
+    if (!pair.added) continue;
+    const Vector3d force = pair.at.force + pair.force_change(change, free_nodes_);
+    if (force.dot(pair.at.normal) >= 0.0) continue;
+    pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.at.force};
+    pair.turning.setZero();
+    pair.sliding.setZero();
+    pair.added = false;
+    pair.released = changed = true;
+  }
+  for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
+    bool any = false;
+    for (Pair& pair : pairs_) {
+      if (pair.who.kind != kind || pair.active() || pair.released) continue;
+      const Vector3d motion = pair.motion(change, free_nodes_);
+      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings_.closing_gap * pair.scale)) continue;
+      pair.row = linearize_closing(pair.at, motion);
+      pair.added = any = true;
+    }
+    if (any) return true;
+  }
+  return changed;
+}
+
+void ContactSet::linearize_at(const Buffer<double>& x) {
+  for (Pair& pair : pairs_) {
+    pair.row = linearize(pair.at);
+    turn(pair, x);
+  }
+}
+
+PairData ContactSet::rows() {
+  nodes_.clear();
+  weights_.clear();
+  stiffness_.clear();
+  for (const Pair& pair : pairs_) {
+    if (!pair.active()) continue;
+    for (int c = 0; c < 4; ++c) {
+      nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
+    }
+    for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
+      for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
+    }
+    const Eigen::Matrix<double, 9, 9> stiffness = pair.stiffness();
+    for (int column = 0; column < 9; ++column) {
+      for (int r = 0; r < 9; ++r) {
+        stiffness_.push_back(static_cast<float>(stiffness(r, column)));
+        if (r % 3 == 2) stiffness_.push_back(0.0f);
+      }
+    }
+  }
+  return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
+}
+
+void ContactSet::subtract_right_side(Buffer<float>& force) const {
+  for (const Pair& pair : pairs_) {
+    PairMotions change = -pair.stiffness() * pair.given;
+    change.head<3>() += pair.row.force;
+    if (change.isZero(0.0)) continue;
+    for (int c = 0; c < 4; ++c) {
+      if (pair.who.node[c] >= free_nodes_) continue;
+      at_node(force, pair.who.node[c]) -=
+          (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) +
+           pair.along_second[c] * change.segment<3>(6))
+              .cast<float>();
+    }
+  }
 }
 
 }  // namespace sim_core

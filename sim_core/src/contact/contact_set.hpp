@@ -1,14 +1,104 @@
-// Contacts of cloth with itself and with other cloth: the pairs of closest points, their forces from step to step
-// (matching.cpp), which of them are active (active_set.cpp), and their rows of Newton's system (linearization.cpp).
+// Contacts of cloth with itself, with other cloth and with surfaces: the pairs of closest points (detection.cpp), their
+// forces from step to step (matching.cpp), which of them are active, and their rows of Newton's system.
 #pragma once
 
 #include <Eigen/Core>
 #include <vector>
 
-#include "contact/detection.hpp"
+#include "cloth/problem.hpp"
+#include "contact/law.hpp"
+#include "contact/path.hpp"
+#include "contact/settings.hpp"
 #include "contact/state.hpp"
+#include "contact/surface.hpp"
 
 namespace sim_core {
+
+// (m, m_1, m_2): motions of the pair's first point over its second, and of its two pieces along themselves, m.
+using PairMotions = Eigen::Matrix<double, 9, 1>;
+
+// One pair of closest points: its geometry, its force, and its part of Newton's system.
+struct Pair {
+  Candidate who;
+  int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node (after the edges);
+                // or the second edge
+  Eigen::Vector4d weights;
+  PairKinematics at;
+  Eigen::Vector3d middle;  // of the two points, or with a skeleton that of the cloth, m
+  double thickness;        // m: that it keeps apart
+  double scale;            // m: that of the cloth, which is less with a skeleton
+  // Derivatives of the weights by the places of the closest points on their pieces.
+  Eigen::Vector4d along_first, along_second;
+  // Part of its motions that held nodes still have to make, m.
+  PairMotions given = PairMotions::Zero();
+  // Derivatives by the motions: of the places of the closest points, and of the force as the normal turns.
+  Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
+  Eigen::Matrix<double, 3, 9> turning = Eigen::Matrix<double, 3, 9>::Zero();
+  Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force in the last linear problem, N
+  PairLinearization row{};
+  double penalty_scale = 1.0;            // growth of its proximal stiffness in this attempt
+  bool added = false, released = false;  // in the linear problem at hand, whatever the law says
+
+  bool active() const { return row.mode != contact_open; }
+  // Motion of its first point over its second, m; all of its motions; and the change of its force by them, N.
+  Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
+  PairMotions motions(const Buffer<float>& change, int free_nodes) const;
+  Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
+  // C, N/m.
+  Eigen::Matrix<double, 9, 9> stiffness() const;
+};
+
+// Record of a pair at an earlier iterate.
+struct PairPast {
+  Candidate who;
+  int feature, mode;
+  Eigen::Vector3d force, change, normal, middle;
+  double scale, penalty_scale;
+  double missed;  // violation of its row, m; see `violation`
+
+  PairPast(const Pair& pair);
+};
+
+// Length by which an active pair violates its row: gap and, where it sticks, slip, m.
+double violation(const PairKinematics& at, int mode);
+
+// Finds closest points of cloth with itself, other cloth and surfaces, and how they have moved.
+class PairDetection {
+ public:
+  PairDetection(Surface surface, const ContactMaterials& materials, const ContactSettings& settings,
+                const PathSettings& path, double margin, int free_nodes);
+
+  Neighbourhood near;
+  const ContactMaterials materials;
+
+  // See ContactSet::begin.
+  void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
+             std::vector<Eigen::Matrix3d> own, std::vector<Eigen::Matrix3d> bone_turns);
+  // Replaces `pairs` by those at x, sorted by kind, first and feature, without forces. `smoothing` [m] and `stiff`: see
+  // ContactSet.
+  void find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs);
+  // The skeleton of a pair, or null.
+  const Bone* bone_of(const Candidate& pair) const;
+  // Least distance of any two pieces without a common node at the last search, m; infinite where none is near.
+  double least_distance() const { return least_distance_; }
+
+ private:
+  void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
+                     std::vector<Pair>& pairs);
+  void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x, std::vector<Pair>& pairs);
+  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x,
+           std::vector<Pair>& pairs);
+  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights, const Eigen::Vector3d& rho);
+
+  ContactSettings settings_;
+  int free_nodes_;
+  double least_distance_, smoothing_ = 0.0;
+  bool stiff_ = false;
+  const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
+  Turns turns_;
+  std::vector<Eigen::Matrix3d> bone_turns_;
+  std::vector<Eigen::Matrix3d> own_;  // stiffness of the free nodes, N/m
+};
 
 class ContactSet {
  public:

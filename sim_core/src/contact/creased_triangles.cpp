@@ -1,12 +1,10 @@
-#include "contact/creased_triangles.hpp"
-
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <numeric>
 #include <utility>
 
-#include "contact/pn_patch.hpp"
+#include "contact/pn_triangles.hpp"
 
 namespace sim_core {
 namespace {

@@ -1,10 +1,10 @@
-#include "contact/detection.hpp"
-
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <utility>
+
+#include "contact/contact_set.hpp"
 
 namespace sim_core {
 namespace {

@@ -15,6 +15,31 @@
 //
 // The second line is friction that turns with the slip; its stiffness is `turning`. Without it friction would keep its
 // direction for the whole step.
+//
+// Between two pieces of cloth, at one pair of closest points, the same law holds with the gap g = |rho| - thickness.
+// The pair's force r is an unknown of its own: it acts with w_i r on the nodes of the pair (contact/closest.hpp).
+// Newton's method takes the derivative of the branch at hand, with a proximal term [Rockafellar 1976], by which pairs
+// that say the same do no harm: g + dg + dr_N/kappa = 0 along the normal, u + du + dr_T/lambda = 0 across it. It
+// vanishes as the iteration converges. With the pair's motion v = sum w_i dx_i the row is dr = force - stiffness v:
+//
+//     open :  stiffness 0                       force -r
+//     stick:  kappa n n^T + lambda (1 - n n^T)  -kappa g n - lambda u
+//     slip :  kappa (n + mu t) n^T + s P        -kappa g n + (mu r_N - t . r_T - mu kappa g) t - (s / (beta k)) P r_T
+//
+// with t = tau/|tau|, beta = mu r_N/|tau|, P = 1 - n n^T - t t^T and s = min(lambda, beta k/(1 - beta)), by which
+// friction turns with the slip.
+//
+// Where this does not find which pairs bear and which slip, the law is smoothed over an energy epsilon, as by the
+// logarithms of the slack in r_N >= 0 and to |r_T| <= mu r_N: r_N g = epsilon and u = -2 epsilon r_T/((mu r_N)^2 -
+// |r_T|^2). In the form above, which holds whatever sign g has [Chen & Harker 1993; Kanzow 1996],
+//
+//     r_N = R_N = (z + sqrt(z^2 + 4 k epsilon))/2,  z = r_N - k g,
+//     r_T = rho t,  rho + 2 k epsilon rho/((mu R_N)^2 - rho^2) = |tau|,
+//
+// and it is the exact law in the limit of no epsilon.
+//
+// As the normal turns, friction turns with it: dr = turning dn, to which sticking pairs, whose force is what holds
+// them, add nothing.
 #pragma once
 
 #include <Eigen/Core>
@@ -50,5 +75,29 @@ ContactLinearization closed_row(const ContactKinematics& at, double turning_max)
 // The rows of a branch that is chosen, whatever the law says at the iterate.
 ContactLinearization sticking_row(const ContactKinematics& at);
 ContactLinearization slipping_row(const ContactKinematics& at, const Eigen::Vector3d& direction, double turning);
+
+// State of a pair at an iterate: the normal is from the second to the first, the slip that of the first over the
+// second, and the force that on the first.
+struct PairKinematics : ContactKinematics {
+  double along, across;    // kappa and lambda: proximal, along the normal and across it, N/m
+  double smoothing = 0.0;  // epsilon, J
+};
+
+// Its row of Newton's system: dr = force - stiffness v + turning dn.
+struct PairLinearization {
+  int mode = 0;                                         // ContactMode
+  Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m
+  Eigen::Matrix3d symmetric = Eigen::Matrix3d::Zero();  // its part for the factor: without mu kappa t n^T
+  Eigen::Vector3d force = Eigen::Vector3d::Zero();      // N
+  Eigen::Matrix3d turning = Eigen::Matrix3d::Zero();    // N: by the normal's change
+};
+
+// The branch that holds there. A pair that sinks in is about to bear more than r_N: it sticks up to mu (r_N - k g).
+PairLinearization linearize(const PairKinematics& at);
+// The branch of a pair that `motion` closes, whatever its gap and force are now: it sticks if it slips by no more than
+// mu times what it would sink in, and it slips else.
+PairLinearization linearize_closing(const PairKinematics& at, const Eigen::Vector3d& motion);
+// Square of the force by which the law is missed, N^2.
+double pair_error_squared(const PairKinematics& at);
 
 }  // namespace sim_core

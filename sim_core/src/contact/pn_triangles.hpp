@@ -24,15 +24,70 @@
 
 #include <Eigen/Core>
 #include <array>
+#include <map>
 #include <optional>
 #include <vector>
 
-#include "contact/creased_triangles.hpp"
-#include "contact/pn_patch.hpp"
-#include "contact/smooth_settings.hpp"
+#include "contact/settings.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
+
+// Triangles of a smooth surface: their orientation, neighbours, and which edges are sharp.
+struct CreasedTriangles {
+  std::vector<std::array<int, 3>> triangles;  // nodes, oriented alike where they can be
+  std::vector<std::array<int, 3>> across;     // triangle over the edge opposite each corner; -1 at a border
+  std::vector<std::array<int, 3>> sharp;      // 1 where that edge is sharp
+  std::vector<std::array<int, 3>> group;      // of the corners; corners of one group share a normal
+  std::vector<int> around_begin, around;      // triangles around each node
+  int groups = 0;
+
+  // `crease`: angle between the normals of two triangles from which their edge is sharp, rad, of each triangle.
+  CreasedTriangles(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x,
+                   const std::vector<double>& crease);
+
+  Eigen::Vector3d facet_normal(const Buffer<double>& x, int triangle) const;
+  // Corner of a triangle at a node.
+  int corner_of(int triangle, int node) const;
+
+ private:
+  using Sides = std::map<std::array<int, 2>, std::vector<int>>;  // triangles at each edge
+  int other(const Sides& sides, int triangle, int corner) const;
+  bool runs(int triangle, int i, int j) const;
+  void orient(const Sides& sides);
+  void find_sharp(const Sides& sides, const Buffer<double>& x, const std::vector<double>& crease);
+};
+
+// Corners of a triangle after one of them.
+inline int next(int corner) { return (corner + 1) % 3; }
+inline int after_next(int corner) { return (corner + 2) % 3; }
+
+// One curved triangle: y(b) and N(b).
+struct PNPatch {
+  std::array<Eigen::Vector3d, 3> corner, normal;
+  std::array<Eigen::Vector3d, 3> near,
+      far;                              // handles E_ij and E_ji of the edge opposite each corner, i the next corner
+  std::array<Eigen::Vector3d, 3> bend;  // Q_ij of that edge
+  Eigen::Vector3d middle;               // C
+
+  Eigen::Vector3d y(const Eigen::Vector3d& b) const;
+  Eigen::Vector3d n(const Eigen::Vector3d& b) const;
+  // Derivatives by each coordinate of b.
+  Eigen::Matrix3d dy(const Eigen::Vector3d& b) const;
+  Eigen::Matrix3d dn(const Eigen::Vector3d& b) const;
+
+  // Place s in [0, 1] on the curved edge opposite corner k, from the next corner on, that is closest to p.
+  double closest_on_edge(int k, const Eigen::Vector3d& p) const;
+};
+
+// Root of y(b) + height n(b)/|n| = p, in the triangle or its continuation beyond the edges.
+struct PNRoot {
+  Eigen::Vector3d b, normal, point;
+  double height = 0.0;  // m
+  bool found = false;
+
+  PNRoot(const PNPatch& patch, const Eigen::Vector3d& p, const SmoothSettings& settings);
+};
 
 // Where a surface is: its nodes, and of the corners of its triangles the normals and the largest curvature of an edge
 // there, seen from the side where the normals point to and from the other, 0 where it is hollow.

@@ -12,9 +12,9 @@
 #include <optional>
 #include <vector>
 
-#include "contact/materials.hpp"
-#include "contact/nearest.hpp"
+#include "contact/closest.hpp"
 #include "contact/pn_triangles.hpp"
+#include "contact/surface.hpp"
 
 namespace sim_core {
 

@@ -9,7 +9,7 @@
 #include "cloth/problem.hpp"
 #include "contact/bodies.hpp"
 #include "contact/law.hpp"
-#include "contact/node_settings.hpp"
+#include "contact/settings.hpp"
 #include "contact/smooth.hpp"
 #include "math/buffer.hpp"
 

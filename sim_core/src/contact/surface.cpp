@@ -1,17 +1,34 @@
 #include "contact/surface.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
+#include <cmath>
 #include <utility>
 
 namespace sim_core {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
+  const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]), b = at_node(x, corner[2]) - at_node(x, corner[0]);
+  Matrix3d out;
+  out.col(0) = a.normalized();
+  out.col(2) = a.cross(b).normalized();
+  out.col(1) = out.col(2).cross(out.col(0));
+  return out;
+}
+
+}  // namespace
 
 Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in,
                  CollisionMask collides_in, const Bones& bones)
     : triangles(std::move(triangles_in)),
       around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
-      collides(std::move(collides_in)),
       bone_triangles(static_cast<int>(triangles.size())),
+      collides(std::move(collides_in)),
       last_collider(collides.rows(), -1) {
   triangles.insert(triangles.end(), bones.triangles.begin(), bones.triangles.end());
   const int first_bone = bones.points.empty() ? static_cast<int>(sheet_of_node.size()) : bones.points.front();
@@ -58,6 +75,40 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
   bone_edges = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
                                 edges.begin());
   bone_vertices = static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) - vertices.begin());
+}
+
+void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes) {
+  free_nodes_ = free_nodes;
+  start_ = start;
+  expected_ = expected;
+  ++step_;
+}
+
+const Matrix3d& Turns::of(const Surface& surface, int node) {
+  nodes_.resize(surface.sheet_of_node.size());
+  Turn& here = nodes_[node];
+  if (here.step == step_) return here.turn;
+  here.step = step_;
+  here.turn.setZero();
+  const int begin = surface.around_begin[node], end = surface.around_begin[node + 1];
+  for (int t = begin; t < end; ++t) here.turn += turn_of(surface, surface.around[t]);
+  here.turn /= end - begin;
+  if (node < free_nodes_) {
+    const double angle = std::sqrt(std::max(3.0 - here.turn.trace(), 0.0));
+    here.turn =
+        Matrix3d::Identity() + std::clamp(2.0 - angle / turn_max_, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
+  }
+  return here.turn;
+}
+
+const Matrix3d& Turns::turn_of(const Surface& surface, int triangle) {
+  triangles_.resize(surface.triangles.size());
+  Turn& here = triangles_[triangle];
+  if (here.step == step_) return here.turn;
+  here.step = step_;
+  const auto& corner = surface.triangles[triangle];
+  here.turn = axes(corner, expected_) * axes(corner, start_).transpose();
+  return here.turn;
 }
 
 }  // namespace sim_core

@@ -1,11 +1,67 @@
-// Triangles that may touch: their corners, edges, and what lies around each.
+// Sheets and surfaces that may touch: thickness and friction, triangles, and how these turn in a step.
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <array>
 #include <vector>
 
+#include "contact/closest.hpp"
+#include "math/buffer.hpp"
+
 namespace sim_core {
+
+// What cloth touches of a body by pairs alone, or besides its vertices.
+struct Bone {
+  int body;
+  double radius;  // m: what pairs keep apart
+  bool whole;     // see Skeleton
+};
+
+// Of sheets and, after them, surfaces and skeletons.
+struct ContactMaterials {
+  std::vector<double> thickness;  // m: two keep the mean of theirs apart
+  Eigen::MatrixXd mu;             // of each two; negative: they do not touch each other
+  int sheets;                     // that come before the surfaces
+  // Shares of the thickness that edges of two sheets, and vertices of the later over triangles of the earlier, keep.
+  // Where sheets lie flat on each other, these pairs are redundant to those of the earlier sheet's vertices: the active
+  // set is not unique and changes all the time. With less than 1 they are active where cloth is curved only.
+  double edge_share = 1.0, second_share = 1.0;
+  double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
+  double cell = 0.0;            // m: side of a cell, of the coarsest sheet
+  std::vector<Bone> bones;
+
+  int first_bone() const { return static_cast<int>(thickness.size()); }
+  // Of two sheets, surfaces and skeletons: the skeleton, or null.
+  const Bone* bone_of(int a, int b) const {
+    const int last = std::max(a, b) - first_bone();
+    return last < 0 ? nullptr : &bones[last];
+  }
+  double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
+  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves (contact/smooth.hpp): pairs only
+  // hold what comes nearer between the nodes.
+  double apart(int a, int b) const {
+    if (const Bone* bone = bone_of(a, b)) return bone->radius;
+    return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
+  }
+  // The same by kind of pair; `first` and `second`: sheets of its pieces.
+  double apart(PairKind kind, int first, int second) const {
+    const bool other = first != second && std::max(first, second) < sheets;
+    const double share = !other ? 1.0 : kind == PairKind::edge_edge ? edge_share : first > second ? second_share : 1.0;
+    return share * apart(first, second);
+  }
+  // The largest of these without skeletons; without any, the largest thickness of a sheet.
+  double farthest() const {
+    double out = 0.0;
+    if ((mu.topLeftCorner(first_bone(), first_bone()).array() < 0.0).all()) {
+      return *std::max_element(thickness.begin(), thickness.begin() + sheets);
+    }
+    for (int a = 0; a < first_bone(); ++a) {
+      for (int b = 0; b <= a; ++b) out = mu(a, b) < 0.0 ? out : std::max(out, apart(a, b));
+    }
+    return out;
+  }
+};
 
 using CollisionMask = Eigen::Matrix<bool, Eigen::Dynamic, Eigen::Dynamic>;
 
@@ -16,6 +72,7 @@ struct Bones {
   std::vector<std::array<int, 3>> triangles;
 };
 
+// Triangles that may touch: their corners, edges, and what lies around each.
 struct Surface {
   std::vector<std::array<int, 3>> triangles;       // nodes
   std::vector<std::array<int, 2>> edges;           // nodes, the lower first; ascending
@@ -31,6 +88,38 @@ struct Surface {
   Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, CollisionMask collides,
           const Bones& bones = {});
   bool may_touch(int node, int other) const { return collides(sheet_of_node[node], sheet_of_node[other]); }
+};
+
+// How a surface turns in a step: a rotation at each node, so that what wanders over the surface is carried by one that
+// changes without a jump from one triangle to the next.
+//
+// A triangle turns by Q Q0^T, with Q = [a, n x a, n] of its first side and its normal where it was expected, and Q0 the
+// same at the start. A node turns by the mean over the triangles around it. That is no rotation where these turn
+// unlike, but what it carries is as short as cloth is thick, and it is one where the surface moves rigidly.
+//
+// The end of the step is taken as velocities lead there, lest a law that carries by it should have derivatives by all
+// nodes around: what this misses is of the order dt^2, and none of it is left where motion ends. Turns of free nodes
+// that are large fade out.
+class Turns {
+ public:
+  // `turn_max`: angle up to which the turn of a free node counts, rad; from twice that it does not.
+  explicit Turns(double turn_max) : turn_max_(turn_max) {}
+
+  // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones go there surely.
+  void begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes);
+  const Eigen::Matrix3d& of(const Surface& surface, int node);
+
+ private:
+  const Eigen::Matrix3d& turn_of(const Surface& surface, int triangle);
+
+  struct Turn {
+    int step = 0;  // to which it belongs
+    Eigen::Matrix3d turn;
+  };
+  double turn_max_;
+  std::vector<Turn> triangles_, nodes_;
+  Buffer<double> start_, expected_;
+  int step_ = 0, free_nodes_ = 0;
 };
 
 }  // namespace sim_core

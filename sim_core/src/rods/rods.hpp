@@ -54,7 +54,7 @@ template <class Batch>
 using RodKernel = void (*)(const Batch&, const RodSettings&, const std::vector<SamplePoint>&, std::int64_t begin,
                            std::int64_t end);
 
-// What is compiled for one instruction set: kernel.hpp is the code of all of them, and all return the same bits. They
+// What is compiled for one instruction set: kernel.cpp is the code of all of them, and all return the same bits. They
 // are constants, so that no code for wider vectors runs where they are listed.
 struct RodKernels {
   RodKernel<RodBatch> solve;

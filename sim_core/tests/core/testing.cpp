@@ -10,8 +10,8 @@
 #include <tuple>
 
 #include "cloth/assembly.hpp"
-#include "contact/nearest.hpp"
-#include "contact/pair_law.hpp"
+#include "contact/closest.hpp"
+#include "contact/law.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
 #include "kernel_levels.hpp"
@@ -182,5 +182,5 @@ NB_MODULE(_testing, m) {
         return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(at));
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a, "smoothing"_a = 0.0,
-      "mode, stiffness, its symmetric part, force and squared error; see contact/pair_law.hpp.");
+      "mode, stiffness, its symmetric part, force and squared error; see contact/law.hpp.");
 }

@@ -1,7 +1,7 @@
 // Flexible GMRES.
 #pragma once
 
-#include "cloth/kernels/contact.hpp"
+#include "cloth/kernels/matrix.hpp"
 #include "cloth/kernels/triangular.hpp"
 
 namespace sim_core {

@@ -1,4 +1,4 @@
-#include "cloth/constants.hpp"
+#include "cloth/settings.hpp"
 
 #include <cmath>
 
