@@ -33,8 +33,7 @@ from plan import coordinator, peak_megabytes, spec
 from sqlalchemy import Row, text
 from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk, encode_shard
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import FileEntry
+from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest

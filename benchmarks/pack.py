@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from stickslip_schemas.documents.tasks import ChunkRef, PackSlot, PackTask, RecordRef
 from stickslip_schemas.format.codecs import encode_chunk
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.pack import pack

@@ -25,12 +25,12 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from stickslip_schemas.base.keys import referred, sha256
+from stickslip_schemas.base import referred, sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
-from stickslip_schemas.scene.sheets import FileMesh
+from stickslip_schemas.scene.parts import FileMesh
 from stickslip_schemas.spec.axes import SobolAxis, drawn_values
 from stickslip_schemas.spec.fabrics import Material
 from stickslip_sim_core.cloth import meshes

@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 from harness import command_line, pids, wait_for
 from sqlalchemy import func, select, text
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_services.database.database import Database
 from stickslip_services.database.tables import tasks, workers
 from stickslip_testing.invariants import violations

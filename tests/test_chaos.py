@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from harness import PATIENCE, STICKSLIP, Service, command_line, descendants, read_arrays, wait_for
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage, sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEAL_NAME, SEALED_NAMES, Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds

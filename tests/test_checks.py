@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.kinds.cloth.arrays import CHECKS as LABELS
 from stickslip_sim_core.cloth.checks import CHECKS
 

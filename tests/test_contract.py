@@ -9,7 +9,7 @@ import stickslip_sim_core
 import yaml
 from pydantic import ValidationError
 from stickslip_schemas.documents.certificate import Certificate
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import KINDS, UnknownKindError, job_spec_adapter
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec

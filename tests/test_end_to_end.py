@@ -11,7 +11,7 @@ import pytest
 import tensorstore
 import xarray
 from harness import STICKSLIP, Service, descendants, read_arrays
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_sim_core import other_minima, reach, self_contact_distance, solve_rods

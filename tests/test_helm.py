@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 import pytest
 import yaml
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_services.app import GRACE_SECONDS, make_app
 from stickslip_services.app import main as coordinator
 from stickslip_services.settings import Settings

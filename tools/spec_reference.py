@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec

@@ -7,7 +7,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from sqlalchemy import update
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS

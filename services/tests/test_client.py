@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
 from stickslip_services.app import make_app
 from stickslip_services.client import Client, ClientError, ProblemError, UnreachableError, pull, verify

@@ -2,7 +2,7 @@
 
 import pytest
 from sqlalchemy import select
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
 from stickslip_services.database.tables import cost_groups

@@ -3,7 +3,7 @@
 from math import sqrt
 
 import pytest
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_services.queue.eta import MODEL_ERROR, QUANTILE_80, StageTimings, StageWork, estimate
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, LeaseState
 from stickslip_services.access.asker import Asker, asking

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from fastapi import FastAPI
 from PIL import Image
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_schemas.scene.library import load_scene
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app

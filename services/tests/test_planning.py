@@ -7,7 +7,7 @@ import httpx
 import pytest
 from click.testing import CliRunner
 from sqlalchemy import select
-from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.base import JobState, Reason, Stage
 from stickslip_schemas.documents.responses import Progress
 from stickslip_services.app import make_app
 from stickslip_services.cli import wording

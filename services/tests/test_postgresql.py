@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from httpx_sse import connect_sse
 from sqlalchemy import func, select, text
 from sqlalchemy.exc import OperationalError
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import main
 from stickslip_services.cli import app

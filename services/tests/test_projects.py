@@ -7,7 +7,7 @@ from typing import Any
 import httpx
 import pytest
 from click.testing import CliRunner
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_services.access.asker import Asker, asking
 from stickslip_services.access.audit_log import read_audit_log
 from stickslip_services.access.projects import find_project, list_projects, set_quota

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text, with_manifest_digest
 from stickslip_services.app import make_app
 from stickslip_services.client.errors import (

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import event, select
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
 from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishSection, PublishTask, RenderTask
 from stickslip_schemas.documents.worker_api import LeaseRequest

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 from sqlalchemy import select
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.worker_api import Lease
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select, update
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.client.verifying import verify

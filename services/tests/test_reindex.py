@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 from sqlalchemy import text
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState, sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import main

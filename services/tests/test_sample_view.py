@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.format.manifest import layout, samples_per_file
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.library import built_in_files

@@ -8,8 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 from fastapi import FastAPI
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason, sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 from stickslip_services.app import make_app

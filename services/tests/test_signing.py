@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest_digest
 from stickslip_services.app import main, make_app
 from stickslip_services.cli.main import app as commands

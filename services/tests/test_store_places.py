@@ -8,7 +8,7 @@ import pytest
 import zarr
 import zarr.storage
 from click.testing import CliRunner, Result
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_services import app as program
 from stickslip_services.app import make_app

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import pause_job, resume_job

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
-from stickslip_schemas.base.keys import referred
+from stickslip_schemas.base import referred
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app

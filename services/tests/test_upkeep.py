@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 from sqlalchemy import select, update
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore

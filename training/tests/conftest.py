@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import Reason
-from stickslip_schemas.format.layout import layout, samples_per_file
-from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry, Manifest, Rejection
+from stickslip_schemas.base import Reason, sha256
+from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry, Manifest, Rejection, layout, samples_per_file
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, RecordRef
 from stickslip_schemas.format.codecs import encode_chunk
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import FileEntry, Rejection
+from stickslip_schemas.format.manifest import FileEntry, Rejection, layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id

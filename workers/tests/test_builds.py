@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.plan.sources import UNCOUNTED, sources
+from stickslip_schemas.plan.builds import UNCOUNTED, sources
 from stickslip_schemas.scene.library import load_scene
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_workers import builds

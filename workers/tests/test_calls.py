@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import ray
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_workers.calls import Call, Calls, NotDoneError
 from stickslip_workers.settings import Settings
 

@@ -13,11 +13,10 @@ import xarray
 import zarr
 from PIL import Image
 from publishing import publish_task
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
 from stickslip_schemas.format.codecs import encode_clip, encode_sample
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection
+from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection, layout
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds

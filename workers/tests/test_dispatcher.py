@@ -12,7 +12,7 @@ import fake_renderer
 import pytest
 import ray
 from coordinator_double import CoordinatorDouble
-from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.base import Reason, Stage
 from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation

@@ -5,7 +5,7 @@ import time
 from typing import Any, cast
 
 import pytest
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, PackTask
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack

@@ -12,7 +12,7 @@ import xarray
 import zarr
 from PIL import Image
 from publishing import changed
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, Pictures, check_seal
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import fake_renderer
 import pytest
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask, TaskResult, task_adapter
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation

@@ -4,7 +4,7 @@ import errno
 
 import pytest
 from ray import exceptions as ray_errors
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import SimulateTask, TaskResult
 from stickslip_schemas.kinds import UnknownKindError
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation

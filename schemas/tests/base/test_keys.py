@@ -1,7 +1,7 @@
 """Canonical JSON, and keys and seeds made of it."""
 
 import pytest
-from stickslip_schemas.base.keys import canonical_json, content_key, derived_seed
+from stickslip_schemas.base import canonical_json, content_key, derived_seed
 
 
 def test_canonical_json_is_one_text() -> None:

@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason, sha256
 from stickslip_schemas.format import manifest as module
 from stickslip_schemas.format.manifest import (
     MANIFEST_ATTRIBUTE,

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from stickslip_schemas.base.keys import canonical_json
+from stickslip_schemas.base import canonical_json
 from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, input_digests
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.plan.builds import Builds

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import ValidationError
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSimulation, ClothDragSpec

@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import Estimate, Interval, estimated
 from stickslip_schemas.plan.grid import count

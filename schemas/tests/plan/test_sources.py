@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from stickslip_schemas.plan.sources import digests, sources
+from stickslip_schemas.plan.builds import digests, sources
 
 PACKAGE = {
     "__init__.py": "from stickslip_made.deep.tool import saw\nfrom stickslip_made.other import file\n",

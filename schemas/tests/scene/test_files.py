@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.scene import files
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import UnfitFileError, check_scene_file, counts_of, inlined, read_file, with_arrays

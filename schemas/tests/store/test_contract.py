@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 import zarr
 import zarr.storage
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, Store, open_store, store_place
-from stickslip_schemas.store.base import artifact_name
+from stickslip_schemas.base import sha256
+from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, Store, artifact_name, open_store, store_place
 from zarr.abc.store import Store as ZarrStore
 
 if TYPE_CHECKING:

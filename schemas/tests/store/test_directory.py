@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, sync, write_durably
 
 

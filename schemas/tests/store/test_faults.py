@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.store import is_unavailable
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")

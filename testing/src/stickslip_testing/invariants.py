@@ -3,7 +3,7 @@
 from collections import Counter
 
 from sqlalchemy import Connection, case, func, select
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_services.database.tables import (
     dataset_versions,
     job_counts,

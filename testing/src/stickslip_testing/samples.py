@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from stickslip_schemas.base.keys import content_key, derived_seed
+from stickslip_schemas.base import content_key, derived_seed
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import grid

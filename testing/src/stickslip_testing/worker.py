@@ -9,7 +9,7 @@ from math import prod
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.base import Reason, Stage
 from stickslip_schemas.documents.tasks import (
     ChunkRef,
     PackOutput,
@@ -35,7 +35,6 @@ from stickslip_schemas.documents.worker_api import (
     WorkerRegistration,
 )
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, encode_sample, encode_shard
-from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -44,6 +43,8 @@ from stickslip_schemas.format.manifest import (
     Manifest,
     ManifestSection,
     has_sections,
+    layout,
+    samples_per_file,
     seal_text,
     section_path,
     with_manifest_digest,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.keys import canonical_json, sha256
+from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_testing.samples import samples

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Contents
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError

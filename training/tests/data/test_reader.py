@@ -9,7 +9,7 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_training.data.errors import (
     CorruptDataError,
     DatasetError,

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from stickslip_schemas.base.keys import canonical_json, sha256
+from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.format.manifest import FileEntry, ManifestSection, section_path, section_samples
 from stickslip_training.data.errors import (
     CorruptDataError,

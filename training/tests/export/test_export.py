@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader

@@ -24,12 +24,11 @@ from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.substrates import drawn_substrate
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING
 from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
-from stickslip_schemas.base.keys import is_sha256
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason, is_sha256
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.plan.sources import UNCOUNTED, sources
+from stickslip_schemas.plan.builds import UNCOUNTED, sources
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.spec.fabrics import Texture

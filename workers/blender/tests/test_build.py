@@ -5,7 +5,7 @@ from stickslip_blender import build
 from stickslip_blender.build import build_digest, roots
 from stickslip_blender.scenes import renders
 from stickslip_schemas.kinds import KINDS, UnknownKindError
-from stickslip_schemas.plan.sources import UNCOUNTED, sources
+from stickslip_schemas.plan.builds import UNCOUNTED, sources
 
 
 def test_the_rasteriser_is_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from itertools import chain
 from typing import Any
 
 from pydantic import ValidationError
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, TaskResult, results_adapter, tasks_adapter
 from stickslip_schemas.documents.worker_api import Lease
 from stickslip_schemas.kinds import KINDS

@@ -1,13 +1,13 @@
 """Builds: digests of the code of each kind and stage, for content keys.
 
-A build covers the files that a stage imports (see `stickslip_schemas.plan.sources`), the compiled core where it is
+A build covers the files that a stage imports (see `stickslip_schemas.plan.builds`), the compiled core where it is
 used, and the versions of the libraries that the output depends on.
 """
 
 from importlib import metadata
 
-from stickslip_schemas.base.keys import content_key
-from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
+from stickslip_schemas.base import content_key
+from stickslip_schemas.plan.builds import UNCOUNTED, digests, sources
 
 from stickslip_workers.kinds import kind, scene_module
 

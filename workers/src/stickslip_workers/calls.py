@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 
 from stickslip_workers import call
 from stickslip_workers.batches import Call

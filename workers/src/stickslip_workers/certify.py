@@ -12,9 +12,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from stickslip_schemas.base.keys import canonical_json, content_key
+from stickslip_schemas.base import canonical_json, content_key
 from stickslip_schemas.documents.certificate import Certificate, ProtocolReport
-from stickslip_schemas.plan.sources import digests, sources
+from stickslip_schemas.plan.builds import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult

@@ -12,7 +12,7 @@ import subprocess
 import time
 from typing import Any
 
-from stickslip_schemas.base.states import Reason, Stage
+from stickslip_schemas.base import Reason, Stage
 from stickslip_schemas.documents.worker_api import LeaseRequest, WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import open_store

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.keys import referred
+from stickslip_schemas.base import referred
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays

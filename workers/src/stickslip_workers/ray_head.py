@@ -16,7 +16,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",

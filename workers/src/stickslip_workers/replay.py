@@ -4,7 +4,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import AnyTask, RenderTask, TaskResult
 from stickslip_schemas.store import open_store
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from stickslip_schemas.base.keys import canonical_json
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason, canonical_json
 from stickslip_schemas.documents.tasks import RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.store import is_unavailable

@@ -5,7 +5,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage
 
 RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
 RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"

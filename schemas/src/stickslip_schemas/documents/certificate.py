@@ -10,8 +10,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base.document import Bool, Document, Float
-from stickslip_schemas.base.keys import Sha256, canonical_json, content_key
+from stickslip_schemas.base import Bool, Document, Float, Sha256, canonical_json, content_key
 
 Numbers = tuple[Float | None, ...]
 

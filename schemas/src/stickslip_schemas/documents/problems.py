@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from stickslip_schemas.base.units import literals, models_at, unit_of
+from stickslip_schemas.base import literals, models_at, unit_of
 from stickslip_schemas.spec.fabrics import did_you_mean
 
 MEDIA_TYPE = "application/problem+json"

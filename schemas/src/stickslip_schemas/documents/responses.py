@@ -6,9 +6,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
-from stickslip_schemas.base.document import Document, Int
-from stickslip_schemas.base.keys import ArtifactRef, Sha256
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import ArtifactRef, Document, Int, JobState, Reason, Sha256, Stage, TaskState
 from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds

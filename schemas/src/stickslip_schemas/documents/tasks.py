@@ -6,9 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from stickslip_schemas.base.document import Bool, Document, Float, Int
-from stickslip_schemas.base.keys import Sha256, referred
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Bool, Document, Float, Int, Reason, Sha256, referred
 from stickslip_schemas.format.manifest import FileEntry, ManifestSection, Rejection
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.plan.builds import Builds

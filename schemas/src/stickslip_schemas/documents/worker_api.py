@@ -4,8 +4,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from stickslip_schemas.base.document import Bool, Document, Float, Int
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Bool, Document, Float, Int, Stage
 from stickslip_schemas.documents.tasks import Task, TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
 from stickslip_schemas.plan.builds import Builds

@@ -16,15 +16,32 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stickslip_schemas.base.document import Document, Int
-from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.base.states import Reason
-from stickslip_schemas.format.layout import samples_per_file
-from stickslip_schemas.kinds import AnyJobSpec
+from stickslip_schemas.base import Document, Int, Reason, Sha256, sha256
+from stickslip_schemas.kinds import AnyJobSpec, registered
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout
+from stickslip_schemas.spec import arrays
+from stickslip_schemas.spec.arrays import COMMON_ARRAYS, FORMAT, ArrayLayout
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.jobs import JobSpec, Quality
+
+
+def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
+    """Return the arrays of the dataset of `spec`; raise UnknownKindError where nobody registered its class."""
+    return (*registered(spec).arrays(), *COMMON_ARRAYS)
+
+
+def samples_per_file(array: ArrayLayout, spec: JobSpec) -> int:
+    """Return the number of consecutive samples in every file of an array except the last."""
+    if array.is_label:
+        most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
+        return min(most, arrays.LABEL_SAMPLES, spec.sample_count)
+    return spec.samples_per_shard
+
+
+def bytes_estimate(spec: JobSpec) -> int:
+    """Return the size of the arrays of the dataset of `spec` before compression [bytes]."""
+    return spec.sample_count * sum(array.sample_bytes for array in layout(spec))
+
 
 MANIFEST_NAME = "manifest.json"
 GROUP_NAME = "zarr.json"

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationError
 
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import GROUP_NAME, Contents, FileEntry
+from stickslip_schemas.base import Document, Sha256
+from stickslip_schemas.format.manifest import GROUP_NAME, Contents, FileEntry, layout
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 
 if TYPE_CHECKING:

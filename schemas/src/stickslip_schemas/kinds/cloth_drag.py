@@ -5,12 +5,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.base.document import Document, Float, Int
-from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Document, Float, Int, Sha256, Stage
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, codes, fabric_arrays, over_time, solver_arrays
-from stickslip_schemas.kinds.cloth.names import VIEWPOINT, Custom, LampAxis, SubstrateAxis, TextureAxis, definitions
-from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
+from stickslip_schemas.kinds.cloth.spec import (
+    VIEWPOINT,
+    ClipRender,
+    ClipSpec,
+    Custom,
+    LampAxis,
+    SubstrateAxis,
+    TextureAxis,
+    definitions,
+)
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest

@@ -19,17 +19,13 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import Sha256, referred
-from stickslip_schemas.base.states import Stage
-from stickslip_schemas.kinds.cloth.arrays import clip_arrays, scene_segments
-from stickslip_schemas.kinds.cloth.names import VIEWPOINT, LampAxis, SubstrateAxis, TextureAxis
-from stickslip_schemas.kinds.cloth.scene_arrays import parameter_label, scene_arrays
-from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
-from stickslip_schemas.scene.bodies import MeshBody
+from stickslip_schemas.base import Document, Sha256, Stage, referred
+from stickslip_schemas.kinds.cloth.arrays import clip_arrays, parameter_label, scene_arrays, scene_segments
+from stickslip_schemas.kinds.cloth.spec import VIEWPOINT, ClipRender, ClipSpec, LampAxis, SubstrateAxis, TextureAxis
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
+from stickslip_schemas.scene.parts import MeshBody
 from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import (

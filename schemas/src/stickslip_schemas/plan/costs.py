@@ -8,8 +8,7 @@ from collections.abc import Mapping
 
 from pydantic import Field
 
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Document, Stage
 from stickslip_schemas.plan.grid import Counts
 from stickslip_schemas.spec.jobs import JobSpec
 

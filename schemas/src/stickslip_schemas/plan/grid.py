@@ -6,7 +6,7 @@ from itertools import pairwise, product
 from math import ceil, prod
 from typing import Any
 
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.axes import axis_values
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule

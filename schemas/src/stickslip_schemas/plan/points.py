@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import canonical_json, content_key, keyed_text, placed, seed_of_key, sha256
+from stickslip_schemas.base import Document, canonical_json, content_key, keyed_text, placed, seed_of_key, sha256
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import columns_of, combined

@@ -6,11 +6,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from stickslip_schemas.base.document import Document, Float
-from stickslip_schemas.base.keys import content_key
-from stickslip_schemas.scene.bodies import Body, MeshBody, Plane
+from stickslip_schemas.base import Document, Float, content_key
 from stickslip_schemas.scene.looks import Looks
-from stickslip_schemas.scene.motion import BY_NAME, Motion, Time, Vector
 from stickslip_schemas.scene.parameters import (
     Parameter,
     ParameterName,
@@ -22,7 +19,18 @@ from stickslip_schemas.scene.parameters import (
     refuse_as,
     with_values,
 )
-from stickslip_schemas.scene.sheets import FileMesh, FromFile, Sheet
+from stickslip_schemas.scene.parts import (
+    BY_NAME,
+    Body,
+    FileMesh,
+    FromFile,
+    MeshBody,
+    Motion,
+    Plane,
+    Sheet,
+    Time,
+    Vector,
+)
 from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean
 from stickslip_schemas.spec.jobs import PresetName
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_schemas.base.keys import ARTIFACT, sha256
-from stickslip_schemas.scene.bodies import MeshBody
+from stickslip_schemas.base import ARTIFACT, sha256
 from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
 from stickslip_schemas.scene.parameters import Path, at, with_values
+from stickslip_schemas.scene.parts import MeshBody
 
 MAX_FILE_BYTES = 16 * 2**20
 """Of a file of a scene, and of the arrays of an NPZ file."""

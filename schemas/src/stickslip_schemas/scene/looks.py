@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from stickslip_schemas.base.document import Document, Float
-from stickslip_schemas.scene.motion import BY_NAME, FileName, Vector
+from stickslip_schemas.base import Document, Float
+from stickslip_schemas.scene.parts import BY_NAME, FileName, Vector
 from stickslip_schemas.spec.appearance import (
     CLIP_SIZE,
     FARTHEST,

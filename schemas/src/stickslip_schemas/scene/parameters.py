@@ -6,9 +6,7 @@ from typing import Annotated, Any, Never
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base.document import Document, Float
-from stickslip_schemas.base.keys import placed
-from stickslip_schemas.base.units import unit_in, unit_of
+from stickslip_schemas.base import Document, Float, placed, unit_in, unit_of
 from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 Path = tuple[str | int, ...]

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, Strict, model_validator
 
-from stickslip_schemas.base.document import WHOLE, Document, Float
+from stickslip_schemas.base import WHOLE, Document, Float
 from stickslip_schemas.spec.cameras import NO_LENS, Camera, distorted
 
 CLIP_SIZE = 224

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, model
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stickslip_schemas.base.document import WHOLE, Document
+from stickslip_schemas.base import WHOLE, Document
 
 if TYPE_CHECKING:
     import numpy as np

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import content_key
+from stickslip_schemas.base import Document, content_key
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,7 +10,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, WithJsonSchema, model_validator
 
-from stickslip_schemas.base.document import Document, Float
+from stickslip_schemas.base import Document, Float
 
 
 class Material(StrEnum):

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, Type
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base.document import Document, Float, Int
-from stickslip_schemas.base.keys import Sha256, content_key, derived_seed, placed
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Document, Float, Int, Sha256, Stage, content_key, derived_seed, placed
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed
 from stickslip_schemas.spec.cameras import Camera

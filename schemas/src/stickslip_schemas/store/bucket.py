@@ -27,8 +27,8 @@ import obstore
 import obstore.exceptions
 import obstore.store
 
-from stickslip_schemas.base.keys import is_sha256, sha256
-from stickslip_schemas.store.base import (
+from stickslip_schemas.base import is_sha256, sha256
+from stickslip_schemas.store import (
     ARTIFACTS,
     DATASETS,
     VERSION,

@@ -10,7 +10,7 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Connection, insert, select
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 
 from stickslip_services.access.asker import asking, this_asker, this_user
 from stickslip_services.database.database import Role

@@ -7,7 +7,7 @@ with the empty name.
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, func, insert, select
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 
 from stickslip_services.access.asker import check_project
 from stickslip_services.access.audit_log import note

@@ -18,7 +18,7 @@ import httpx
 from cryptography.fernet import Fernet, InvalidToken
 from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select, update
 from standardwebhooks import Webhook as Signer
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 from stickslip_schemas.documents.responses import EventName
 
 from stickslip_services.access.asker import check_project

@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.store import Store
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.responses import CertificateEntry, Page
 from stickslip_schemas.store import Store

@@ -1,7 +1,7 @@
 """Uploaded files: textures, and meshes and paths of scenes; specs name them by their digests."""
 
 from sqlalchemy import insert, select
-from stickslip_schemas.base.keys import ARTIFACT, Sha256
+from stickslip_schemas.base import ARTIFACT, Sha256
 from stickslip_schemas.documents.problems import FieldError
 from stickslip_schemas.documents.responses import FileUpload, TextureEntry
 from stickslip_schemas.format.pictures import UnfitPictureError, read_picture

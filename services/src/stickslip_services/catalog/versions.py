@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
-from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.documents.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,

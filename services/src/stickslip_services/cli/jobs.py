@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 from click.exceptions import Exit
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetPublishedEvent,
     FileUpload,
@@ -21,7 +21,7 @@ from stickslip_schemas.documents.responses import (
     Validation,
 )
 from stickslip_schemas.documents.responses import Progress as JobProgress
-from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.plan.costs import Estimate, estimated
 from stickslip_schemas.plan.grid import Counts, count
 from stickslip_schemas.spec.jobs import JobSpec

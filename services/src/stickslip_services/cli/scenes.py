@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 from click.exceptions import Exit
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import Scene

@@ -1,7 +1,7 @@
 """States, progress and remaining times as text for the command line."""
 
 import click
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Eta, Progress, StageProgress
 from stickslip_schemas.plan.costs import Interval
 

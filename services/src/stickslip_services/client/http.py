@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import httpx
 from pydantic import TypeAdapter, ValidationError
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.responses import (
     CertificateEntry,

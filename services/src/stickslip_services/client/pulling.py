@@ -14,8 +14,7 @@ from pathlib import Path
 
 import httpx
 from pydantic import ValidationError
-from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -26,6 +25,7 @@ from stickslip_schemas.format.manifest import (
     FileEntry,
     Manifest,
     check_seal,
+    layout,
 )
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_schemas.store import sync, write_durably

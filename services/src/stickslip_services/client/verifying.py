@@ -11,8 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ValidationError
-from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.format.layout import layout
+from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.format.manifest import (
     MANIFEST_NAME,
     SEAL_NAME,
@@ -24,6 +23,7 @@ from stickslip_schemas.format.manifest import (
     FileEntry,
     Manifest,
     check_seal,
+    layout,
 )
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
 

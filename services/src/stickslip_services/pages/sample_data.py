@@ -4,10 +4,9 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.format.codecs import MISSING, decode_chunk, decode_sample, decode_shard_index, shard_index_size
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection
+from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection, layout
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 

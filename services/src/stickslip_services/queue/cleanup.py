@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from sqlalchemy import Connection, delete, select
-from stickslip_schemas.base.keys import Sha256, is_sha256
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState, Sha256, is_sha256
 from stickslip_schemas.store import Store, Stored
 
 from stickslip_services.access.audit_log import note

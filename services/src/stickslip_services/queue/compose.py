@@ -7,8 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, select
 from sqlalchemy.exc import NoResultFound
-from stickslip_schemas.base.keys import Sha256, content_key
-from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.base import Sha256, Stage, TaskState, content_key
 from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishTask, RenderTask, task_adapter
 from stickslip_schemas.format.manifest import section_samples
 from stickslip_schemas.plan.grid import dataset_id

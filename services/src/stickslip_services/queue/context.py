@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.clock import Clock

@@ -21,7 +21,7 @@ from math import sqrt
 from typing import Any, Self
 
 from sqlalchemy import Connection, Row, select
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
 from stickslip_schemas.documents.tasks import TaskResult
 

@@ -4,8 +4,7 @@ import hashlib
 import json
 import secrets
 
-from stickslip_schemas.base.keys import is_sha256
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Stage, is_sha256
 
 
 def new_id(prefix: str) -> str:

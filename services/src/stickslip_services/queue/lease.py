@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, select, update
-from stickslip_schemas.base.states import JobState, Reason, TaskState
+from stickslip_schemas.base import JobState, Reason, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,

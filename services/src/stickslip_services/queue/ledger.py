@@ -21,8 +21,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, bindparam, case, exists, func, insert, or_, select, text, update
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.states import JobState, Reason, TaskState
+from stickslip_schemas.base import Document, JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetPublishedEvent,
     DatasetRef,

@@ -10,8 +10,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection
-from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.base.states import Stage
+from stickslip_schemas.base import Sha256, Stage
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import Shard, publish_key, shards

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from sqlalchemy import Connection, Row, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
-from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.base import JobState, Reason, Stage
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.prepared import Prepared

@@ -18,8 +18,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, and_, bindparam, or_, select, update
-from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Sha256, Stage, TaskState
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.jobs import JobSpec

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import select, update
-from stickslip_schemas.base.keys import Sha256, sha256
-from stickslip_schemas.base.states import Stage, TaskState
+from stickslip_schemas.base import Sha256, Stage, TaskState, sha256
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.plan.grid import dataset_id

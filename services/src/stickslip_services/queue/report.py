@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import bindparam, delete, insert, select, update
-from stickslip_schemas.base.states import Reason, Stage, TaskState
+from stickslip_schemas.base import Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
 from stickslip_schemas.format.manifest import Manifest, seal_text

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from itertools import islice
 
 from sqlalchemy import Connection, func, insert, select
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.base import JobState, Reason, Stage, sha256
 from stickslip_schemas.documents.responses import JobDetail, Validation
-from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import Interval, estimated
 from stickslip_schemas.plan.grid import Counts, count, grid

@@ -8,7 +8,7 @@ from contextlib import suppress
 from math import inf
 
 from sqlalchemy import or_, select, update
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 
 from stickslip_services.access.keys import admit_local_worker

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.database import insert_rows, rows_with

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_training.benchmark.sets import Making, load_set

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 
 from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.benchmark.task import Task

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from stickslip_schemas.base.keys import canonical_json, sha256
+from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 

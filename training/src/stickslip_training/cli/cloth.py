@@ -44,7 +44,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
     """Train a network that estimates material and friction, on pictures rendered from simulations while it trains."""
-    from stickslip_schemas.base.keys import sha256
+    from stickslip_schemas.base import sha256
 
     from stickslip_training.cloth.clips import training_clips, training_runs
     from stickslip_training.cloth.learner import ClothTraining, train_friction

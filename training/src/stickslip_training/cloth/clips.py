@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_schemas.spec.cameras import Camera, load_rig
 

@@ -1,6 +1,6 @@
 """Check the Zarr metadata of a dataset against the contract.
 
-The reader computes with `stickslip_schemas.format.layout` and not with the metadata, so the two must agree before
+The reader computes with `stickslip_schemas.format.manifest` and not with the metadata, so the two must agree before
 anything is read: a chunk of another shape or codec would otherwise be nonsense that passes its checksum.
 """
 

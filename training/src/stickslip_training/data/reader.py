@@ -14,8 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.format.codecs import empty_in_order, in_order_of_chunks
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import SEAL_NAME, BrokenSealError, FileEntry, Manifest, Rejection, check_seal
+from stickslip_schemas.format.manifest import (
+    SEAL_NAME,
+    BrokenSealError,
+    FileEntry,
+    Manifest,
+    Rejection,
+    check_seal,
+    layout,
+)
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec

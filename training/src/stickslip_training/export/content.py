@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.keys import sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
 

@@ -3,8 +3,8 @@
 from functools import cache
 from importlib import metadata
 
-from stickslip_schemas.base.keys import content_key
-from stickslip_schemas.plan.sources import UNCOUNTED, digests, sources
+from stickslip_schemas.base import content_key
+from stickslip_schemas.plan.builds import UNCOUNTED, digests, sources
 
 from stickslip_blender.cycles.blender import blender_version, described
 from stickslip_blender.raster._raster import BUILD_HASH

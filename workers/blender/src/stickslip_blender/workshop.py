@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.spec.cameras import Camera, rig_digest

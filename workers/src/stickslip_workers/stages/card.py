@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 from stickslip_schemas.format.codecs import decode_sample
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import Manifest
+from stickslip_schemas.format.manifest import Manifest, layout
 from stickslip_schemas.format.pictures import labelled, moving, sheet
 from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.appearance import shown_frames

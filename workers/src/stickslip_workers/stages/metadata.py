@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 from stickslip_schemas.format.codecs import ZSTD_LEVEL, axes_order, packing
-from stickslip_schemas.format.layout import layout, samples_per_file
+from stickslip_schemas.format.manifest import layout, samples_per_file
 from stickslip_schemas.spec.arrays import FORMAT, ArrayLayout, describe
 from stickslip_schemas.spec.jobs import JobSpec
 

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.documents.tasks import PackOutput, PackSlot, PackTask, RecordRef
 from stickslip_schemas.format.codecs import check_chunk, encode_chunk, encode_sample, encode_shard
-from stickslip_schemas.format.layout import layout
-from stickslip_schemas.format.manifest import FileEntry
+from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.keys import canonical_json
+from stickslip_schemas.base import canonical_json
 from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
-from stickslip_schemas.format.layout import layout, samples_per_file
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -22,6 +21,8 @@ from stickslip_schemas.format.manifest import (
     Psnr,
     Rejection,
     has_sections,
+    layout,
+    samples_per_file,
     seal_text,
     section_path,
     section_samples,

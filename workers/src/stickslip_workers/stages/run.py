@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import AnyTask, TaskResult, input_digests, results_adapter, tasks_adapter
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.store import Store, in_parallel, open_store

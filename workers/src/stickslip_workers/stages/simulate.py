@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason
 from stickslip_schemas.documents.tasks import RecordRef, SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.store import Store
 

@@ -6,7 +6,7 @@
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.base import is_sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
 

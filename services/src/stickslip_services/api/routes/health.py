@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from sqlalchemy import text
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 
 from stickslip_services import __version__
 from stickslip_services.access.asker import refuse_projects

@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base.keys import content_key, referred
-from stickslip_schemas.base.states import Reason
+from stickslip_schemas.base import Reason, content_key, referred
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, encode_chunk, encode_clip
 from stickslip_schemas.format.pictures import moving

@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 import numpy as np
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import estimated

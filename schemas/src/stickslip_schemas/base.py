@@ -1,0 +1,286 @@
+"""The base of all documents: strict numbers, content keys, states and reasons, and units of numbers."""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+
+def _whole(value: Any) -> Any:
+    """Return 1 for 1.0, which is the same number in JSON."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+WHOLE = BeforeValidator(_whole)
+"""For integers with bounds of their own: stands after them, or the bounds are not in the JSON schema."""
+Int = Annotated[int, Strict(), WHOLE]
+"""A whole number: not the text "1", not true."""
+Float = Annotated[float, Strict()]
+"""A number: not the text "1", not true."""
+Bool = Annotated[bool, Strict()]
+"""True or false: not 1, not "yes"."""
+
+
+class Document(BaseModel):
+    """Refuse unknown fields, NaN and infinities; never change after construction."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+KEY_PATTERN = r"^[0-9a-f]{64}$"
+
+Sha256 = Annotated[str, Field(pattern=KEY_PATTERN, description="SHA-256, 64 lower-case hexadecimal digits")]
+
+
+def canonical_json(value: Any) -> str:
+    """Return the one JSON text of `value`: sorted keys, no spaces, shortest round-trip floats, -0.0 as 0.0.
+
+    NaN and infinities raise ValueError, for they have no JSON form.
+    """
+    return json.dumps(_normalised(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def content_key(purpose: str, value: Any) -> str:
+    """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share a key."""
+    return sha256(keyed_text(purpose, canonical_json(value)).encode())
+
+
+def keyed_text(purpose: str, canonical: str) -> str:
+    """Return the text whose SHA-256 is the content key of a value with the canonical JSON `canonical`."""
+    return f"stickslip/{purpose}\n{canonical}"
+
+
+def derived_seed(seed: int, purpose: str, value: Any) -> int:
+    """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position in a grid."""
+    return seed_of_key(content_key(f"seed/{purpose}", {"seed": seed, "for": value}))
+
+
+def seed_of_key(key: str) -> int:
+    """Return the seed in [0, 2**31) that a content key gives."""
+    return int(key[:15], 16) % 2**31
+
+
+def sha256(data: bytes) -> str:
+    """Return the SHA-256 of `data` in lower-case hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def is_sha256(text: str) -> bool:
+    return re.fullmatch(KEY_PATTERN, text) is not None
+
+
+ARTIFACT = "sha256:"
+"""How a reference to an artifact begins, where a name might stand as well."""
+
+ArtifactRef = Annotated[
+    str, Field(pattern=r"^sha256:[0-9a-f]{64}$", description="`sha256:` and the SHA-256 of an artifact")
+]
+
+
+def referred(name: str) -> Sha256 | None:
+    """Return the digest that a reference to an artifact names; None where `name` is a name."""
+    return name.removeprefix(ARTIFACT) if name.startswith(ARTIFACT) else None
+
+
+def placed(document: Any, place: Sequence[str | int], value: Any) -> Any:
+    """Return a copy of a JSON document with another value at a place; positions in lists may be texts."""
+    if not place:
+        return value
+    step, *rest = place
+    if isinstance(document, list):
+        return [placed(item, rest, value) if at == int(step) else item for at, item in enumerate(document)]
+    return {**document, step: placed(document[step], rest, value)}
+
+
+def _normalised(value: Any) -> Any:
+    if isinstance(value, float):
+        return value + 0.0  # -0.0 + 0.0 is 0.0
+    if isinstance(value, dict):
+        return {key: _normalised(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_normalised(item) for item in value]
+    return value
+
+
+class JobState(StrEnum):
+    """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back.
+
+    A job of many samples is `planning` until all its tasks are written down; the first of them run meanwhile.
+    """
+
+    planning = "planning"
+    queued = "queued"
+    running = "running"
+    pausing = "pausing"
+    paused = "paused"
+    cancelling = "cancelling"
+    cancelled = "cancelled"
+    succeeded = "succeeded"
+    succeeded_with_rejects = "succeeded_with_rejects"
+    failed = "failed"
+
+    @property
+    def is_open(self) -> bool:
+        """True until the job has ended."""
+        ended = (JobState.cancelled, JobState.succeeded, JobState.succeeded_with_rejects, JobState.failed)
+        return self not in ended
+
+
+class TaskState(StrEnum):
+    """Where a task is; `soft_failed` waits for another try, `rejected` is a result, not a fault."""
+
+    pending = "pending"
+    leased = "leased"
+    running = "running"
+    succeeded = "succeeded"
+    soft_failed = "soft_failed"
+    failed = "failed"
+    rejected = "rejected"
+    cancelled = "cancelled"
+
+    @property
+    def is_settled(self) -> bool:
+        """True where the task has a result that others may use."""
+        return self in (TaskState.succeeded, TaskState.rejected)
+
+    @property
+    def is_over(self) -> bool:
+        return self.is_settled or self in (TaskState.failed, TaskState.cancelled)
+
+
+class Stage(StrEnum):
+    """Steps of the pipeline, in order."""
+
+    simulate = "simulate"
+    render = "render"
+    pack = "pack"
+    publish = "publish"
+
+
+class Reason(StrEnum):
+    """Why a job or task ended, or why it waits."""
+
+    # Infrastructure: another try may succeed.
+    exec_timeout = "exec_timeout"
+    worker_lost = "worker_lost"
+    oom_killed = "oom_killed"
+    renderer_crash = "renderer_crash"
+    process_crash = "process_crash"
+    storage_error = "storage_error"
+    store_unavailable = "store_unavailable"
+    internal_error = "internal_error"
+    # The sample itself: deterministic, never retried.
+    solver_diverged = "solver_diverged"
+    out_of_frame = "out_of_frame"
+    invalid_sample = "invalid_sample"
+    poor_pictures = "poor_pictures"
+    # The same, of cloth: the check of the solver that failed.
+    not_finite = "not_finite"
+    jumps = "jumps"
+    unconverged = "unconverged"
+    budget = "budget"
+    missed = "missed"
+    crossings = "crossings"
+    contact_gain = "contact_gain"
+    stretch = "stretch"
+    penetration = "penetration"
+    passages = "passages"
+    sharpness = "sharpness"
+    # A job's own.
+    cancelled = "cancelled"
+    failed_tasks = "failed_tasks"
+    quarantined = "quarantined"
+    waiting_for_worker = "waiting_for_worker"
+    preset_not_certified = "preset_not_certified"
+
+    @property
+    def ends_a_process(self) -> bool:
+        """True where a task took its process with it; one that does so again and again is quarantined."""
+        return self in _ENDING
+
+    @property
+    def is_deterministic(self) -> bool:
+        """True where a second try gives the same answer, so that the sample is rejected and not retried."""
+        return self not in _INFRASTRUCTURE | _OF_JOBS
+
+
+_ENDING = {Reason.exec_timeout, Reason.worker_lost, Reason.oom_killed, Reason.renderer_crash, Reason.process_crash}
+_INFRASTRUCTURE = {*_ENDING, Reason.storage_error, Reason.store_unavailable, Reason.internal_error}
+_OF_JOBS = {
+    Reason.cancelled,
+    Reason.failed_tasks,
+    Reason.quarantined,
+    Reason.waiting_for_worker,
+    Reason.preset_not_certified,
+}
+
+
+_RULES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_type", "finite_number")
+"""Types of pydantic's errors that are about a number."""
+
+
+def unit_of(item: ErrorDetails, of: Any) -> str:
+    """Return ` [unit]` of the number that an error is about, or an empty text.
+
+    `of` is the type that the document was to be, a model or a union of models.
+    """
+    location = item["loc"]
+    names = [place for place, part in enumerate(location) if isinstance(part, str) and item["type"] in _RULES]
+    for place in reversed(names):
+        for model in models_at(of, location[:place]):
+            if (field := model.model_fields.get(str(location[place]))) is not None:
+                unit = _said(field)
+                return f" [{unit}]" if unit else ""
+    return ""
+
+
+def unit_in(document: Any, location: Sequence[int | str]) -> str:
+    """Return the unit of the number at a place in a document; `1` of a pure number."""
+    unit = ""
+    for part in location:
+        if isinstance(document, BaseModel):
+            unit = _said(type(document).model_fields[str(part)])
+            document = getattr(document, str(part))
+        else:
+            document = document[part]
+    return unit or "1"
+
+
+def _said(field: FieldInfo) -> str:
+    unit = re.search(r"\[([^\]]+)\]", field.description or "")
+    return unit[1] if unit else ""
+
+
+def models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
+    """Return the models that a place in a document may hold, from the type of the whole."""
+    models = list(_models_in(of))
+    for part in location:
+        fields = [model.model_fields[part] for model in models if part in model.model_fields]
+        if fields:
+            models = [found for field in fields for found in _models_in(field.annotation)]
+        else:  # the place in a list, or the tag of a union
+            tagged = [
+                model
+                for model in models
+                if any(part in literals(field.annotation) for field in model.model_fields.values())
+            ]
+            models = tagged or models
+    return models
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif get_origin(annotation) is not Literal:
+        for argument in get_args(annotation):
+            yield from _models_in(argument)
+
+
+def literals(annotation: Any) -> list[str]:
+    return [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []

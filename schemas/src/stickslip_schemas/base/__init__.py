@@ -1,1 +1,0 @@
-"""The base of every document, content keys and states."""
