@@ -8,8 +8,7 @@ from itertools import cycle
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, ScalarFormatter
-from stickslip_sim_core.protocols.dense import dense_master
-from stickslip_sim_core.protocols.result import ProtocolResult
+from stickslip_sim_core.protocols.result import ProtocolResult, dense_master
 
 # Okabe and Ito's colours, which the colour-blind tell apart.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")

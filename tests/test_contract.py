@@ -19,7 +19,7 @@ from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
 from stickslip_services.queue.plan import Terms, expand, terms_for
 from stickslip_sim_core._sim_core import kernels
-from stickslip_sim_core.cloth.bodies import MU_MAX
+from stickslip_sim_core.cloth.contact import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_sim_core.scenes import cloth_drag

@@ -37,7 +37,7 @@ struct RodBatch {
   RodOutput output;
 };
 
-// n rods of varying natural curvature; N = elements of the finest level, P = output points. See general.py.
+// n rods of varying natural curvature; N = elements of the finest level, P = output points. See solve.py.
 struct GeneralRodBatch {
   const double* gamma;              // (n)
   const double* stiffness;          // (n, 3), EI

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks, meshes
-from stickslip_sim_core.cloth.bodies import Body, box, capsule, cylinder, plane, sphere
+from stickslip_sim_core.cloth.contact import Body, box, capsule, cylinder, plane, sphere
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth

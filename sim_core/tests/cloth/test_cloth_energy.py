@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core import Cloth, Fabric, _testing, fabric, isotropic, preset_named
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
-from stickslip_sim_core.protocols.strip import DIAGONALS, LENGTH, MeshKind, strip
+from stickslip_sim_core.protocols.protocol import DIAGONALS, LENGTH, MeshKind, strip
 
 Floats = NDArray[np.float64]
 

@@ -21,8 +21,7 @@ from stickslip_sim_core import (
 )
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.protocols import stacked_incline
-from stickslip_sim_core.protocols.inclined_plane import tilted
+from stickslip_sim_core.protocols.inclined_plane import Stack, tilted
 
 pytestmark = pytest.mark.physics
 
@@ -34,9 +33,9 @@ MATERIAL = fabric("gray-interlock")
 SOFT = isotropic(0.2, 100.0, 1e-6)
 
 
-def stack(mu: float, cells: int = 4, preset: str = "certified") -> stacked_incline.Stack:
+def stack(mu: float, cells: int = 4, preset: str = "certified") -> Stack:
     """Two sheets on a floor, 0.5 mm from each other."""
-    return stacked_incline.Stack(2, mu, preset_named(preset), cells)
+    return Stack(2, mu, preset_named(preset), cells)
 
 
 def watched(cloth: Cloth, steps: int, dt: float = 0.02, **drive: object) -> int:
@@ -104,7 +103,7 @@ class TestStack:
 
     def test_each_two_sheets_have_their_own_friction(self) -> None:
         """Of three sheets the upper two slide together on the lowest, where friction is least."""
-        three = stacked_incline.Stack(3, 0.3, CERTIFIED, 3)
+        three = Stack(3, 0.3, CERTIFIED, 3)
         three.cloth.gravity[:] = tilted(np.arctan(0.3) + 0.03)
         assert watched(three.cloth, 25, bodies=three.floor) == 0
         moved = [three.moved()[three.level == level] for level in range(3)]
@@ -119,8 +118,8 @@ class TestStack:
         assert result.settings["least_distance_over_thickness"] >= 0.99  # type: ignore[operator]
 
     def test_a_stack_that_creeps_has_no_slip_angle(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(stacked_incline.Stack, "drift", lambda _: 2e-5)
-        monkeypatch.setattr(stacked_incline.Stack, "slip_slope", lambda _: 0.3)
+        monkeypatch.setattr(Stack, "drift", lambda _: 2e-5)
+        monkeypatch.setattr(Stack, "slip_slope", lambda _: 0.3)
         assert not protocols.run("stacked-incline", friction=(0.3,), sheets=(2,), cells=3, unstructured=0).passed
 
 
@@ -459,7 +458,7 @@ class TestNothingCrosses:
 
     def test_rerun_is_bit_identical(self) -> None:
         def run() -> tuple[bytes, bytes]:
-            two = stacked_incline.Stack(2, 0.5, CERTIFIED, 4, 1)
+            two = Stack(2, 0.5, CERTIFIED, 4, 1)
             two.cloth.gravity[:] = tilted(np.arctan(0.5) + 0.05)
             for _ in range(12):
                 two.cloth.step(0.02, bodies=two.floor)

@@ -10,7 +10,7 @@ import pytest
 
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
 from stickslip_sim_core.protocols import Curve, ProtocolResult, rods
-from stickslip_sim_core.protocols.dense import dense_master
+from stickslip_sim_core.protocols.result import dense_master
 from stickslip_sim_core.protocols.rods import extrapolated, loss_of_stability, planar_frames, round_rod, tip
 from stickslip_sim_core.reference import master_curves
 

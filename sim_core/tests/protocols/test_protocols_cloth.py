@@ -11,8 +11,8 @@ from stickslip_sim_core import PRESETS, preset_named, protocols
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.protocols import Curve, ProtocolResult, cantilever, inclined_plane, lateral_buckling, stick_slip
+from stickslip_sim_core.protocols.protocol import LENGTH, strip
 from stickslip_sim_core.protocols.result import Refinement
-from stickslip_sim_core.protocols.strip import LENGTH, strip
 from stickslip_sim_core.reference import master_curves
 
 pytestmark = pytest.mark.physics

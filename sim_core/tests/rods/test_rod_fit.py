@@ -13,7 +13,7 @@ from stickslip_sim_core import (
     solve_rods,
 )
 from stickslip_sim_core.rods.fit import _Model, _parameters, _State
-from stickslip_sim_core.rods.splines import bspline_matrix
+from stickslip_sim_core.rods.solve import bspline_matrix
 
 pytestmark = pytest.mark.physics
 

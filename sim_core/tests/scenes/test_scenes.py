@@ -8,7 +8,7 @@ import pytest
 from stickslip_sim_core import ClothRun, fabric, fabric_names
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.scenes import cloth_drag, hanging
+from stickslip_sim_core.scenes import cloth_drag, holders
 
 pytestmark = pytest.mark.physics
 
@@ -109,7 +109,7 @@ class TestClothRun:
         mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 10, 10)
         first = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(hanging, "HANGING", replace(hanging.HANGING, tolerance=1e-4, time_step=0.035))
+            patch.setattr(holders, "HANGING", replace(holders.HANGING, tolerance=1e-4, time_step=0.035))
             second = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0, kernel="baseline")
         assert first.reason == second.reason == ""
         assert second.positions == pytest.approx(first.positions, abs=1e-6)
@@ -129,7 +129,7 @@ class TestClothRun:
             assert not hung.reason, name
 
     def test_hung_shape_that_does_not_settle_is_not_valid(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(hanging, "HANGING_STEPS_MAX", 2)
+        monkeypatch.setattr(holders, "HANGING_STEPS_MAX", 2)
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=1).run()
         assert not scene.valid
         assert "did not come to rest" in scene.reason

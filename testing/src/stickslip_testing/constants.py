@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, box, plane, sphere
-from stickslip_sim_core.cloth.contact import SelfContact, Surface
+from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface, box, plane, sphere
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, plane
-from stickslip_sim_core.cloth.contact import THICKNESS, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import THICKNESS, Body, SelfContact, Surface, plane
 from stickslip_sim_core.cloth.fabrics import fabric, fabric_names
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth

@@ -18,7 +18,7 @@ from stickslip_schemas.plan.builds import digests, sources
 from stickslip_schemas.store import write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import ProtocolResult
-from stickslip_sim_core.protocols.dense import dense_master
+from stickslip_sim_core.protocols.result import dense_master
 
 from stickslip_workers.builds import solver_build
 

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, check_mesh, kernels, sheet_count
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.cloth.bodies import Body, BodyTuple
-from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, Body, BodyTuple, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings

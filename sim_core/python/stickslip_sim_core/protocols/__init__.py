@@ -1,20 +1,20 @@
 """Physical protocols: measurements of a build of the core, against master curves. See docs/protocols.md."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings
 from stickslip_sim_core.protocols.cantilever import Cantilever
 from stickslip_sim_core.protocols.capstan import Capstan
-from stickslip_sim_core.protocols.certification import CERTIFICATION, SCENE_PROTOCOLS, Certification
 from stickslip_sim_core.protocols.heavy_fold import HeavyFold
-from stickslip_sim_core.protocols.inclined_plane import InclinedPlane
+from stickslip_sim_core.protocols.inclined_plane import InclinedPlane, StackedIncline
 from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
 from stickslip_sim_core.protocols.protocol import Protocol
 from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
 from stickslip_sim_core.protocols.rods import BendTwist, RodCantilever, RodLateralBuckling, RodProtocol
-from stickslip_sim_core.protocols.stacked_incline import StackedIncline
 from stickslip_sim_core.protocols.stick_slip import StickSlip
 
 PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
@@ -57,6 +57,57 @@ def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult
     if preset is not None and name not in ROD_PROTOCOLS:
         settings["preset"] = preset
     return PROTOCOLS[name](**settings).run()
+
+
+QUICK: Mapping[str, Mapping[str, Any]] = {
+    "bend-twist": {"phi": (6.0, 10.0), "poisson": (0.5,), "elements": 256},
+    "rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512},
+    "inclined-plane": {"friction": (0.3,)},
+    "lateral-buckling": {"aspect": (0.2,), "poisson": (0.3,)},
+    "stick-slip": {"friction": (0.1, 0.3), "phases": False},
+    "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
+    "capstan": {"friction": (0.3,), "bending": (0.05,)},
+    "heavy-fold": {"friction": (0.3,), "cells": 80},
+    "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
+    "pull-out": {"friction": (0.3,), "loads": (1.0,), "unstructured": 0},
+}
+
+
+@dataclass(frozen=True)
+class Certification:
+    """Protocols and settings of the certificate of a preset."""
+
+    protocols: tuple[str, ...]
+    """Names in PROTOCOLS, in the order in which they run: the quick ones first."""
+
+    solver: str
+    """The module whose build the certificate is of."""
+
+    numbers: Callable[[], Mapping[str, Any]] = dict
+    """Returns the settings that the preset stands for, constants of the solver included, in JSON's types."""
+
+    quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
+    """Settings by protocol for a first look; a certificate made with them certifies nothing."""
+
+
+_CLOTH = ("inclined-plane", "lateral-buckling", "stick-slip", "cantilever")
+SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-out")
+"""What a certificate has to have for a scene with self-contact."""
+
+
+def _of_cloth(preset: SolverSettings) -> Certification:
+    # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
+    touches = not preset.name.startswith("thesis-")
+    return Certification(SCENE_PROTOCOLS if touches else _CLOTH, "stickslip_sim_core.cloth", preset.numbers)
+
+
+CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
+    {
+        "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods"),
+        **{name: _of_cloth(preset) for name, preset in PRESETS.items()},
+    }
+)
+"""By preset; "rods" stands for the rod solver, which has none."""
 
 
 __all__ = [

@@ -9,8 +9,7 @@ import numpy as np
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.protocol import RefinedProtocol
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, cell_of, strip
+from stickslip_sim_core.protocols.protocol import LENGTH, RefinedProtocol, Strip, cell_of, strip
 from stickslip_sim_core.reference import master_curves
 
 # Weights rho_A g L^3 / D [-].

@@ -8,8 +8,7 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, cylinder
-from stickslip_sim_core.cloth.contact import THICKNESS
+from stickslip_sim_core.cloth.contact import THICKNESS, Body, cylinder
 from stickslip_sim_core.cloth.fabrics import Fabric, isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth

@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import plane
-from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.contact import SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth

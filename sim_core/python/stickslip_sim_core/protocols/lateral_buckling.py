@@ -20,8 +20,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.protocol import RefinedProtocol
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, strip
+from stickslip_sim_core.protocols.protocol import LENGTH, RefinedProtocol, Strip, strip
 from stickslip_sim_core.reference import master_curves
 
 ASPECT = (0.1, 0.2, 0.5)

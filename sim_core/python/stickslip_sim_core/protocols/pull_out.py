@@ -7,13 +7,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import plane
-from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.contact import SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.protocol import MeshedProtocol
-from stickslip_sim_core.protocols.strip import MeshKind, rectangle
+from stickslip_sim_core.protocols.protocol import MeshedProtocol, MeshKind, rectangle
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 LOADS = (1.0, 4.0)  # weight of the upper sheet, over that of the fabric

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core.cloth.bodies import plane
+from stickslip_sim_core.cloth.contact import plane
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.protocols.protocol import RefinedProtocol
+from stickslip_sim_core.protocols.protocol import LENGTH, RefinedProtocol, Strip, cell_of, strip
 from stickslip_sim_core.protocols.result import Setting
-from stickslip_sim_core.protocols.strip import LENGTH, Strip, cell_of, strip
 from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)

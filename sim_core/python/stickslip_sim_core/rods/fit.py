@@ -13,16 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.rods.general import (
+from stickslip_sim_core.rods.solve import (
     CLAMP_FRAME,
     ELEMENT_TURN_MAX,
     STIFFNESS,
+    RodSolution,
+    bspline_matrix,
     clamp_quaternions,
+    finite_array,
+    interpolation_matrix,
     rod_stiffness,
     solve_general_rods,
 )
-from stickslip_sim_core.rods.solve import RodSolution, finite_array
-from stickslip_sim_core.rods.splines import bspline_matrix, interpolation_matrix
 
 ELEMENTS_MIN = 96
 """Elements of the coarser chain are at least this many."""

@@ -7,9 +7,14 @@ from numpy.typing import ArrayLike
 
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.rods.general import CLAMP_FRAME, STIFFNESS, clamp_quaternions, rod_stiffness
-from stickslip_sim_core.rods.solve import finite_array
-from stickslip_sim_core.rods.splines import interpolation_matrix
+from stickslip_sim_core.rods.solve import (
+    CLAMP_FRAME,
+    STIFFNESS,
+    clamp_quaternions,
+    finite_array,
+    interpolation_matrix,
+    rod_stiffness,
+)
 
 GRAVITY = np.array([0.0, 0.0, -1.0])
 

@@ -8,13 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats, check_range
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, plane
-from stickslip_sim_core.cloth.contact import SELF_FRICTION, SelfContact
+from stickslip_sim_core.cloth.contact import SELF_FRICTION, Body, SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.scenes.hanging import Hung, hung
-from stickslip_sim_core.scenes.holders import Holder
+from stickslip_sim_core.scenes.holders import Holder, Hung, hung
 from stickslip_sim_core.scenes.kind import Record
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kind, fabric_labels
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body
-from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.contact import Body, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth, kernel_level
 from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome, Record

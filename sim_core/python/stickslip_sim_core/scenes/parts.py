@@ -12,11 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.bodies import Body, box, capsule, cylinder, plane, sphere
-from stickslip_sim_core.cloth.contact import Surface
+from stickslip_sim_core.cloth.contact import Body, Surface, box, capsule, cylinder, plane, sphere
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
-from stickslip_sim_core.scenes.hanging import Hung, hung
-from stickslip_sim_core.scenes.holders import ALWAYS, Holder
+from stickslip_sim_core.scenes.holders import ALWAYS, Holder, Hung, hung
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
 
 Document = Mapping[str, Any]

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stickslip_sim_core.rods.labels import reach, self_contact_distance
-from stickslip_sim_core.rods.multistability import other_minima
+from stickslip_sim_core.rods.labels import other_minima, reach, self_contact_distance
 from stickslip_sim_core.rods.solve import solve_rods
 from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome
 

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core._sim_core import self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
-from stickslip_sim_core.cloth.bodies import Body
-from stickslip_sim_core.cloth.contact import SelfContact, Surface
+from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
