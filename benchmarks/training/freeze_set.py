@@ -10,7 +10,7 @@ from pathlib import Path
 
 import stickslip_training.benchmark
 import yaml
-from stickslip_training.benchmark.sets import frozen
+from stickslip_testing.sets import frozen
 from stickslip_training.data.reader import DatasetReader, Split
 
 

@@ -8,10 +8,10 @@ from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_testing.samples import samples
+from stickslip_testing.sets import frozen
 from stickslip_training.benchmark import sets
-from stickslip_training.benchmark.records import enter, read_record, table, with_tables
-from stickslip_training.benchmark.rods import NOISES, RodTask
-from stickslip_training.benchmark.sets import frozen, load_set, set_names
+from stickslip_training.benchmark.sets import enter, load_set, read_record, set_names, table, with_tables
+from stickslip_training.benchmark.tasks import NOISES, RodTask
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.rods.evaluation import bending

@@ -1,4 +1,5 @@
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def test_scores_of_known_answers():
     assert set(scores.bands) == {"0 to 0.4", "0.4 to 0.8", "0.8 to 1.2", "1.2 to 1.6"}
     assert scores.bands["0.8 to 1.2"].mae.value == pytest.approx(0.15, abs=2e-3)
     assert scores.sides["-1"].clips == scores.sides["+1"].clips == 2
-    json.dumps(scores.as_dict())
+    json.dumps(asdict(scores))
 
 
 def test_calibrated_answers_are_reliable_and_overconfident_ones_are_not():

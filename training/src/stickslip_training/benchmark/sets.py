@@ -1,4 +1,4 @@
-"""Which named test sets there are, and whether a dataset is one of them.
+"""Named test sets, whether a dataset is one of them, and entries: records of scores, and their table.
 
 A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ between
 machines, and so do manifests. What identifies a set is therefore what its samples hold:
@@ -11,8 +11,9 @@ from those on a set that was remade.
 """
 
 import json
-from dataclasses import dataclass
-from io import BytesIO
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,11 +21,10 @@ import numpy as np
 from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Integers
-from stickslip_training.benchmark.cloth import ClothTask
-from stickslip_training.benchmark.rods import RodTask
-from stickslip_training.benchmark.task import Task
+from stickslip_training.benchmark.tasks import ClothTask, RodTask, Task
 from stickslip_training.data.reader import DatasetReader, Split
 
 SETS = Path(__file__).parent / "sets"
@@ -47,7 +47,7 @@ class NamedSet:
     """SHA-256 of the labels of the samples to answer."""
     split: Split | None
     """Of the samples to answer; None: all."""
-    published: tuple[str, ...]
+    published: Sequence[str]
     """Digests of the manifests of versions that were published."""
     seen: dict[str, Array]
 
@@ -97,32 +97,109 @@ def load_set(name: str) -> NamedSet:
     document = json.loads((SETS / f"{name}.json").read_text(encoding="utf-8"))
     with np.load(SETS / f"{name}.npz") as file:
         seen = {each: file[each] for each in file.files}
-    return NamedSet(
-        name=name,
-        about=document["about"],
-        spec=document["spec"],
-        labels=document["labels"],
-        split=document["split"],
-        published=tuple(document["published"]),
-        seen=seen,
-    )
-
-
-def frozen(
-    name: str, about: str, spec: dict[str, Any], split: Split | None, reader: DatasetReader
-) -> tuple[bytes, bytes]:
-    """Return the files NAME.json and NAME.npz of a new set, whose published version the reader has open."""
-    task = TASKS[reader.kind]
-    slots = reader.slots(split)
-    seen = task.seen(reader, slots)
-    new = NamedSet(name, about, spec, labels_digest(task, reader, slots), split, (reader.manifest_digest,), seen)
-    new.check(reader)
-    document = {"about": about, "split": split, "labels": new.labels, "published": [*new.published], "spec": spec}
-    packed = BytesIO()
-    np.savez_compressed(packed, **seen)  # type: ignore[arg-type]  # its stub takes no dictionary
-    return (json.dumps(document, indent=2) + "\n").encode(), packed.getvalue()
+    return NamedSet(name=name, seen=seen, **document)
 
 
 def labels_digest(task: Task, reader: DatasetReader, slots: Integers) -> str:
     """Return the SHA-256 of the labels of slots."""
     return sha256(canonical_json(task.labels(reader, slots)).encode())
+
+
+# --- entries --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """What is kept of an entry."""
+
+    set: str
+    method: str
+    by: str
+    trained_on: str
+    """In the entrant's words; "nothing" for a method that learns nothing."""
+    link: str | None
+    """To code or a text."""
+    making: Making
+    """Of the set that was answered."""
+    manifest: str
+    """Digest of that dataset's manifest."""
+    predictions: str
+    """SHA-256 of the file of answers."""
+    scores: dict[str, Any]
+
+    def write(self, path: Path) -> None:
+        """Write the record as JSON, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, (json.dumps(_rounded(asdict(self)), indent=1, allow_nan=False) + "\n").encode())
+
+
+def enter(
+    name: str, answers: Path, dataset: str, *, method: str, by: str, trained_on: str, link: str | None = None
+) -> Record:
+    """Score a file of answers to the test set `name`.
+
+    Raises ValueError where the file holds no list, or the dataset is not that set.
+    """
+    data = answers.read_bytes()
+    answered = json.loads(data)
+    if not isinstance(answered, list):
+        raise ValueError(f"{answers} must hold a list of answers, and holds a {type(answered).__name__}")
+    chosen = load_set(name)
+    with DatasetReader(dataset) as reader:
+        slots, making = chosen.check(reader)
+        scores = chosen.task.score(reader, slots, answered)
+        manifest = reader.manifest_digest
+    return Record(
+        set=name,
+        method=method,
+        by=by,
+        trained_on=trained_on,
+        link=link,
+        making=making,
+        manifest=manifest,
+        predictions=sha256(data),
+        scores=_rounded(scores),
+    )
+
+
+def read_record(path: Path) -> Record:
+    """Return the record of a file; raise ValueError if it is not one."""
+    try:
+        return Record(**json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} must be a record of `stickslip-train benchmark score`: {error}") from None
+
+
+def table(name: str, records: Iterable[Record]) -> str:
+    """Return the Markdown table of the records of a set, best first."""
+    task = load_set(name).task
+    mine = sorted((record for record in records if record.set == name), key=lambda each: task.rank(each.scores))
+    titles = ("method", *task.columns, "trained on", "by", "set")
+    lines = [_line(titles), "|---" * len(titles) + "|"]
+    for record in mine:
+        method = record.method if record.link is None else f"[{record.method}]({record.link})"
+        lines.append(_line((method, *task.row(record.scores), record.trained_on, record.by, record.making)))
+    return "\n".join(lines)
+
+
+def with_tables(page: str, records: Iterable[Record]) -> str:
+    """Return a page in which what stands between `<!-- results of NAME -->` and `<!-- end -->` is that table."""
+    known, place = list(records), re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S)
+    changed, count = place.subn(lambda found: f"{found[1]}\n{table(found[2], known)}\n{found[3]}", page)
+    missing = {record.set for record in known} - set(re.findall(r"<!-- results of (\S+) -->", page))
+    if missing or not count:
+        raise ValueError(f"the page must have a place `<!-- results of NAME -->` for {', '.join(sorted(missing))}")
+    return changed
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _rounded(value: Any) -> Any:
+    """Return plain values with six digits: the last ones differ between machines."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    return value

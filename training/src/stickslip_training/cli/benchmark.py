@@ -91,7 +91,7 @@ def score(
     record: Annotated[Path | None, typer.Option(help="file for the record of this entry (.json)")] = None,
 ) -> None:
     """Score a file of predictions on a test set; the dataset is compared with the set first."""
-    from stickslip_training.benchmark.records import enter, table
+    from stickslip_training.benchmark.sets import enter, table
 
     with readable_errors():
         entry = enter(name, predictions, dataset, method=method, by=by, trained_on=trained_on, link=link)
@@ -106,7 +106,7 @@ def table_(
     page: Annotated[Path | None, typer.Option(help="put the tables into this page, between its marks")] = None,
 ) -> None:
     """Print the tables of records, best first, or put them into a page."""
-    from stickslip_training.benchmark.records import read_record, table, with_tables
+    from stickslip_training.benchmark.sets import read_record, table, with_tables
 
     with readable_errors():
         read = [read_record(path) for path in records]

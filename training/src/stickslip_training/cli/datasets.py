@@ -16,9 +16,8 @@ from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.errors import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import hdf5, huggingface, lerobot, meshes, webdataset
-from stickslip_training.export.content import Content, OnBytes
-from stickslip_training.export.writing import made_whole, to_directory
+from stickslip_training.export import formats, lerobot
+from stickslip_training.export.content import Content, OnBytes, made_whole, to_directory
 
 
 def info(
@@ -106,7 +105,7 @@ def export(
             with _progress(content) as on_bytes:
                 if option == "--hdf5":
                     with made_whole(target) as scratch:
-                        hdf5.write(content, scratch, on_bytes)
+                        formats.write_hdf5(content, scratch, on_bytes)
                 else:
                     to_directory(content, target, on_bytes, _DIRECTORIES[option])
         skipped = len(reader) - len(content.slots)
@@ -118,10 +117,10 @@ def export(
 
 
 _DIRECTORIES = {
-    "--webdataset": webdataset.write,
-    "--huggingface": huggingface.write,
+    "--webdataset": formats.write_webdataset,
+    "--huggingface": formats.write_huggingface,
     "--lerobot": lerobot.write,
-    "--obj": meshes.write_obj,
+    "--obj": formats.write_obj,
 }
 _NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--lerobot": ["av", "pandas", "pyarrow"]}
 

@@ -5,7 +5,7 @@ Clips of one simulation are not independent. So intervals are over simulations, 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,10 +73,6 @@ class Scores:
     sides: dict[str, Errors]
     reliability: dict[str, float]
     """Share of the clips whose truth lies in the central interval of each level."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,1 +1,1 @@
-"""Datasets in formats that other libraries read: HDF5, WebDataset, and Parquet for Hugging Face `datasets`."""
+"""Datasets in formats that other libraries read: HDF5, WebDataset, Parquet, LeRobot, and OBJ meshes."""

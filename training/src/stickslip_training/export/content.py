@@ -1,12 +1,17 @@
 """What an export holds: the samples of a part of a version, in the order of their slots, one at a time.
 
 Rejected samples are left out in every format, so no fill value is ever taken for a sample. The array `slot` says which
-slot of the version each sample has.
+slot of the version each sample has. An export is there whole or not at all, and overwrites nothing.
 """
 
 import json
+import os
+import shutil
+import uuid
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +19,7 @@ import numpy.typing as npt
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
+from stickslip_schemas.store import sync
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.errors import CorruptDataError
@@ -74,11 +80,6 @@ class Content:
     def labels(self) -> tuple[ArrayLayout, ...]:
         return tuple(array for array in self.arrays if array.is_label)
 
-    @property
-    def others(self) -> tuple[ArrayLayout, ...]:
-        """The arrays that are no labels: pictures, clips, curves, meshes."""
-        return tuple(array for array in self.arrays if not array.is_label)
-
     def read(self, name: str, slots: npt.NDArray[np.int64]) -> Array:
         """Return an array of samples, (len(slots), *sample shape)."""
         if name == SLOT.name:
@@ -129,3 +130,42 @@ class Content:
             for array in self.arrays
         }
         return (json.dumps(self.identity() | {"arrays": arrays}, indent=2) + "\n").encode()
+
+
+def to_directory(
+    content: Content, target: Path, on_bytes: OnBytes, write: Callable[[Content, Path, OnBytes], None]
+) -> None:
+    """Let `write` fill a directory, and add the manifest and a description."""
+    with made_whole(target) as scratch:
+        scratch.mkdir()
+        (scratch / MANIFEST_COPY).write_bytes(content.manifest())
+        (scratch / DESCRIPTION).write_bytes(content.description())
+        write(content, scratch, on_bytes)
+
+
+@contextmanager
+def made_whole(target: Path) -> Iterator[Path]:
+    """Give a path beside `target` to write to, which becomes `target` at the end, or vanishes after an error.
+
+    Raises FileExistsError, and overwrites nothing, where `target` exists.
+    """
+    _refuse_existing(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    scratch = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        yield scratch
+        for path in [scratch, *scratch.rglob("*")]:
+            sync(path)
+        _refuse_existing(target)
+        scratch.rename(target)
+        sync(target.parent)
+    finally:
+        if scratch.is_dir():
+            shutil.rmtree(scratch)
+        else:
+            scratch.unlink(missing_ok=True)
+
+
+def _refuse_existing(target: Path) -> None:
+    if os.path.lexists(target):
+        raise FileExistsError(f"{target} exists, and an export overwrites nothing: name another place")

@@ -11,7 +11,6 @@ Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset ha
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -37,15 +36,6 @@ _POSE = ("x", "y", "z", "xx", "yx", "zx", "xy", "yy", "zy")
 _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 
-@dataclass(frozen=True)
-class Episode:
-    """What becomes one episode."""
-
-    split: str
-    slots: dict[str, int]
-    """Sample by viewpoint."""
-
-
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write the files into an empty directory; raise ValueError where there are no holders or no whole episode."""
     import pandas
@@ -59,22 +49,22 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
             f"in this part of {content.name}"
         )
     episodes = list(_episodes(content))
-    views = list(episodes[0].slots)
+    views = list(episodes[0][1])
     instants = np.array(arrays["video"].attributes["instants"])
     length, span = len(instants), int(np.ptp(instants))
     per_second = Fraction(arrays["holder_pose"].attributes["instants_per_second"]).limit_denominator(1000)
     rate = per_second * (length - 1) / span if span else Fraction(1)  # a video has its frames evenly
-    totals: dict[str, Any] = {}
+    every: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     tables: list[Any] = []
-    for number, episode in enumerate(episodes):
+    for number, (_, slots) in enumerate(episodes):
         chunk, file = divmod(number, FILES)
-        frames, names = _numbers(content, episode.slots[views[0]], instants)
+        frames, names = _numbers(content, slots[views[0]], instants)
         frames["observation.time"] = (instants[:, None] / float(per_second)).astype(np.float32)
         names["observation.time"] = ["s"]
         stats = {name: _statistics(values) for name, values in frames.items()}
         where: dict[str, Any] = {}
-        for view, slot in episode.slots.items():
+        for view, slot in slots.items():
             key, video = f"observation.images.{view}", content.read("video", np.array([slot]))[0]
             _encode(video, directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file), rate)
             stats[key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
@@ -85,7 +75,7 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
                 f"videos/{key}/to_timestamp": float(length / rate),
             }
             on_bytes(content.sample_bytes)
-        totals = {name: _merged(totals[name], own) if name in totals else own for name, own in stats.items()}
+        every.append(stats)
         tables.append(_table(frames, number, rate))
         data_chunk, data_file = divmod(number // EPISODES_IN_FILE, FILES)
         if len(tables) == EPISODES_IN_FILE or number == len(episodes) - 1:
@@ -95,7 +85,7 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
             tables = []
         rows.append(
             {
-                **_labels(content, episode),
+                **_labels(content, slots[views[0]]),
                 "episode_index": number,
                 "tasks": [content.title],
                 "length": length,
@@ -113,13 +103,14 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     path.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), path)
     pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(directory / "meta" / "tasks.parquet")
+    totals = {name: _merged([stats[name] for stats in every]) for name in every[0]}
     (directory / "meta" / "stats.json").write_text(json.dumps(totals))
     info = _info(episodes, names, views, float(rate), arrays["video"].shape)
     (directory / "meta" / "info.json").write_text(json.dumps(info, indent=2))
 
 
-def _episodes(content: Content) -> Iterator[Episode]:
-    """Yield the episodes that all viewpoints of the dataset see, split by split."""
+def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
+    """Yield the split and the samples by viewpoint of each episode that all viewpoints see, split by split."""
     reader = content.reader
     labels = [name for name in reader.spec.named_axes if name in reader.arrays and name != "viewpoint"]
     seen: dict[tuple[Any, ...], dict[str, int]] = {}
@@ -135,7 +126,7 @@ def _episodes(content: Content) -> Iterator[Episode]:
             f"{content.name} has them all"
         )
     for split, slots in sorted(whole, key=lambda found: found[0]):
-        yield Episode(SPLITS[split], dict(sorted(slots.items())))
+        yield SPLITS[split], dict(sorted(slots.items()))
 
 
 def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Array], dict[str, list[str]]]:
@@ -217,21 +208,17 @@ def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str
     return {name: value.reshape(shape or -1).tolist() for name, value in found.items()} | {"count": [len(values)]}
 
 
-def _merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
-    """Return the statistics of two sets of values together [Chan et al. 1979]."""
-    a, b = ({name: np.array(value) for name, value in each.items()} for each in (one, other))
-    count = a["count"] + b["count"]
-    share = b["count"][0] / count[0]
-    apart = b["mean"] - a["mean"]
-    variance = (1.0 - share) * a["std"] ** 2 + share * b["std"] ** 2 + share * (1.0 - share) * apart**2
-    found = {"min": np.minimum(a["min"], b["min"]), "max": np.maximum(a["max"], b["max"])}
-    found |= {"mean": a["mean"] + share * apart, "std": np.sqrt(variance), "count": count}
-    return {name: value.tolist() for name, value in found.items()}
+def _merged(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of all episodes together, which have equally many values each."""
+    each = {name: np.array([part[name] for part in parts]) for name in parts[0]}
+    mean = each["mean"].mean(axis=0)
+    variance = (each["std"] ** 2 + (each["mean"] - mean) ** 2).mean(axis=0)
+    found = {"min": each["min"].min(axis=0), "max": each["max"].max(axis=0), "mean": mean, "std": np.sqrt(variance)}
+    return {name: value.tolist() for name, value in found.items()} | {"count": each["count"].sum(axis=0).tolist()}
 
 
-def _labels(content: Content, episode: Episode) -> dict[str, Any]:
+def _labels(content: Content, slot: int) -> dict[str, Any]:
     """Return the labels of an episode: those that are one number of a sample, and names instead of codes."""
-    slot = next(iter(episode.slots.values()))
     found: dict[str, Any] = {}
     for array in content.labels:
         if not array.shape and array.name != "viewpoint":
@@ -241,7 +228,7 @@ def _labels(content: Content, episode: Episode) -> dict[str, Any]:
 
 
 def _info(
-    episodes: list[Episode], names: dict[str, list[str]], views: list[str], rate: float, shape: tuple[int, ...]
+    episodes: list[tuple[str, Any]], names: dict[str, list[str]], views: list[str], rate: float, shape: tuple[int, ...]
 ) -> dict[str, Any]:
     """Return `info.json`; `shape` is that of a clip."""
     length, height, width, _ = shape
@@ -268,7 +255,7 @@ def _info(
     }
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
-    ends = np.cumsum([0, *(sum(episode.split == split for episode in episodes) for split in SPLITS)]).tolist()
+    ends = np.cumsum([0, *(sum(own == split for own, _ in episodes) for split in SPLITS)]).tolist()
     return {
         "codebase_version": "v3.0",
         "robot_type": "holders",

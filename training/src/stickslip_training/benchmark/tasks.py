@@ -1,48 +1,137 @@
-"""Curvature of hanging rods from noisy centrelines, and their weight over their stiffness, gamma.
+"""Tasks of test sets, one for each kind of dataset that has any: questions, and scoring of answers."""
 
-A method is given the centrelines of the split test under white noise of three strengths, drawn from a secret. Its
-answers are a list with
-
-    {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
-
-for every rod and noise. `bending` is null where a method has no answer, which counts as infinitely wrong. `gamma` may
-be left out.
-"""
-
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import torch
 from stickslip_schemas.base import sha256
 
 from stickslip_training.arrays import Array, Floats, Integers
-from stickslip_training.benchmark.task import Task
+from stickslip_training.cloth.clips import truth_of_slots
+from stickslip_training.cloth.crop import grey
+from stickslip_training.cloth.evaluation import BANDS, score_predictions
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.rods.dataset import with_white_noise
 from stickslip_training.rods.evaluation import bending, relative_rms_error
 
 NOISES = (0.001, 0.005, 0.01)
-"""Standard deviation of every coordinate, over L."""
+"""Standard deviation of every coordinate of a centreline, over L."""
 
-_DRAWS = 1000
+_SHOWN = 3  # frames of a clip that are compared
+_BLOCK = 14  # pixels along a side of an averaged block
 _EVERY = 15  # points of a rod of which one is compared
+_DRAWS = 1000
+
+
+class Task(ABC):
+    """Questions about datasets of one kind."""
+
+    label_names: tuple[str, ...]
+    """Labels that follow from the spec, with equal bits in every making of a set."""
+    columns: tuple[str, ...]
+    """Of the table of results, besides the method and who entered it."""
+    tolerances: Mapping[str, float]
+    """By which what `seen` returns may differ between two makings of one set."""
+
+    def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
+        """Return the slots and labels of samples as plain values; a category by its name."""
+        columns: dict[str, list[Any]] = {"slot": slots.tolist()}
+        for label in self.label_names:
+            names, values = reader.categories(label), reader.label(label)[slots].tolist()
+            columns[label] = [names[code] for code in values] if names else values
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    @abstractmethod
+    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+        """Return a little of what a method sees of slots, and of a truth that is computed."""
+
+    @abstractmethod
+    def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
+        """Return what a method is given, with noise from a secret; raise ValueError where that is the dataset
+        itself."""
+
+    @abstractmethod
+    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
+        """Return the scores of answers as plain values; raise ValueError, which names the answer, where one is none."""
+
+    @abstractmethod
+    def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the cells of `columns`."""
+
+    @abstractmethod
+    def rank(self, scores: Mapping[str, Any]) -> float:
+        """Return what is smaller for a better entry."""
+
+
+class ClothTask(Task):
+    """Friction and material of every clip: answers are what `stickslip-train cloth predict --json` prints."""
+
+    label_names = ("mu", "material", "texture", "viewpoint", "lighting")
+    columns = (
+        "mean error of mu",
+        "interval score",
+        "< 0.1 / < 0.2",
+        "material",
+        "in 80 % sets",
+        *(f"mu {low:g} to {high:g}" for low, high in BANDS),
+    )
+    tolerances = {"frames": 1.5}  # noqa: RUF012  # levels of 255, of means over 14 x 14 pixels
+
+    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+        shown = np.linspace(0, reader.arrays["video"].shape[0] - 1, _SHOWN + 2).round().astype(int)[1:-1]
+        means = [
+            torch.nn.functional.avg_pool2d(grey(torch.from_numpy(reader.read("video", [slot])[0][shown])), _BLOCK)
+            for slot in slots.tolist()
+        ]
+        return {"frames": (255 * torch.stack(means)).round().to(torch.uint8).numpy()}
+
+    def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
+        raise ValueError("a method is given the clips themselves: read the array video of the dataset")
+
+    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
+        truth = truth_of_slots(reader, slots)
+        return asdict(score_predictions(answers, reader.categories("material"), slots.tolist(), truth))
+
+    def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
+        blind, bands = scores["blind"], scores["bands"]
+
+        def error(part: Mapping[str, Any]) -> str:
+            return f"{part['mae']['value']:.3f}"
+
+        return (
+            f"{error(blind)} ({blind['mae']['low']:.3f} to {blind['mae']['high']:.3f})",
+            f"{blind['interval']['value']:.3f}" if "interval" in blind else "",
+            f"{blind['within_01']['value']:.0%} / {blind['within_02']['value']:.0%}",
+            f"{scores['top_1']['value']:.0%}",
+            f"{blind['coverage']['value']:.0%}",
+            *(error(bands[name]) if name in bands else "" for name in (f"{low:g} to {high:g}" for low, high in BANDS)),
+        )
+
+    def rank(self, scores: Mapping[str, Any]) -> float:
+        return float(scores["blind"]["mae"]["value"])
 
 
 class RodTask(Task):
-    """|kappa| and gamma of every rod of the split test."""
+    """Curvature of hanging rods from noisy centrelines, and their weight over their stiffness, gamma.
 
+    A method is given the centrelines of the split test under white noise of three strengths, drawn from a secret. Its
+    answers are a list with
+
+        {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
+
+    for every rod and noise. `bending` is null where a method has no answer, which counts as infinitely wrong. `gamma`
+    may be left out.
+    """
+
+    label_names = ("gamma", "phi0", "phi1")
     columns = (
         *(f"{100 * noise:g} %: error of \\|κ\\|, median; p95" for noise in NOISES),
         f"error of gamma at {100 * NOISES[1]:g} %, median; p95",
     )
     tolerances = {"centerline": 1e-5, "bending": 1e-3}  # noqa: RUF012
-
-    def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
-        columns = {name: reader.label(name)[slots].tolist() for name in ("gamma", "phi0", "phi1")}
-        return [
-            {"slot": slot, **{name: values[place] for name, values in columns.items()}}
-            for place, slot in enumerate(slots.tolist())
-        ]
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         exact = reader.read("centerline", slots)

@@ -1,0 +1,201 @@
+"""Datasets as HDF5, tar files for WebDataset, Parquet files for Hugging Face `datasets`, and OBJ meshes.
+
+Functions write into a new file, or an empty directory, which then gets the manifest and a description.
+"""
+
+import io
+import json
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stickslip_schemas.spec.arrays import ArrayLayout, describe
+
+from stickslip_training.arrays import Array
+from stickslip_training.export.content import DESCRIPTION, MANIFEST_COPY, Content, OnBytes
+
+CHUNK_BYTES = 2**20
+"""Decoded samples of a chunk of HDF5 [bytes]."""
+
+GROUP_BYTES = 32 * 2**20
+"""Decoded samples that are written to Parquet and read from it together [bytes]."""
+
+
+def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
+    """Write one file: a dataset for each array, with the names, types and values of the version.
+
+    The first dimension is the sample, and `slot` says which one. Every chunk has a checksum (fletcher32), which the
+    HDF5 library checks.
+    """
+    import h5py
+
+    count = len(content.slots)
+    with h5py.File(path, "x") as file:
+        for name, value in content.identity().items():
+            file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value or ""
+        manifest = np.frombuffer(content.manifest(), dtype=np.uint8)
+        file.create_dataset("manifest.json", data=manifest, chunks=manifest.shape, compression="gzip", fletcher32=True)
+        for array in content.arrays:
+            rows = max(1, min(count, CHUNK_BYTES // array.sample_bytes))
+            shape, chunks = (count, *array.shape), (rows, *array.shape)
+            out = file.create_dataset(array.name, shape=shape, dtype=array.dtype, chunks=chunks, fletcher32=True)
+            for dimension, name in zip(out.dims, ("sample", *array.dimensions), strict=True):
+                dimension.label = name
+            for key, value in describe(array).items():
+                out.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+            for first in range(0, count, rows):
+                slots = content.slots[first : first + rows]
+                out[first : first + len(slots)] = content.read(array.name, slots)
+                on_bytes(len(slots) * array.sample_bytes)
+
+
+def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> None:
+    """Write `train-000000.tar` and so on: for each sample `SLOT.json` with its labels, and a `SLOT.ARRAY.npy` for each
+    other array.
+
+    Categories are codes, as in the version; `dataset.json` names them. Infinity and NaN are written as Python's json
+    reads them.
+    """
+    for part in content.parts():
+        with tarfile.open(directory / f"{part.split}-{part.number:06d}.tar", "x", format=tarfile.USTAR_FORMAT) as tar:
+            labels = {array.name: content.read(array.name, part.slots).tolist() for array in content.labels}
+            for place, slot in enumerate(part.slots):
+                sample = {name: values[place] for name, values in labels.items()}
+                _add(tar, f"{slot:08d}.json", json.dumps(sample).encode())
+                for array in content.arrays:
+                    if not array.is_label:
+                        buffer = io.BytesIO()
+                        np.save(buffer, content.read(array.name, part.slots[[place]])[0], allow_pickle=False)
+                        _add(tar, f"{slot:08d}.{array.name}.npy", buffer.getvalue())
+                on_bytes(content.sample_bytes)
+
+
+def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Add a file without a time or an owner: the same export has the same bytes."""
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    member.mode = 0o644
+    tar.addfile(member, io.BytesIO(data))
+
+
+def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
+    """Write `SLOT/0000.obj` and so on, one for each instant with all sheets, and `SLOT/labels.json`.
+
+    Meshes are in metres, z up, with the flat cloth as texture coordinates from 0 to 1 along its longer side. OBJ is
+    text, and its numbers, read as 32-bit floats, are those of the dataset, bit by bit.
+    """
+    names = {array.name for array in content.arrays}
+    sheets = [name.removesuffix("positions") for name in sorted(names) if name.split(".")[-1] == "positions"]
+    missing = [f"{sheet}{part}" for sheet in sheets or [""] for part in ("positions", "rest", "triangles")]
+    if missing := [name for name in missing if name not in names]:
+        raise ValueError(f"a mesh needs {', '.join(missing)}, which this part of {content.name} does not have")
+    for slot in content.slots:
+        alone = np.array([slot])
+        folder = directory / f"{slot:08d}"
+        folder.mkdir()
+        labels = {array.name: content.read(array.name, alone)[0].tolist() for array in content.labels}
+        (folder / "labels.json").write_text(json.dumps(labels, indent=2) + "\n")
+        written: list[str] = []
+        first = 1
+        for sheet in sheets:
+            positions, rest, triangles = (
+                content.read(f"{sheet}{part}", alone)[0] for part in ("positions", "rest", "triangles")
+            )
+            low = rest.min(axis=0)
+            uv = ((rest - low) / (rest.max(axis=0) - low).max()).astype(np.float32)
+            fixed = "".join(f"vt {u:.9g} {v:.9g}\n" for u, v in uv.tolist())
+            fixed += "".join("f " + " ".join(f"{i}/{i}" for i in face) + "\n" for face in (triangles + first).tolist())
+            first += len(rest)
+            written = written or [""] * len(positions)
+            for instant, vertices in enumerate(positions.tolist()):
+                moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
+                written[instant] += f"o {sheet.removesuffix('.') or 'cloth'}\n{moved}{fixed}"
+        for instant, text in enumerate(written):
+            (folder / f"{instant:04d}.obj").write_text(text)
+        on_bytes(content.sample_bytes)
+
+
+def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> None:
+    """Write `data/train-00000-of-00002.parquet` and so on, and a card.
+
+    Each file carries the features, so `datasets.load_dataset(DIR)` gives every array with its shape and type, and every
+    categorical label with its names.
+    """
+    import datasets
+    import pyarrow
+    from pyarrow import parquet
+
+    (directory / "data").mkdir()
+    schema = datasets.Features({array.name: _feature(array) for array in content.arrays}).arrow_schema
+    rows = max(1, GROUP_BYTES // content.sample_bytes)
+    splits = []
+    for part in content.parts():
+        splits += [part.split] if part.number == 0 else []
+        path = directory / "data" / f"{part.split}-{part.number:05d}-of-{part.count:05d}.parquet"
+        with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
+            for first in range(0, len(part.slots), rows):
+                slots = part.slots[first : first + rows]
+                columns = [
+                    _column(content.read(array.name, slots), schema.field(array.name).type) for array in content.arrays
+                ]
+                writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
+                on_bytes(len(slots) * content.sample_bytes)
+    (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
+
+
+def _feature(array: ArrayLayout) -> Any:
+    import datasets
+
+    if array.categories:
+        return datasets.ClassLabel(names=list(map(str, array.categories)))
+    if not array.shape:
+        return datasets.Value(array.dtype)
+    if len(array.shape) == 1:
+        return datasets.Sequence(datasets.Value(array.dtype), length=array.shape[0])
+    of_rank = {2: datasets.Array2D, 3: datasets.Array3D, 4: datasets.Array4D, 5: datasets.Array5D}
+    return of_rank[len(array.shape)](array.shape, array.dtype)
+
+
+def _column(values: Array, kind: Any) -> Any:
+    """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the further axes."""
+    import pyarrow
+
+    column = pyarrow.array(values.reshape(-1))
+    for size in values.shape[:0:-1]:
+        column = pyarrow.FixedSizeListArray.from_arrays(column, size)
+    if not isinstance(kind, pyarrow.ExtensionType):
+        return column.cast(kind)
+    return pyarrow.ExtensionArray.from_storage(kind, column.cast(kind.storage_type))
+
+
+def _card(content: Content, splits: list[str]) -> str:
+    files = "".join(f"  - split: {split}\n    path: data/{split}-*.parquet\n" for split in splits)
+    arrays = "\n".join(
+        f"| `{array.name}` | {' x '.join(map(str, array.shape)) or 'one value'} | {array.dtype} | {array.description} |"
+        for array in content.arrays
+    )
+    return f"""---
+configs:
+- config_name: default
+  data_files:
+{files}---
+
+# {content.title}
+
+This is an export of the dataset `{content.name}`, which stickslip made: {len(content.slots)} samples. The manifest of
+that version is `{MANIFEST_COPY}` here; its SHA-256 is `{content.reader.manifest_digest}`.
+`{DESCRIPTION}` describes the arrays for programs.
+
+```python
+from datasets import load_dataset
+
+dataset = load_dataset("PATH OF THIS DIRECTORY").with_format("numpy")
+```
+
+The format "numpy" of `datasets` rounds float64 to float32, unless you give it a `dtype`.
+
+| column | shape | type | meaning |
+|---|---|---|---|
+{arrays}
+"""
