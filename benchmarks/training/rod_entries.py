@@ -21,12 +21,13 @@ import numpy.typing as npt  # noqa: E402
 import torch  # noqa: E402
 from stickslip_sim_core import fit_natural_curvature, fit_parameters  # noqa: E402
 from stickslip_training.rods import curvature as table_5_1  # noqa: E402
-from stickslip_training.rods.baselines import (  # noqa: E402
+from stickslip_training.rods.evaluation import (  # noqa: E402
+    bending,
     cubic_spline_curvature,
+    estimate_strains,
     finite_difference_curvature,
     quintic_spline_curvature,
 )
-from stickslip_training.rods.evaluation import bending, estimate_strains  # noqa: E402
 
 Lines = npt.NDArray[np.float32]
 Answer = dict[str, Any]

@@ -1,13 +1,15 @@
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
-from stickslip_training.rods.baselines import (
+from stickslip_training.rods.evaluation import (
+    bending,
     cubic_spline_curvature,
     finite_difference_curvature,
     quintic_spline_curvature,
+    relative_rms_error,
+    rms,
+    with_white_noise,
 )
-from stickslip_training.rods.dataset import with_white_noise
-from stickslip_training.rods.evaluation import bending, relative_rms_error, rms
 
 S = np.linspace(0.0, 1.0, 150)
 METHODS = [finite_difference_curvature, cubic_spline_curvature, quintic_spline_curvature]

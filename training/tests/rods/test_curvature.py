@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.rods.curvature import CurvatureTraining, load_model, train_curvature
-from stickslip_training.rods.dataset import load_splits
-from stickslip_training.rods.evaluation import estimate_strains, noisy_test_centerline
+from stickslip_training.rods.curvature import TEST, CurvatureTraining, load_model, load_splits, train_curvature
+from stickslip_training.rods.evaluation import estimate_strains, with_white_noise
 
 pytestmark = pytest.mark.physics
 
@@ -49,7 +48,7 @@ def test_the_report_measures_the_model_that_is_saved(trained, rods):
     assert json.loads((config.out / "report.json").read_text())["test_loss"] == report["test_loss"]
     with DatasetReader(rods.root) as reader:
         test = load_splits(reader, config.evaluation_rods)[0]["test"]
-    noisy = noisy_test_centerline(test, config.noise, config.seed)
+    noisy = with_white_noise(test.centerline, config.noise, (config.seed, TEST))
     assert np.array_equal(test.centerline, rods.arrays["centerline"][test.slots])
     assert 0.0009 < (noisy - test.centerline).std() < 0.0011
     strains = estimate_strains(load_model(config.out / "model.pt"), noisy)

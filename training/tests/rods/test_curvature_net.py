@@ -1,6 +1,6 @@
 import pytest
 import torch
-from stickslip_training.rods.nets import CurvatureNet, root_mean_square_loss
+from stickslip_training.rods.curvature import CurvatureNet, root_mean_square_loss
 
 
 def test_it_is_the_network_of_table_5_1():

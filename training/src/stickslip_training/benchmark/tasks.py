@@ -14,8 +14,7 @@ from stickslip_training.cloth.clips import truth_of_slots
 from stickslip_training.cloth.crop import grey
 from stickslip_training.cloth.evaluation import BANDS, score_predictions
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.rods.dataset import with_white_noise
-from stickslip_training.rods.evaluation import bending, relative_rms_error
+from stickslip_training.rods.evaluation import bending, relative_rms_error, with_white_noise
 
 NOISES = (0.001, 0.005, 0.01)
 """Standard deviation of every coordinate of a centreline, over L."""

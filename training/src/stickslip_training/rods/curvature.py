@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from stickslip_training.data.reader import DatasetReader
+from stickslip_training.arrays import Array, Integers, SingleFloats
+from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine.fit import (
     EpochReport,
     FitSettings,
@@ -22,11 +23,140 @@ from stickslip_training.engine.fit import (
     torch_threads,
     write_report,
 )
-from stickslip_training.rods.dataset import Rods, load_splits, with_white_noise
-from stickslip_training.rods.evaluation import estimate_strains, evaluate, noisy_test_centerline, rms
-from stickslip_training.rods.nets import CurvatureNet, root_mean_square_loss
+from stickslip_training.rods.evaluation import estimate_strains, evaluate, rms, with_white_noise
 
-_TRAINING, _VALIDATION, _ORDER = 0, 1, 3  # streams of random numbers, kept apart
+KIND = "rod_hang"
+
+POINTS = 150
+"""Of a centreline that the network takes."""
+
+FEW_RODS = 30
+"""With fewer test rods than this, a report warns that its medians mean little."""
+
+TRAINING, VALIDATION, TEST, ORDER = range(4)
+"""Streams of random numbers, kept apart."""
+
+
+@dataclass(frozen=True)
+class Rods:
+    """Rods in memory: centrelines over L and strains times L, float32 (rods, 150, 3), and their slots."""
+
+    slots: Integers
+    centerline: SingleFloats
+    strains: SingleFloats
+
+    def __len__(self) -> int:
+        return len(self.slots)
+
+    def __getitem__(self, chosen: slice | Array) -> "Rods":
+        return Rods(self.slots[chosen], self.centerline[chosen], self.strains[chosen])
+
+
+def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, Rods], list[str]]:
+    """Read the three splits, of the test split no more than `evaluation_rods`; return them, and notes on them.
+
+    Where a split is empty, another one takes its place, with a note.
+    """
+    if reader.kind != KIND:
+        raise ValueError(f"kind of the dataset must be {KIND} to train on curvature: it is {reader.kind}")
+    points = reader.arrays["centerline"].shape[0]
+    if points != POINTS:
+        raise ValueError(f"centrelines must have {POINTS} points for this network, and have {points}")
+    splits: tuple[Split, ...] = ("train", "validation", "test")
+    slots = {split: reader.slots(split) for split in splits}
+    if not any(map(len, slots.values())):
+        raise ValueError(f"dataset {reader.manifest.dataset} has no valid sample to train on")
+    notes = []
+    if not len(slots["train"]):
+        other: Split = "validation" if len(slots["validation"]) > len(slots["test"]) else "test"
+        slots["train"] = slots[other]
+        notes.append(f"The train split is empty: the network was trained on the {other} split.")
+    if not len(slots["validation"]):
+        notes.append("The validation split is empty: the model has the last weights, not the best ones.")
+    if not len(slots["test"]):
+        other = "validation" if len(slots["validation"]) else "train"
+        slots["test"] = slots[other]
+        seen = "chose the weights" if other == "validation" else "trained the network"
+        notes.append(f"The test split is empty: errors are those on the {other} split, which {seen}.")
+    if set(slots["test"]) & set(slots["train"]):
+        notes.append("Test rods were trained on: these errors do not hold for other rods.")
+    if len(slots["test"]) > evaluation_rods:
+        notes.append(f"Evaluated on {evaluation_rods} of {len(slots['test'])} test rods (evaluation_rods).")
+        slots["test"] = slots["test"][:evaluation_rods]
+    if len(slots["test"]) < FEW_RODS:
+        notes.append(f"There are only {len(slots['test'])} test rods: take medians and percentiles as a hint.")
+    arrays = ("centerline", "curvature")
+    return {split: Rods(some, *(reader.read(name, some) for name in arrays)) for split, some in slots.items()}, notes
+
+
+class CurvatureNet(nn.Module):
+    """The network of Table 5.1 of the thesis.
+
+    It takes centrelines over L, (B, 150, 3), to strains (twist, bend1, bend2) times L, (B, 150, 3). The table is silent
+    on four things. What was chosen, and why:
+
+    * Convolutions are padded to keep the length: every one of the 150 points is then the middle of a filter, the clamp
+      and the free end too, where the rod bears all of its weight and none.
+    * Poolings are not padded: a maximum over a window that reaches beyond the end adds nothing to the one that does
+      not. With stride 1 they shorten 150 points to 148, 147 and 146.
+    * The second block of the name conv2 has weights of its own; with 128 channels in and not 64 it could not share.
+    * Inputs and outputs are standardised by fixed numbers, buffers and so part of the state: mean and deviation at each
+      point for the centreline, for each strain over all points for the output. Adadelta starts with steps of about
+      1e-3, and the strains are of order 10.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+
+        def convolution(channels_in: int, channels_out: int) -> list[nn.Module]:
+            return [nn.Conv1d(channels_in, channels_out, kernel_size=3, padding="same"), nn.ReLU()]
+
+        self.features = nn.Sequential(
+            *convolution(3, 64),
+            *convolution(64, 64),
+            nn.MaxPool1d(3, stride=1),
+            *convolution(64, 128),
+            *convolution(128, 128),
+            nn.MaxPool1d(2, stride=1),
+            *convolution(128, 128),
+            *convolution(128, 128),
+            nn.MaxPool1d(2, stride=1),
+        )
+        self.head = nn.Sequential(
+            nn.Flatten(), nn.Linear(128 * (POINTS - 4), 512), nn.ReLU(), nn.Linear(512, POINTS * 3)
+        )
+        self.input_mean: torch.Tensor
+        self.input_scale: torch.Tensor
+        self.output_mean: torch.Tensor
+        self.output_scale: torch.Tensor
+        self.register_buffer("input_mean", torch.zeros(POINTS, 3))
+        self.register_buffer("input_scale", torch.ones(POINTS, 3))
+        self.register_buffer("output_mean", torch.zeros(3))
+        self.register_buffer("output_scale", torch.ones(3))
+
+    def standardise(self, centerline: torch.Tensor, strains: torch.Tensor, noise: float) -> None:
+        """Set the standardisation from the training rods, (rods, 150, 3) each, seen with `noise` (of L)."""
+        spread = centerline.double().var(dim=0, correction=0) + noise**2
+        self.input_mean.copy_(centerline.double().mean(dim=0))
+        self.input_scale.copy_(_positive(spread.sqrt()))
+        self.output_mean.copy_(strains.double().mean(dim=(0, 1)))
+        self.output_scale.copy_(_positive(strains.double().std(dim=(0, 1), correction=0)))
+
+    def forward(self, centerline: torch.Tensor) -> torch.Tensor:
+        """Estimate the strains of a batch of centrelines."""
+        x = (centerline - self.input_mean) / self.input_scale
+        y = self.head(self.features(x.transpose(1, 2)))
+        return torch.as_tensor(y.reshape(-1, POINTS, 3) * self.output_scale + self.output_mean)
+
+
+def root_mean_square_loss(estimate: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Return the root of the mean square of all differences, the loss of the thesis."""
+    return torch.sqrt(torch.mean(torch.square(estimate - truth)))
+
+
+def _positive(scale: torch.Tensor) -> torch.Tensor:
+    """Return `scale`, and 1 where it is 0: a number that is always the same (the clamp's position) stays 0."""
+    return torch.where(scale > 1e-12, scale, torch.ones_like(scale))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +214,8 @@ def train_curvature(
     config = replace(config, epoch=learner.steps_per_epoch)
     fitted = fit(learner, config, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
     with torch_threads(config.threads):
-        noisy = noisy_test_centerline(rods["test"], config.noise, config.seed)
-        methods, test_loss = evaluate(fitted.net, rods["test"], noisy)
+        noisy = with_white_noise(rods["test"].centerline, config.noise, (config.seed, TEST))
+        methods, test_loss = evaluate(fitted.net, noisy, rods["test"].strains)
     report = {
         "dataset": manifest.dataset,
         "version": manifest.version,
@@ -118,7 +248,7 @@ class _CurvatureLearner(Learner):
         self.config = config
         self.train = train
         self.validation = validation
-        self.noisy_validation = with_white_noise(validation.centerline, config.noise, (config.seed, _VALIDATION))
+        self.noisy_validation = with_white_noise(validation.centerline, config.noise, (config.seed, VALIDATION))
         self.steps_per_epoch = -(-len(train) // config.batch_size)
         with seeded(config.seed):
             self.net = CurvatureNet()
@@ -130,9 +260,9 @@ class _CurvatureLearner(Learner):
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         config = self.config
         epoch, position = divmod(step, self.steps_per_epoch)
-        order = np.random.default_rng((config.seed, _ORDER, epoch)).permutation(len(self.train))
+        order = np.random.default_rng((config.seed, ORDER, epoch)).permutation(len(self.train))
         batch = self.train[order[position * config.batch_size : (position + 1) * config.batch_size]]
-        noisy = with_white_noise(batch.centerline, config.noise, (config.seed, _TRAINING, step))
+        noisy = with_white_noise(batch.centerline, config.noise, (config.seed, TRAINING, step))
         estimate = net(torch.from_numpy(noisy).to(config.device))
         return root_mean_square_loss(estimate, torch.from_numpy(batch.strains).to(config.device))
 

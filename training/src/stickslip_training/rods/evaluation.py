@@ -1,4 +1,8 @@
-"""Errors of the curvature that networks, and methods that learn nothing, find of the same noisy rods.
+"""Curvature of noisy centrelines without learning, which is what a network has to beat, and errors of all methods.
+
+The curvature of a curve x(s) in any parametrisation is |x' × x''| / |x'|^3. Points are at uniform arc length, so s is
+known; lengths are over L, and so curvatures come out times L. Every method here takes centrelines (rods, points, 3) and
+returns |kappa| L, (rods, points).
 
 kappa = (twist, bend1, bend2) L are the strains of a rod. Its centreline has the curvature |kappa| = sqrt(bend1^2 +
 bend2^2) L: the twist is that of the material about the centreline, which an estimate from the centreline alone cannot
@@ -7,20 +11,132 @@ see. So errors that compare methods are errors of |kappa|.
 
 import time
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.interpolate import BSpline
+from scipy.linalg import eigh
 
 from stickslip_training.arrays import AnyFloats, Floats, SingleFloats
-from stickslip_training.rods.baselines import (
-    cubic_spline_curvature,
-    finite_difference_curvature,
-    quintic_spline_curvature,
-)
-from stickslip_training.rods.dataset import Rods, with_white_noise
 
 _CHUNK = 256  # rods that go through a network at once
-_TEST = 2  # stream of random numbers of the noise on test rods, apart from those of training
+
+
+def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
+    """Add independent normal noise of standard deviation `share` (of L) to every coordinate of every point.
+
+    The same `seed` gives the same noise. `centerline` is over L, (..., points, 3).
+    """
+    generator = np.random.default_rng(seed)
+    noise = generator.standard_normal(centerline.shape, dtype=np.float32)
+    return (centerline + np.float32(share) * noise).astype(np.float32, copy=False)
+
+
+def finite_difference_curvature(centerline: AnyFloats) -> Floats:
+    """Take the derivatives from a point and its two neighbours; x'' at an end is that of the point next to it."""
+    x = np.asarray(centerline, dtype=np.float64)
+    h = 1.0 / (x.shape[-2] - 1)
+    first = np.gradient(x, h, axis=-2, edge_order=2)
+    second = np.empty_like(x)
+    second[..., 1:-1, :] = (x[..., 2:, :] - 2 * x[..., 1:-1, :] + x[..., :-2, :]) / h**2
+    second[..., 0, :], second[..., -1, :] = second[..., 1, :], second[..., -2, :]
+    return _curvature(first, second)
+
+
+def cubic_spline_curvature(centerline: AnyFloats) -> Floats:
+    """Take the derivatives from cubic smoothing splines, the usual ones.
+
+    They minimise the sum of squares plus lambda ∫ |x''|^2, for which they are straight at their ends: at the free
+    end, where a rod has its natural curvature, they find none. `scipy.interpolate.make_smoothing_spline` gives the same
+    splines, at 50 ms each.
+    """
+    return _spline_curvature(centerline, 2)
+
+
+def quintic_spline_curvature(centerline: AnyFloats) -> Floats:
+    """Take the derivatives from quintic smoothing splines, which penalise ∫ |x'''|^2 and may be bent at their ends.
+
+    They halve the error of cubic ones on hanging rods. One order more takes another sixth off, and was not worth it.
+    """
+    return _spline_curvature(centerline, 3)
+
+
+def _curvature(first: Floats, second: Floats) -> Floats:
+    """|x' × x''| / |x'|^3 of x' and x'', (..., points, 3)."""
+    return np.asarray(np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3)
+
+
+class _SplineBasis(NamedTuple):
+    """Splines that are orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a
+    [Demmler, Reinsch 1975]: in this basis smoothing is a division, and every lambda can be tried on every curve.
+    """
+
+    value: Floats
+    """At the points, (points, basis)."""
+    first: Floats
+    second: Floats
+    weight: Floats
+    """a, (basis,)."""
+
+
+@cache
+def _spline_basis(points: int, order: int) -> _SplineBasis:
+    """Return the basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]."""
+    degree = 2 * order - 1
+    s = np.linspace(0.0, 1.0, points)
+    knots = np.concatenate([np.zeros(degree), s, np.ones(degree)])
+    splines = BSpline(knots, np.eye(points + degree - 1), degree)
+    B = splines(s)
+    # The penalised derivative is of degree order - 1 between knots: `order` Gauss points integrate its square exactly.
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    h = s[1]
+    D = splines.derivative(order)((s[:-1, None] + h * (nodes + 1) / 2).ravel())
+    P = D.T @ (np.tile(h * weights / 2, points - 1)[:, None] * D)
+    P *= np.trace(B.T @ B) / np.trace(P)  # the scale of lambda is free, and rounding is least where the two are alike
+    weight, V = eigh(B.T @ B, B.T @ B + P)
+    return _SplineBasis(B @ V, splines.derivative(1)(s) @ V, splines.derivative(2)(s) @ V, np.clip(weight, 0.0, 1.0))
+
+
+_SMOOTHING = np.geomspace(1e-3, 1e16, 400)
+"""The values of lambda that are tried, in the scale of `_spline_basis`."""
+
+_MOST_FREEDOM = 0.7
+"""Most degrees of freedom of a spline, as a share of the points: near 1, cross-validation divides 0 by 0."""
+
+
+def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
+    """Smooth each coordinate by itself, with the lambda of least generalised cross-validation [Craven, Wahba 1979]:
+
+    GCV = (|y - f|^2 / n) / (1 - tr(A) / n)^2, f = A y.
+    """
+    x = np.asarray(centerline, dtype=np.float64)
+    points = x.shape[-2]
+    basis = _spline_basis(points, order)
+    a = basis.weight
+    y = x.swapaxes(-1, -2).reshape(-1, points)
+    z = y @ basis.value
+    power = np.square(y).sum(axis=1)
+    best, smoothing = np.full(len(y), np.inf), np.zeros(len(y))
+    for candidate in _SMOOTHING:
+        shrunk = 1.0 / (a + candidate * (1.0 - a))  # the coefficients are c = shrunk z
+        freedom = float((a * shrunk).sum()) / points
+        if freedom > _MOST_FREEDOM:
+            continue
+        residual = power - np.square(z) @ (shrunk * (2.0 - a * shrunk))  # |y|^2 - 2 c z + a c^2
+        score = residual / (1.0 - freedom) ** 2
+        better = score < best
+        best[better], smoothing[better] = score[better], candidate
+    c = z / (a + smoothing[:, None] * (1.0 - a))
+    first, second = (
+        (c @ derivative.T).reshape(*x.shape[:-2], 3, points).swapaxes(-1, -2)
+        for derivative in (basis.first, basis.second)
+    )
+    return _curvature(first, second)
+
+
+# --- errors ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +153,6 @@ class MethodReport:
     seconds_per_rod: float
 
 
-def noisy_test_centerline(rods: Rods, noise: float, seed: int) -> SingleFloats:
-    """Return the centrelines of test rods as all methods see them, (rods, 150, 3)."""
-    return with_white_noise(rods.centerline, noise, (seed, _TEST))
-
-
 def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFloats:
     """Return the strains (twist, bend1, bend2) times L of centrelines over L, both (rods, 150, 3)."""
     device = next(net.parameters()).device
@@ -53,9 +164,10 @@ def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFl
     return np.concatenate(parts)
 
 
-def evaluate(net: torch.nn.Module, rods: Rods, noisy: SingleFloats) -> tuple[tuple[MethodReport, ...], float]:
-    """Let every method see the centrelines `noisy` of `rods`; return how each did, and the network's loss [rad]."""
-    truth = bending(rods.strains)
+def evaluate(net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats) -> tuple[tuple[MethodReport, ...], float]:
+    """Let every method see noisy centrelines of rods of true strains; return how each did, and the network's loss
+    [rad]."""
+    truth = bending(true)
     net.eval()
     started = time.perf_counter()
     strains = estimate_strains(net, noisy)
@@ -69,7 +181,7 @@ def evaluate(net: torch.nn.Module, rods: Rods, noisy: SingleFloats) -> tuple[tup
         method(noisy[:1])  # the splines' basis is made once, whatever the number of rods
         started = time.perf_counter()
         reports.append(_method(name, method(noisy), truth, started))
-    return tuple(reports), rms(strains - rods.strains)
+    return tuple(reports), rms(strains - true)
 
 
 def _method(name: str, estimate: Floats, truth: Floats, started: float) -> MethodReport:
