@@ -6,10 +6,9 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
-from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
-from stickslip_training.data.sources import BucketSource, open_source
+from stickslip_training.data.sources import BucketSource, CorruptDataError, MissingFileError, SourceError, open_source
 
 pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-training[s3]'")
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")

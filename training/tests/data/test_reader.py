@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import zarr
 from stickslip_schemas.base import sha256
-from stickslip_training.data.errors import (
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.sources import (
     CorruptDataError,
     DatasetError,
     InvalidDatasetError,
     MissingFileError,
     RejectedSampleError,
 )
-from stickslip_training.data.reader import DatasetReader
 
 
 @pytest.mark.parametrize("name", ["clips", "rods", "seen_rods"])

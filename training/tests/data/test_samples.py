@@ -135,7 +135,7 @@ def test_workers_read_what_one_process_reads(clips, method):
 
 
 def test_an_error_in_a_worker_arrives_as_itself(clips, tmp_path):
-    from stickslip_training.data.errors import MissingFileError
+    from stickslip_training.data.sources import MissingFileError
 
     made = clips.copy(tmp_path / "v1")
     dataset = Samples(made.root)

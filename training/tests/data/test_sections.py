@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.format.manifest import FileEntry, ManifestSection, section_path, section_samples
-from stickslip_training.data.errors import (
+from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.samples import Samples
+from stickslip_training.data.sources import (
     CorruptDataError,
     DatasetError,
     InvalidDatasetError,
     MissingFileError,
     RejectedSampleError,
 )
-from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.samples import Samples
 
 
 def write_sections(made, **changes):

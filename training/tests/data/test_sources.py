@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
-from stickslip_training.data.sources import HttpSource
+from stickslip_training.data.sources import CorruptDataError, HttpSource, MissingFileError, SourceError
 
 
 class _Server(http.server.ThreadingHTTPServer):

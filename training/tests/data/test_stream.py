@@ -6,8 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from stickslip_training.data.samples import Samples
-from stickslip_training.data.stream import Stream
+from stickslip_training.data.samples import Samples, Stream
 
 
 def slots(stream: Stream, count: int | None = None) -> list[list[int]]:

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_training.reconstruction import curve
 from stickslip_training.reconstruction.refinement import _Problem, draw, samples, start
 from stickslip_training.reconstruction.silhouette import NoRodError, View, silhouette, to_linear
 from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
-from stickslip_training.reconstruction.tube_image import Shading, tube_image
+from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, fit_curve, tube_image
 
 RADIUS = 0.008
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -35,7 +34,7 @@ def line():
 @pytest.fixture(scope="module")
 def views(line):
     """The helix as the drawing itself would have it."""
-    fit = start(curve.fit(line, 44), RADIUS, 4)
+    fit = start(fit_curve(line, 44), RADIUS, 4)
     drawn = []
     for index, view in enumerate(empty_views()):
         image = draw(view, index, fit, samples([view], fit))
@@ -97,8 +96,8 @@ def test_views_project_as_cameras_do(line):
 
 
 def test_a_spline_is_at_uniform_arc_length(line):
-    control = curve.fit(line, 44)
-    found = curve.at_uniform_arc_length(control, 150)
+    control = fit_curve(line, 44)
+    found = at_uniform_arc_length(control, 150)
     assert np.linalg.norm(found - line, axis=1).max() < 2e-4
     steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
@@ -108,7 +107,7 @@ def test_the_drawing_changes_as_its_derivatives_say():
     """Along a straight rod, where the nearest sample of a pixel does not jump as the rod moves."""
     view = empty_views()[1]
     points = np.linspace((0.0, 0.0, 0.0), (0.02, 0.01, -0.9), 400)
-    shading = Shading(1.0 + 0.2 * np.sin(np.linspace(0, 3, 400)), 0.3 * np.cos(np.linspace(0, 3, 400)))
+    bright, tilted = 1.0 + 0.2 * np.sin(np.linspace(0, 3, 400)), 0.3 * np.cos(np.linspace(0, 3, 400))
 
     def value(shift=0.0, grow=0.0, blur=0.0, light=0.0, slope=0.0):
         image = tube_image(
@@ -116,7 +115,8 @@ def test_the_drawing_changes_as_its_derivatives_say():
             points + shift * np.array([1.0, 0.0, 0.0]),
             RADIUS * np.exp(grow),
             0.5 * np.exp(blur),
-            Shading(shading.light + light, shading.slope + slope),
+            bright + light,
+            tilted + slope,
         )
         drawn = np.full(view.coverage.size, np.nan)
         drawn[image.pixel] = image.value
@@ -143,7 +143,7 @@ def test_the_drawing_changes_as_its_derivatives_say():
 
 @pytest.mark.physics
 def test_the_cost_falls_as_its_gradient_says(views, line):
-    fit = start(curve.fit(line, 44), 1.1 * RADIUS, 4)
+    fit = start(fit_curve(line, 44), 1.1 * RADIUS, 4)
     fit = replace(fit, control=fit.control + 0.002 * np.sin(np.arange(132).reshape(44, 3)))
     problem = _Problem(views, fit, DOWN, 0.0, True, False)
     x = problem.pack(fit)
@@ -172,7 +172,7 @@ def test_the_hull_holds_the_rod_and_little_else(views, line):
 def test_the_moving_cylinder_follows_a_gentle_rod(views, line):
     walked = moving_cylinder(visual_hull(views), RADIUS, DOWN)
     assert np.linalg.norm(walked[:, None] - line, axis=-1).min(axis=1).max() < 2.0 * RADIUS
-    assert curve.arc_length(walked)[-1] == pytest.approx(1.0, abs=0.05)
+    assert arc_length(walked)[-1] == pytest.approx(1.0, abs=0.05)
 
 
 def test_tracking_goes_to_the_free_end(views, line):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from stickslip_training.data.errors import DatasetError
+from stickslip_training.data.sources import DatasetError
 
 if TYPE_CHECKING:
     from stickslip_training.engine.fit import EpochReport

@@ -11,20 +11,12 @@ from typing import Any
 
 import numpy as np
 from stickslip_schemas.base import sha256
-from stickslip_schemas.format.codecs import (
-    MISSING,
-    CorruptChunkError,
-    decode_chunk,
-    decode_sample,
-    decode_shard_index,
-    shard_index_size,
-)
+from stickslip_schemas.format import codecs
 from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry, Manifest, ManifestSection
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError
-from stickslip_training.data.sources import Source
+from stickslip_training.data.sources import CorruptDataError, InvalidDatasetError, MissingFileError, Source
 
 
 class Index:
@@ -143,26 +135,26 @@ class Index:
         what = f"array {array.name}, sample {slot}"
         file = self.file(array.shard_path(number), what)
         offset, length = map(int, self._shard_index(array, number, file)[position])
-        if offset == MISSING and length == MISSING:
+        if offset == codecs.MISSING and length == codecs.MISSING:
             raise CorruptDataError(f"{what}: its chunk is missing in {self.at(file)}")
         if offset + length > file.size:
             raise CorruptDataError(f"{what}: its chunk reaches beyond the end of {self.at(file)}")
         chunk = self.source.read(file, offset, length)
         with _naming(f"{what}, {self.at(file)}"):
-            decode_sample(array, chunk, out)
+            codecs.decode_sample(array, chunk, out)
 
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
         key = array.name, shard
         if key not in self._shard_indexes:
             samples = self.manifest.spec.samples_per_shard
-            size = shard_index_size(samples)
+            size = codecs.shard_index_size(samples)
             if size > file.size:
                 raise CorruptDataError(f"array {array.name}: {self.at(file)} is too short for a shard index")
             data = self.source.read(file, file.size - size, size)
             if self._check_shards:
                 self._compare(file, self.source.digest(file))
             with _naming(f"array {array.name}, {self.at(file)}"):
-                self._shard_indexes[key] = decode_shard_index(data, samples)
+                self._shard_indexes[key] = codecs.decode_shard_index(data, samples)
         return self._shard_indexes[key]
 
     def _kept_chunk(self, array: ArrayLayout, number: int) -> Array:
@@ -184,7 +176,7 @@ class Index:
         out = np.empty((size, *array.shape), dtype=array.dtype)
         data = self.read_file(file)
         with _naming(f"{what}, {self.at(file)}"):
-            decode_chunk(data, out)
+            codecs.decode_chunk(data, out)
         return out
 
 
@@ -193,5 +185,5 @@ def _naming(what: str) -> Iterator[None]:
     """Name the chunk that cannot be decoded."""
     try:
         yield
-    except (CorruptChunkError, RuntimeError, ValueError) as error:
+    except (codecs.CorruptChunkError, RuntimeError, ValueError) as error:
         raise CorruptDataError(f"{what}: {error}") from error

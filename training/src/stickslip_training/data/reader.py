@@ -5,16 +5,18 @@ asynchronous, so a reader may be used before and after a fork, and it can be pic
 replaced by zeros.
 """
 
+import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.format.codecs import empty_in_order, in_order_of_chunks
+from stickslip_schemas.format.codecs import axes_order, empty_in_order, in_order_of_chunks, packing
 from stickslip_schemas.format.manifest import (
+    GROUP_NAME,
     SEAL_NAME,
     BrokenSealError,
     FileEntry,
@@ -28,10 +30,16 @@ from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.errors import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError
 from stickslip_training.data.index import Index
-from stickslip_training.data.metadata import GROUP_METADATA, check_array, consolidated, parse_metadata
-from stickslip_training.data.sources import DirectorySource, Source, open_source
+from stickslip_training.data.sources import (
+    CorruptDataError,
+    DirectorySource,
+    InvalidDatasetError,
+    MissingFileError,
+    RejectedSampleError,
+    Source,
+    open_source,
+)
 
 Split = Literal["train", "validation", "test"]
 Slots = Sequence[int] | npt.NDArray[np.integer[Any]]
@@ -223,15 +231,19 @@ class DatasetReader:
             self.index.check_section(slot)
 
     def _check_metadata(self, group: dict[str, Any]) -> None:
-        """Check the Zarr metadata against the layout, and their digests against the manifest."""
-        inline = consolidated(group)
+        """Check the Zarr metadata against the layout: what is read follows from the layout alone, and a chunk of
+        another shape or codec would be nonsense that passes its checksum."""
+        if group.get("zarr_format") != 3 or group.get("node_type") != "group":
+            raise InvalidDatasetError(f"{GROUP_NAME} must be of a Zarr v3 group")
+        inline = group.get("consolidated_metadata")
+        inline = inline.get("metadata") if isinstance(inline, dict) else None
         for name, array in self.arrays.items():
-            if inline is None:
-                file = self.index.file(f"{name}/{GROUP_METADATA}", "metadata")
-                found: Any = parse_metadata(self.index.read_file(file), self.index.at(file))
-            else:
+            if isinstance(inline, dict):
                 found = inline.get(name)
-            check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
+            else:
+                file = self.index.file(f"{name}/{GROUP_NAME}", "metadata")
+                found = _parse_metadata(self.index.read_file(file), self.index.at(file))
+            _check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
 
     def _check_labels(self) -> None:
         """Check that the manifest fits the arrays `valid` and `split`.
@@ -262,12 +274,12 @@ class DatasetReader:
 def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
     """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked against one another."""
     manifest = source.read_manifest()
-    group = source.fetch(GROUP_METADATA)[0]
+    group = source.fetch(GROUP_NAME)[0]
     try:
         digest = check_seal(manifest, group, source.fetch(SEAL_NAME)[0])
     except BrokenSealError as error:
         raise CorruptDataError(f"{source}/{error}") from None
-    return digest, parse_metadata(group, f"{source}/{GROUP_METADATA}"), manifest
+    return digest, _parse_metadata(group, f"{source}/{GROUP_NAME}"), manifest
 
 
 def _read_selection(source: Source, manifest: str) -> Selection:
@@ -299,3 +311,87 @@ def _parse_manifest(data: bytes) -> Manifest:
             f"and it lists {len(manifest.sample_keys)} sample keys"
         )
     return manifest
+
+
+# --- Zarr metadata ----------------------------------------------------------------------------------------------
+
+
+def _parse_metadata(data: bytes, path: str) -> dict[str, Any]:
+    """Return the JSON object in `data`."""
+    try:
+        metadata = json.loads(data)
+    except ValueError as error:
+        raise InvalidDatasetError(f"{path} is no JSON: {error}") from None
+    if not isinstance(metadata, dict):
+        raise InvalidDatasetError(f"{path} must be a JSON object, and is a {type(metadata).__name__}")
+    return metadata
+
+
+def _check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> None:
+    """Raise InvalidDatasetError where the metadata of one array contradict its layout."""
+    if not isinstance(metadata, dict):
+        raise InvalidDatasetError(f"array {array.name}: there must be metadata, and there are none")
+    shard = [samples_per_file, *array.shape]
+    expected: dict[str, Any] = {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": [sample_count, *array.shape],
+        "data_type": array.dtype,
+        "dimension_names": ["sample", *array.dimensions],
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": shard}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "codecs": _codecs(array),
+        "fill_value": "NaN" if array.fill != array.fill else array.fill,
+        "storage_transformers": [],
+    }
+    defaults = _DEFAULTS | ({"bytes": {"endian": "little"}} if np.dtype(array.dtype).itemsize == 1 else {})
+    found = {
+        **metadata,
+        "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding"), defaults),
+        "codecs": _normalised(metadata.get("codecs"), defaults),
+        "storage_transformers": metadata.get("storage_transformers") or [],
+    }
+    for field, rule in expected.items():
+        if found.get(field) != rule:
+            raise InvalidDatasetError(
+                f"array {array.name}: {field} must be {json.dumps(rule)}, and is {json.dumps(found.get(field))}"
+            )
+
+
+_LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
+_CRC = {"name": "crc32c", "configuration": {}}
+
+
+def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
+    compressor: dict[str, Any] = {"name": "zstd" if packing(array) is None else "blosc", "configuration": {}}
+    chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
+    if (order := axes_order(array)) is not None:
+        chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})
+    if not array.per_sample:
+        return chunk
+    configuration = {
+        "chunk_shape": [1, *array.shape],
+        "codecs": chunk,
+        "index_codecs": [_LITTLE, _CRC],
+        "index_location": "end",
+    }
+    return [{"name": "sharding_indexed", "configuration": configuration}]
+
+
+_DEFAULTS = {"default": {"separator": "/"}, "sharding_indexed": {"index_location": "end"}}
+"""Configurations that the metadata may leave out; for values of one byte, the order of bytes, too."""
+
+
+def _normalised(codec: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
+    """Give a codec or an encoding, or each of a list, its configuration, but for what a reader need not know: the level
+    of zstd, all of blosc's."""
+    if isinstance(codec, list):
+        return [_normalised(each, defaults) for each in codec]
+    codec = {"name": codec} if isinstance(codec, str) else codec
+    if not isinstance(codec, dict):
+        return codec
+    name = codec.get("name")
+    configuration = defaults.get(str(name), {}) | (codec.get("configuration") or {})
+    nested = [key for key in ("codecs", "index_codecs") if key in configuration]
+    inner = {key: _normalised(configuration[key], defaults) for key in nested}
+    return {"name": name, "configuration": {} if name in ("zstd", "blosc") else configuration | inner}

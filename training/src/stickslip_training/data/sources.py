@@ -1,4 +1,5 @@
-"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range requests.
+"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range requests; what can
+be wrong with them.
 
 A source keeps nothing open that two processes could fight over: a file is opened for each read, and an HTTP client
 belongs to the process that made it. So a source can be pickled and survives a fork.
@@ -15,12 +16,35 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
-
-from stickslip_training.data.errors import CorruptDataError, MissingFileError, SourceError
 
 API_KEY_VARIABLE = "STICKSLIP_API_KEY"
 """Environment variable with the key that is sent to a server where none is given."""
+
+
+class DatasetError(Exception):
+    """The base of everything that reading a dataset raises on purpose."""
+
+
+class InvalidDatasetError(DatasetError, ValueError):
+    """The manifest or the metadata contradict the contract, or each other."""
+
+
+class MissingFileError(DatasetError, FileNotFoundError):
+    """A file that belongs to the dataset is not there."""
+
+
+class CorruptDataError(DatasetError, CorruptChunkError):
+    """Bytes are not what a size, a checksum or a digest says they are."""
+
+
+class RejectedSampleError(DatasetError, LookupError):
+    """The sample was rejected when the dataset was made."""
+
+
+class SourceError(DatasetError, OSError):
+    """The server does not answer, or not with the requested data."""
 
 
 class Source(ABC):
@@ -93,7 +117,22 @@ class DirectorySource(Source):
             return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-class BucketSource(Source):
+class _RemoteSource(Source):
+    """A URL with a client, which belongs to the process that made it."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url.rstrip("/")
+        self._client: Any = None
+        self._pid = 0
+
+    def __str__(self) -> str:
+        return self._url
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_client": None, "_pid": 0}
+
+
+class BucketSource(_RemoteSource):
     """A dataset version in an S3 bucket: `s3://BUCKET/PREFIX/datasets/<id>/v<n>`.
 
     Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read is one request. The
@@ -106,16 +145,8 @@ class BucketSource(Source):
         parts = urlsplit(url)
         if not parts.netloc or parts.query or parts.fragment:
             raise ValueError(f"a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is {url!r}")
-        self._url = url.rstrip("/")
+        super().__init__(url)
         self._bucket, self._prefix = parts.netloc, unquote(parts.path).strip("/")
-        self._objects: Any = None
-        self._pid = 0
-
-    def __str__(self) -> str:
-        return self._url
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_objects": None, "_pid": 0}
 
     def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
         if part is None:
@@ -124,7 +155,7 @@ class BucketSource(Source):
         return self._asked(path, lambda obstore, objects: obstore.get_range(objects, path, **within).to_bytes()), None
 
     def close(self) -> None:
-        self._objects = None
+        self._client = None
 
     def _asked(self, name: str, request: Callable[[Any, Any], bytes]) -> bytes:
         try:
@@ -133,23 +164,23 @@ class BucketSource(Source):
             raise SourceError(
                 f"{self} needs obstore, which is not installed: pip install 'stickslip-training[s3]'"
             ) from error
-        if self._objects is not None and self._pid != os.getpid():
+        if self._client is not None and self._pid != os.getpid():
             raise SourceError(
                 f'{self} cannot be read after a fork: give the DataLoader multiprocessing_context="spawn"'
             )
         try:
-            if self._objects is None:
+            if self._client is None:
                 retries: Any = {"retry_timeout": self.PATIENCE}
-                self._objects = obstore.store.S3Store(self._bucket, prefix=self._prefix or None, retry_config=retries)
+                self._client = obstore.store.S3Store(self._bucket, prefix=self._prefix or None, retry_config=retries)
                 self._pid = os.getpid()
-            return bytes(request(obstore, self._objects))
+            return bytes(request(obstore, self._client))
         except FileNotFoundError:
             raise MissingFileError(f"{self}/{name} is not there") from None
         except obstore.exceptions.BaseError as error:
             raise SourceError(f"{self}/{name} cannot be read: {str(error).splitlines()[0]}") from error
 
 
-class HttpSource(Source):
+class HttpSource(_RemoteSource):
     """A dataset version behind a URL.
 
     Either a version of the service, `.../v1/datasets/<id>/versions/<n>` (with or without `/files` or `/manifest`), or
@@ -162,16 +193,8 @@ class HttpSource(Source):
     def __init__(self, url: str, *, api_key: str | None = None) -> None:
         url = url.rstrip("/")
         version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
-        self._files = f"{version[1]}/files" if version else url
+        super().__init__(f"{version[1]}/files" if version else url)
         self._api_key = api_key
-        self._client: Any = None
-        self._client_pid = 0
-
-    def __str__(self) -> str:
-        return self._files
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_client": None, "_client_pid": 0}
 
     def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
         url, asked = f"{self}/{path}", "" if part is None else f"{part.start}-{part.stop - 1}"
@@ -193,7 +216,7 @@ class HttpSource(Source):
         return data, int(sent[2])
 
     def close(self) -> None:
-        if self._client is not None and self._client_pid == os.getpid():
+        if self._client is not None and self._pid == os.getpid():
             self._client.close()
         self._client = None
 
@@ -201,13 +224,13 @@ class HttpSource(Source):
         """GET with a few tries: a server that restarts or is busy is no reason to lose an epoch."""
         import httpx  # only who reads over HTTP needs it
 
-        if self._client is None or self._client_pid != os.getpid():
+        if self._client is None or self._pid != os.getpid():
             # A fork shares the parent's sockets: the child must not use them, nor close them.
             headers_of_all = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
             if self._api_key:
                 headers_of_all["Authorization"] = f"Bearer {self._api_key}"
             self._client = httpx.Client(headers=headers_of_all, timeout=30.0, follow_redirects=True)
-            self._client_pid = os.getpid()
+            self._pid = os.getpid()
         for attempt in range(self.TRIES):
             try:
                 response = self._client.get(url, headers=headers)

@@ -22,8 +22,8 @@ from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
 from stickslip_schemas.store import sync
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.errors import CorruptDataError
 from stickslip_training.data.reader import DatasetReader
+from stickslip_training.data.sources import CorruptDataError
 
 OnBytes = Callable[[int], None]
 """Hears how many decoded bytes have been written."""

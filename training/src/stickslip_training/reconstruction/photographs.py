@@ -145,14 +145,8 @@ def write_results(result: FolderReconstruction, out: Path) -> list[str]:
     table = np.column_stack([s, found.centerline, found.deviation, found.views_seen])
     header = "arc_length,x,y,z,deviation,views_seen"
     np.savetxt(out / "centerline.csv", table, fmt=["%.9g"] * 5 + ["%d"], delimiter=",", header=header, comments="")
-    np.savez(
-        out / "centerline.npz",
-        arc_length=s,
-        centerline=found.centerline,
-        deviation=found.deviation,
-        residual=found.residual,
-        views_seen=found.views_seen,
-    )
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in ("deviation", "residual", "views_seen")}
+    np.savez(out / "centerline.npz", arc_length=s, centerline=found.centerline, **arrays)
     save_overlay(out / "overlay.png", result.views, result.cameras, found.centerline)
     report = {
         "verdict": found.verdict.value,

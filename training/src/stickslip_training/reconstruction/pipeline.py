@@ -13,17 +13,16 @@ Nothing of rods' physics is used but that they do not stretch and bend smoothly,
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
-from stickslip_training.reconstruction import curve
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
 from stickslip_training.reconstruction.silhouette import NoRodError, View, shrink_image, silhouette, to_linear
 from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
+from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, basis, fit_curve
 
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined
@@ -44,11 +43,9 @@ class Verdict(StrEnum):
     """The curve does not explain the views."""
 
 
-# Shares of the silhouettes' area; benchmarks/reconstruction.py says how they tell good from bad.
-MISFIT_MAX = 0.25
-UNEXPLAINED_MAX = 0.03
-UNSUPPORTED_MAX = 0.03
-STRETCH_MAX = 0.02
+LIMITS = {"misfit": 0.25, "unexplained share": 0.03, "unsupported share": 0.03, "stretch": 0.02}
+"""Of a good curve, as shares of the silhouettes' area and of the length; `benchmarks/reconstruction.py` says how they
+tell good from bad."""
 RIVAL = 1.1  # a different curve whose misfit is less than so many times the winner's is a rival
 
 
@@ -116,25 +113,22 @@ def reconstruct(
     seen = _silhouettes(views, cameras, length, origin)
     size = radius / length if radius is not None else _radius(seen)
     fits = _refined(seen, size, heading, radius is not None)
-    judged = sorted(((_Match.of(seen, fit), fit) for fit in fits), key=lambda item: item[0].misfit)
-    match, fit = judged[0]
-    shape = curve.at_uniform_arc_length(fit.control, points)
-    rivals = [
-        other.misfit / match.misfit for other, rival in judged[1:] if _distance(rival.control, fit.control) > APART
-    ]
+    judged = sorted(((_match(seen, fit), fit) for fit in fits), key=lambda item: item[0])
+    (misfit, unexplained, unsupported), fit = judged[0]
+    shape = at_uniform_arc_length(fit.control, points)
+    rivals = [other[0] / misfit for other, rival in judged[1:] if _distance(rival.control, fit.control) > APART]
     rival = min(rivals, default=float("inf"))
     residual = _residual(seen, fit, points)
-    stretch = abs(curve.arc_length(shape)[-1] - 1.0)
-    verdict, reasons = _judge(match, rival, stretch)
+    verdict, reasons = _judge((misfit, unexplained, unsupported, abs(arc_length(shape)[-1] - 1.0)), rival)
     return Reconstruction(
         centerline=origin + length * shape,
         deviation=length * _deviation(fit, points),
         residual=residual,
         views_seen=np.isfinite(residual).sum(axis=0),
         radius=length * fit.radius,
-        misfit=match.misfit,
-        unexplained=match.unexplained,
-        unsupported=match.unsupported,
+        misfit=misfit,
+        unexplained=unexplained,
+        unsupported=unsupported,
         rival=rival,
         verdict=verdict,
         reasons=reasons,
@@ -197,13 +191,13 @@ def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radi
         by_hull = moving_cylinder(visual_hull(views), radius, direction)
     except HullTooLargeError:
         by_hull = np.zeros((1, 3))
-    if 0.8 < curve.arc_length(by_hull)[-1] < 1.2:
+    if 0.8 < arc_length(by_hull)[-1] < 1.2:
         lines.append(by_hull)
     coarse_views = [view.shrunk(2) for view in views]
     coarse = [
         refine(
             coarse_views,
-            start(curve.fit(line, CONTROL_POINTS), radius, len(views)),
+            start(fit_curve(line, CONTROL_POINTS), radius, len(views)),
             direction,
             extra_blur=1.2,
             shading=False,
@@ -222,45 +216,33 @@ def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radi
 
 def _distance(one: Floats, other: Floats) -> float:
     """Return the largest distance of two curves at the same arc length [L]."""
-    a, b = (curve.at_uniform_arc_length(control, 100) for control in (one, other))
+    a, b = (at_uniform_arc_length(control, 100) for control in (one, other))
     return float(np.linalg.norm(a - b, axis=1).max())
 
 
-@dataclass(frozen=True, slots=True)
-class _Match:
-    """How a fit and the views agree, by area."""
-
-    misfit: float
-    unexplained: float
-    unsupported: float
-
-    @classmethod
-    def of(cls, views: Sequence[View], fit: Fit) -> Self:
-        s = samples(views, fit)
-        seen_sum = drawn_sum = difference = unexplained = unsupported = 0.0
-        for index, view in enumerate(views):
-            image = draw(view, index, fit, s)
-            drawn = np.zeros(view.coverage.size)
-            drawn[image.pixel] = image.value
-            known = np.ones(view.coverage.size, dtype=bool)
-            known[image.left_out] = False
-            seen, drawn = np.minimum(view.coverage.ravel(), 1.5)[known], drawn[known]
-            seen_sum += seen.sum()
-            drawn_sum += drawn.sum()
-            difference += np.abs(seen - drawn).sum()
-            unexplained += seen[(drawn < 0.1 * seen) & (seen > 0.3)].sum()
-            unsupported += drawn[(seen < 0.1 * drawn) & (drawn > 0.3)].sum()
-        return cls(difference / seen_sum, unexplained / seen_sum, unsupported / max(drawn_sum, 1e-9))
+def _match(views: Sequence[View], fit: Fit) -> tuple[float, float, float]:
+    """Return the misfit, and the unexplained and the unsupported share: see `Reconstruction`."""
+    s = samples(views, fit)
+    seen_sum = drawn_sum = difference = unexplained = unsupported = 0.0
+    for index, view in enumerate(views):
+        image = draw(view, index, fit, s)
+        drawn = np.zeros(view.coverage.size)
+        drawn[image.pixel] = image.value
+        known = np.ones(view.coverage.size, dtype=bool)
+        known[image.left_out] = False
+        seen, drawn = np.minimum(view.coverage.ravel(), 1.5)[known], drawn[known]
+        seen_sum += seen.sum()
+        drawn_sum += drawn.sum()
+        difference += np.abs(seen - drawn).sum()
+        unexplained += seen[(drawn < 0.1 * seen) & (seen > 0.3)].sum()
+        unsupported += drawn[(seen < 0.1 * drawn) & (drawn > 0.3)].sum()
+    return (difference / seen_sum, unexplained / seen_sum, unsupported / max(drawn_sum, 1e-9))
 
 
-def _judge(match: _Match, rival: float, stretch: float) -> tuple[Verdict, tuple[str, ...]]:
-    limits = (
-        ("misfit", match.misfit, MISFIT_MAX),
-        ("unexplained share", match.unexplained, UNEXPLAINED_MAX),
-        ("unsupported share", match.unsupported, UNSUPPORTED_MAX),
-        ("stretch", stretch, STRETCH_MAX),
-    )
-    reasons = tuple(f"{name} {value:.3f} is above {limit}" for name, value, limit in limits if value > limit)
+def _judge(values: Sequence[float], rival: float) -> tuple[Verdict, tuple[str, ...]]:
+    """Compare values with `LIMITS`, in their order; return the verdict, and why it is not good."""
+    limited = zip(LIMITS.items(), values, strict=True)
+    reasons = tuple(f"{name} {value:.3f} is above {limit}" for (name, limit), value in limited if value > limit)
     if reasons:
         return Verdict.failed, reasons
     if rival < RIVAL:
@@ -269,7 +251,7 @@ def _judge(match: _Match, rival: float, stretch: float) -> tuple[Verdict, tuple[
 
 
 def _deviation(fit: Fit, points: int) -> Floats:
-    B = curve.basis(np.linspace(0.0, 1.0, points), len(fit.control))
+    B = basis(np.linspace(0.0, 1.0, points), len(fit.control))
     assert fit.covariance is not None
     variance = sum(np.einsum("ij,jk,ik->i", B, fit.covariance[axis::3, axis::3], B) for axis in range(3))
     return np.asarray(np.sqrt(variance))

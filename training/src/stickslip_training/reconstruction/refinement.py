@@ -18,9 +18,8 @@ from scipy import ndimage
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stickslip_training.arrays import Floats
-from stickslip_training.reconstruction.curve import basis
 from stickslip_training.reconstruction.silhouette import View
-from stickslip_training.reconstruction.tube_image import Shading, TubeImage, tube_image
+from stickslip_training.reconstruction.tube_image import TubeImage, basis, tube_image
 
 PIXEL = 0.12  # of the brightness of the rod: what a pixel may be off
 ROBUST = 3.0  # in units of PIXEL: beyond it a pixel's pull falls again
@@ -53,7 +52,6 @@ class Fit:
     """What it gains from the middle to the edge, (views, nodes)."""
     cost: float = np.inf
     """Half the sum of squares."""
-    steps: int = 0
     covariance: Floats | None = None
     """Of the control points [L^2], (3 K, 3 K), if pixels err independently by what they do err."""
 
@@ -72,10 +70,9 @@ def samples(views: Sequence[View], fit: Fit) -> Floats:
 
 def draw(view: View, index: int, fit: Fit, s: Floats, extra_blur: float = 0.0) -> TubeImage:
     """Draw the fit as view number `index` sees it, at parameters s half a pixel apart."""
-    N = _hats(s)
-    shading = Shading(N @ fit.light[index], N @ fit.slope[index])
+    N, points = _hats(s), basis(s, len(fit.control)) @ fit.control
     blur = float(np.hypot(fit.blur, extra_blur))
-    return tube_image(view, basis(s, len(fit.control)) @ fit.control, fit.radius, blur, shading)
+    return tube_image(view, points, fit.radius, blur, N @ fit.light[index], N @ fit.slope[index])
 
 
 def refine(
@@ -95,13 +92,13 @@ def refine(
     problem = _Problem(views, fit, direction, extra_blur, shading, fixed_radius)
     x = problem.pack(fit)
     system = problem.system(x)
-    damping, taken = 1e-3, 0
+    damping = 1e-3
     for _ in range(iterations):
         step = system.step(damping)
         tried = problem.system(x + step)
         if tried.cost < system.cost:
             gain = system.cost - tried.cost
-            x, system, damping, taken = x + step, tried, max(damping / 5.0, 1e-9), taken + 1
+            x, system, damping = x + step, tried, max(damping / 5.0, 1e-9)
             if gain < tolerance * system.cost:
                 break
         else:
@@ -110,7 +107,7 @@ def refine(
                 break
     K = len(fit.control)
     spread = system.inverse()[: 3 * K, : 3 * K] * system.pixel_variance
-    return replace(problem.unpack(x), cost=system.cost, steps=taken, covariance=spread)
+    return replace(problem.unpack(x), cost=system.cost, covariance=spread)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,6 @@
-"""What a camera sees of a tube, and how that changes when the tube does.
+"""What a camera sees of a tube about a curve, and how that changes when the tube does.
+
+Curves are cubic B-splines over [0, 1] with evenly spaced knots, (K, 3) control points.
 
 About the projected centreline, at signed distance n from it [px], a tube of half width r has the coverage
 
@@ -14,22 +16,48 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import BSpline
 from scipy.special import ndtr
 
 from stickslip_training.arrays import Floats, Integers
 from stickslip_training.reconstruction.silhouette import View
 
+DEGREE = 3
 BAND = 2.5  # blurs beyond the edge of the rod that are looked at
 
 
-@dataclass(frozen=True, slots=True)
-class Shading:
-    """Light along the rod in one view, at the samples of the curve."""
+def basis(s: Floats, count: int, derivative: int = 0) -> Floats:
+    """Return B, (n, count): B @ control points are the points, or the derivatives, at s, (n,)."""
+    inner = np.linspace(0.0, 1.0, count - DEGREE + 1)
+    knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])  # the ends are the first and the last point
+    return np.asarray(BSpline(knots, np.eye(count), DEGREE)(s, nu=derivative))
 
-    light: Floats
-    """Brightness in the middle, (samples,)."""
-    slope: Floats
-    """What it gains from the middle to the edge, (samples,)."""
+
+def fit_curve(points: Floats, count: int) -> Floats:
+    """Return the control points (count, 3) of the spline nearest to a polyline (n, 3), by its arc length.
+
+    The spline's parameter runs from 0 to 1 whatever the polyline's length.
+    """
+    s = arc_length(points)
+    dense = np.linspace(0.0, s[-1], 4 * count)
+    sampled = np.stack([np.interp(dense, s, axis) for axis in points.T], axis=1)
+    B = basis(np.linspace(0.0, 1.0, len(dense)), count)
+    smooth = 1e-2 * np.diff(np.eye(count), 3, axis=0)
+    control: Floats = np.linalg.lstsq(np.vstack([B, smooth]), np.vstack([sampled, np.zeros((count - 3, 3))]))[0]
+    return control
+
+
+def arc_length(points: Floats) -> Floats:
+    """Return the length of the polyline (n, 3) up to each of its points, (n,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def at_uniform_arc_length(control: Floats, count: int) -> Floats:
+    """Return `count` points of a spline, evenly spaced along its length, ends included."""
+    parameter = np.linspace(0.0, 1.0, 20 * len(control))
+    length = arc_length(basis(parameter, len(control)) @ control)
+    wanted = np.interp(np.linspace(0.0, length[-1], count), length, parameter)
+    return np.asarray(basis(wanted, len(control)) @ control)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +66,8 @@ class Side:
 
     sample: Integers
     """Sample of the curve nearest to the pixel, (n,)."""
-    covered: Floats
-    """c, (n,)."""
     by_light: Floats
-    """d I / d light, (n,)."""
+    """d I / d light, (n,); c where nothing is in front."""
     by_slope: Floats
     """d I / d slope, (n,)."""
     by_point: Floats
@@ -68,8 +94,11 @@ class TubeImage:
     """Pixels near the rod, but behind the clamp."""
 
 
-def tube_image(view: View, points: Floats, radius: float, blur: float, shading: Shading) -> TubeImage:
-    """Draw the tube about samples (n, 3) of a curve, half a pixel apart or less; radius [L], blur [px]."""
+def tube_image(view: View, points: Floats, radius: float, blur: float, light: Floats, slope: Floats) -> TubeImage:
+    """Draw the tube about samples (n, 3) of a curve, half a pixel apart or less; radius [L], blur [px].
+
+    `light` is the brightness in the middle at the samples, (n,), and `slope` what it gains from there to the edge.
+    """
     pixels, depth = view.project(points)
     half = radius * view.focal / depth
     pixel, sample = _passes(pixels, half + BAND * blur, view.coverage.shape)
@@ -87,13 +116,12 @@ def tube_image(view: View, points: Floats, radius: float, blur: float, shading: 
     density_high, density_low = (np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) for x in (high, low))
     covered = ndtr(high) - ndtr(low)
     tilt = np.where(beyond, 0.0, np.clip(n / r, -1.5, 1.5))
-    bright = shading.light[sample] + shading.slope[sample] * tilt
+    bright = light[sample] + slope[sample] * tilt
     by_n = (density_high - density_low) / blur * bright
-    tilting = covered * shading.slope[sample] * (~beyond & (np.abs(n) < 1.5 * r))
+    tilting = covered * slope[sample] * (~beyond & (np.abs(n) < 1.5 * r))
     by_n += tilting / r
     part = Side(
         sample=sample,
-        covered=covered,
         by_light=covered,
         by_slope=covered * tilt,
         by_point=-by_n[:, None] * np.einsum("ij,ijk->ik", normal, view.gradient(points)[sample]),
@@ -139,12 +167,12 @@ def _compose(pixel: Integers, part: Side, value: Floats, depth: Floats, left_out
     kept = ~left_out[front] & ~(left_out[back] & has_back)
     hidden = pixel[front[~kept]]
     front, back, seen = front[kept], back[kept], has_back[kept].astype(np.float64)
-    through = seen * (1.0 - part.covered[front])
+    through = seen * (1.0 - part.by_light[front])
     # The front's own derivatives act on I_1 (1 - I_2 c_1 / I_1): its light does not change what it covers.
     lost = (
         seen
         * value[back]
-        * np.divide(part.covered[front], value[front], out=np.zeros(len(front)), where=value[front] > 1e-6)
+        * np.divide(part.by_light[front], value[front], out=np.zeros(len(front)), where=value[front] > 1e-6)
     )
     return TubeImage(
         pixel=pixel[front],
@@ -158,4 +186,4 @@ def _scaled(part: Side, rows: Integers, by_light: Floats, by_shape: Floats) -> S
     factors = {"by_light": by_light, "by_slope": by_light}
     factors |= {"by_point": by_shape[:, None], "by_normal": by_shape, "by_radius": by_shape, "by_blur": by_shape}
     scaled = {name: getattr(part, name)[rows] * factor for name, factor in factors.items()}
-    return Side(part.sample[rows], part.covered[rows], **scaled)
+    return Side(part.sample[rows], **scaled)
