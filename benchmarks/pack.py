@@ -16,7 +16,7 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.stages.pack import pack
-from stickslip_workers.stages.records import encode_records
+from stickslip_workers.stages.run import encode_records
 
 SAMPLES = 64
 REPEATS = 5

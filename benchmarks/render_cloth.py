@@ -32,18 +32,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.build import build_digest
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import FLOOR, Holders
 from stickslip_blender.cloth.ground_truth import ground_truth
-from stickslip_blender.cloth.looks import drawn_light, grained, look_of
-from stickslip_blender.cloth.substrates import HARD, Substrate, drawn_substrate, floor_factor
+from stickslip_blender.cloth.looks import HARD, Substrate, drawn_light, drawn_substrate, floor_factor, grained, look_of
 from stickslip_blender.cloth.textures import texture_image
-from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
+from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling, import_bpy
 from stickslip_blender.cycles.pixels import FrameReader, encode
 from stickslip_blender.raster import Points, Textures, Window, projected, see
-from stickslip_blender.workshop import Workshop
+from stickslip_blender.workshop import Workshop, build_digest
 from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender

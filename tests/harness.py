@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import zarr
-from stickslip_workers.ray_head import own_directory
+from stickslip_workers.cluster import own_directory
 from zarr.abc.store import Store as ZarrStore
 
 T = TypeVar("T")

@@ -26,7 +26,7 @@ from stickslip_sim_core.scenes import cloth_drag
 from stickslip_testing.samples import samples
 from stickslip_testing.worker import BUILDS
 from stickslip_training.benchmark.sets import load_set
-from stickslip_workers.kinds import kind
+from stickslip_workers.builds import kind
 
 ROOT = Path(__file__).parents[1]
 

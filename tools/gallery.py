@@ -27,7 +27,7 @@ from stickslip_schemas.scene.library import built_in_files, load_scene, scene_na
 from stickslip_schemas.spec.appearance import CLIP_SIZE
 from stickslip_schemas.spec.cameras import FRAMING
 from stickslip_schemas.store import open_store
-from stickslip_workers.replay import replay
+from stickslip_workers.commands import replay
 
 INSTANTS = 4
 VIEW = "high"

@@ -20,11 +20,10 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import DirectoryStore
 from stickslip_testing.samples import samples
-from stickslip_workers.cluster import Place
-from stickslip_workers.ray_head import own_directory
+from stickslip_workers.cluster import Place, own_directory
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
-from stickslip_workers.stages.records import encode_records
+from stickslip_workers.stages.run import encode_records
 
 # Ray looks once, when it is first imported, and test_results imports it.
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
@@ -154,7 +153,7 @@ class Connected(Place):
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A Ray of two CPUs for all tests, with `fake_renderer` in reach of its processes."""
     directory = own_directory(tmp_path_factory.mktemp("ray"))
-    command = f"from pathlib import Path; from stickslip_workers.ray_head import main; main(Path('{directory}'), 2)"
+    command = f"from pathlib import Path; from stickslip_workers.cluster import main; main(Path('{directory}'), 2)"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", HERE, prepend=os.pathsep)
         with subprocess.Popen([sys.executable, "-c", command], stdout=subprocess.DEVNULL) as head:

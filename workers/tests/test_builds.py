@@ -13,7 +13,7 @@ from stickslip_schemas.plan.builds import UNCOUNTED, sources
 from stickslip_schemas.scene.library import load_scene
 from stickslip_sim_core.protocols import CERTIFICATION
 from stickslip_workers import builds
-from stickslip_workers.kinds import kind
+from stickslip_workers.builds import kind
 
 STAGES = ("simulate", "pack")
 
@@ -45,9 +45,9 @@ from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.documents.tasks import task_adapter
 from stickslip_workers.stages.run import StageActor
 actor = StageActor(sys.argv[2])
-import stickslip_sim_core, stickslip_workers.stages.simulate  # what is run at import is no work
+import stickslip_sim_core  # what is run at import is no work
 from stickslip_schemas.kinds import KINDS
-from stickslip_workers.kinds import kind
+from stickslip_workers.builds import kind
 for name in KINDS:
     kind(name)
 sys.setprofile(note)
@@ -59,10 +59,9 @@ print(json.dumps({"results": results, "ran": sorted(ran)}))
 _IMPORT = """
 import sys
 import stickslip_workers.stages.run, stickslip_workers.stages.pack, stickslip_workers.stages.publish
-import stickslip_workers.stages.simulate
 from stickslip_schemas.store import DirectoryStore
 from stickslip_schemas.kinds import KINDS
-from stickslip_workers.kinds import kind
+from stickslip_workers.builds import kind
 for name in KINDS:
     kind(name)
 import stickslip_sim_core

@@ -10,7 +10,7 @@ from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols import Certification
 from stickslip_workers.__main__ import main
 from stickslip_workers.builds import solver_build
-from stickslip_workers.certify import certify
+from stickslip_workers.commands import certify
 
 pytestmark = pytest.mark.physics
 

@@ -32,11 +32,9 @@ from stickslip_sim_core.scenes import cloth_drag
 from stickslip_sim_core.scenes.scene import cloth_kind
 from stickslip_testing.samples import samples
 from stickslip_workers.stages import pack as pack_module
-from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
-from stickslip_workers.stages.publish import publish
-from stickslip_workers.stages.records import Records, encode_records
-from stickslip_workers.stages.run import run_tasks
+from stickslip_workers.stages.publish import create_array, publish
+from stickslip_workers.stages.run import Records, encode_records, run_tasks
 
 BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" * 64)
 SIDE = 5

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import httpx
 import pytest
 import zarr
-from stickslip_workers.ray_head import own_directory
+from stickslip_workers.cluster import own_directory
 from stickslip_workers.settings import default_blender_python
 
 pytest.importorskip("stickslip_services")

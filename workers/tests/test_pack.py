@@ -12,8 +12,8 @@ from stickslip_schemas.documents.tasks import ChunkRef, PackTask
 from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index
 from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.store import DirectoryStore
-from stickslip_workers.stages.metadata import create_array
 from stickslip_workers.stages.pack import pack
+from stickslip_workers.stages.publish import create_array
 from stickslip_workers.stages.run import run_tasks
 
 

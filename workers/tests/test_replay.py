@@ -12,7 +12,7 @@ from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
 from stickslip_workers.__main__ import main
-from stickslip_workers.replay import replay
+from stickslip_workers.commands import replay
 
 
 def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

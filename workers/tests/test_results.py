@@ -10,7 +10,9 @@ from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
-from stickslip_workers.results import MESSAGE_LENGTH, failure, merged, process_failure, shading_of, split
+from stickslip_workers.batches import merged, shading_of, split
+from stickslip_workers.dispatcher import process_failure
+from stickslip_workers.stages.run import MESSAGE_LENGTH, failure
 
 RECORD = RecordRef(digest="d" * 64, row=0)
 

@@ -11,7 +11,7 @@ from stickslip_schemas.kinds import UnknownKindError
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
 from stickslip_sim_core.scenes import rod_hang
-from stickslip_workers.kinds import kind
+from stickslip_workers.builds import kind
 from stickslip_workers.stages.run import run_tasks
 
 

@@ -10,7 +10,6 @@
 #include <tuple>
 
 #include "build_constants.hpp"
-#include "composition.hpp"
 #include "raster.hpp"
 
 namespace nb = nanobind;

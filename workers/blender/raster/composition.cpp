@@ -1,12 +1,10 @@
-#include "composition.hpp"
-
 #include <algorithm>
 #include <array>
 #include <bit>
 #include <cmath>
 #include <cstdlib>
 
-#include "kernel.hpp"
+#include "raster.hpp"
 
 namespace raster {
 

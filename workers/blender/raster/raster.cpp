@@ -5,8 +5,6 @@
 #include <cmath>
 #include <limits>
 
-#include "kernel.hpp"
-
 namespace raster {
 
 namespace {

@@ -17,13 +17,12 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.build import roots
 from stickslip_blender.cloth import quality
-from stickslip_blender.cloth.looks import drawn_light
+from stickslip_blender.cloth.looks import drawn_light, drawn_substrate
 from stickslip_blender.cloth.scene import ClothScene
-from stickslip_blender.cloth.substrates import drawn_substrate
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING
 from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
+from stickslip_blender.workshop import roots
 from stickslip_schemas.base import Reason, is_sha256
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip

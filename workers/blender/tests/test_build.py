@@ -1,9 +1,9 @@
 """The build digest covers the files of the renderer only."""
 
 import pytest
-from stickslip_blender import build
-from stickslip_blender.build import build_digest, roots
-from stickslip_blender.scenes import renders
+from stickslip_blender import workshop
+from stickslip_blender.actor import renders
+from stickslip_blender.workshop import build_digest, roots
 from stickslip_schemas.kinds import KINDS, UnknownKindError
 from stickslip_schemas.plan.builds import UNCOUNTED, sources
 
@@ -11,7 +11,7 @@ from stickslip_schemas.plan.builds import UNCOUNTED, sources
 def test_the_rasteriser_is_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:
     digest = build_digest.__wrapped__  # not the one that is kept
     before = {kind: digest(kind) for kind in KINDS}
-    monkeypatch.setattr(build, "BUILD_HASH", "another")
+    monkeypatch.setattr(workshop, "BUILD_HASH", "another")
     assert all(digest(kind) != before[kind] for kind in KINDS)
 
 
@@ -24,7 +24,7 @@ def test_every_kind_has_a_build_of_its_own_files() -> None:
     assert len({build_digest(kind) for kind in KINDS}) == len(KINDS)
     for kind in KINDS:
         scenes = {name for name in sources(roots(kind), cut=UNCOUNTED) if "/scenes/" in name}
-        assert scenes == {"stickslip_blender/scenes/__init__.py", f"stickslip_blender/scenes/{kind}.py"}
+        assert scenes == {f"stickslip_blender/scenes/{kind}.py"}
 
 
 def test_a_kind_that_nobody_registered_is_refused() -> None:

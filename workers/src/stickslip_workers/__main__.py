@@ -82,9 +82,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _head(options: argparse.Namespace) -> int:
-    from stickslip_workers import ray_head
+    from stickslip_workers.cluster import own_directory, run_head
 
-    ray_head.main(ray_head.own_directory(options.ray_data), options.cpus)
+    run_head(own_directory(options.ray_data), options.cpus)
     return 0
 
 
@@ -125,9 +125,8 @@ def _dispatch(options: argparse.Namespace) -> int:
         blender_python=options.blender_python.absolute(),
     )
     from stickslip_workers.calls import StartError
-    from stickslip_workers.cluster import Place
+    from stickslip_workers.cluster import Place, own_directory
     from stickslip_workers.dispatcher import Dispatcher
-    from stickslip_workers.ray_head import own_directory
 
     address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
     if address is None and data is None:
@@ -196,7 +195,7 @@ def _die_with_parent() -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from stickslip_workers.replay import replay
+    from stickslip_workers.commands import replay
 
     try:
         task = task_adapter.validate_json(options.task.read_bytes())
@@ -216,16 +215,16 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _show_frames(over: threading.Event) -> None:
     """Write to standard error how far the simulation of this process is."""
-    from stickslip_workers import progress
+    from stickslip_workers.stages import run
 
     while not over.wait(FRAMES_SECONDS):
-        if (frames := progress.frames) is not None:
+        if (frames := run.frames) is not None:
             sys.stderr.write(f"{frames[0]} of {frames[1]} frames\n")
 
 
 def _certify(options: argparse.Namespace) -> int:
     """Return 0 if the preset passed, 1 if not, 2 if there was nothing to run."""
-    from stickslip_workers.certify import certify
+    from stickslip_workers.commands import certify
 
     # Long protocols may log their progress.
     logging.basicConfig(level=logging.INFO, format="    %(message)s")
@@ -248,7 +247,7 @@ def _preview(options: argparse.Namespace) -> int:
     """Return 0 if the scene was drawn, and 2 if not."""
     from stickslip_schemas.scene.document import Scene
 
-    from stickslip_workers.preview import preview
+    from stickslip_workers.commands import preview
 
     try:
         scene = Scene.model_validate_json(options.scene.read_bytes())

@@ -2,19 +2,26 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
 from pydantic import ValidationError
-from stickslip_schemas.base import Stage
-from stickslip_schemas.documents.tasks import RenderTask, SimulateTask, TaskResult, results_adapter, tasks_adapter
+from stickslip_schemas.base import Stage, canonical_json
+from stickslip_schemas.documents.tasks import (
+    RenderOutput,
+    RenderTask,
+    SimulateTask,
+    TaskResult,
+    results_adapter,
+    tasks_adapter,
+)
 from stickslip_schemas.documents.worker_api import Lease
 from stickslip_schemas.kinds import KINDS
 
-from stickslip_workers.kinds import kind
-from stickslip_workers.results import failure, merged, shading_of, split
+from stickslip_workers.builds import kind
+from stickslip_workers.stages.run import failure
 
 STAGE_BYTES = {Stage.simulate: 2**28, Stage.render: 2**30, Stage.pack: 2**29, Stage.publish: 2**29}
 """Memory of a process without a mesh [bytes]. Measured: 152 MiB after 512 rods."""
@@ -137,3 +144,38 @@ class Pace:
             for start in range(0, len(group), size):
                 some = group[start : start + size]
                 yield Call(stage, [some] if shared else [[lease] for lease in some], is_short)
+
+
+def shading_of(task: RenderTask) -> str | None:
+    """Return a key that renders of one shading share; None if a render shares none."""
+    shared = task.render.shading
+    return None if shared is None else canonical_json({"shading": shared, "record": task.record.model_dump()})
+
+
+def merged(tasks: Sequence[RenderTask]) -> RenderTask:
+    """Merge renders of one shading into one task; a single task stays as it is."""
+    if len(tasks) == 1:
+        return tasks[0]
+    if len({shading_of(task) for task in tasks}) != 1 or shading_of(tasks[0]) is None:
+        raise ValueError("tasks must be renders of one shading to be merged")
+    textures = tuple(dict.fromkeys(task.render.variant for task in tasks))
+    return tasks[0].model_copy(update={"textures": textures, "preview": any(task.preview for task in tasks)})
+
+
+def split(tasks: Sequence[RenderTask], result: TaskResult) -> list[TaskResult]:
+    """Split the result of merged renders into one a task; the cost is divided evenly."""
+    if len(tasks) == 1:
+        return [result]
+    share = {"cpu_seconds": result.cpu_seconds / len(tasks), "wall_seconds": result.wall_seconds / len(tasks)}
+    if not isinstance(result.output, RenderOutput):
+        return [result.model_copy(update=share)] * len(tasks)
+    try:
+        return [_own(task, result.output.clips[task.render.variant]).model_copy(update=share) for task in tasks]
+    except KeyError as error:
+        return [failure(error)] * len(tasks)
+
+
+def _own(task: RenderTask, result: TaskResult) -> TaskResult:
+    if task.preview or not isinstance(result.output, RenderOutput):
+        return result
+    return result.model_copy(update={"output": result.output.model_copy(update={"preview": None})})

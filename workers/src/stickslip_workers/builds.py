@@ -4,12 +4,28 @@ A build covers the files that a stage imports (see `stickslip_schemas.plan.build
 used, and the versions of the libraries that the output depends on.
 """
 
-from importlib import metadata
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING
 
 from stickslip_schemas.base import content_key
+from stickslip_schemas.kinds import kind_named
 from stickslip_schemas.plan.builds import UNCOUNTED, digests, sources
 
-from stickslip_workers.kinds import kind, scene_module
+if TYPE_CHECKING:
+    from stickslip_sim_core.scenes.kind import Kind
+
+
+def scene_module(name: str) -> str:
+    """Return the module that simulates a kind; raise UnknownKindError."""
+    kind_named(name)
+    return f"stickslip_sim_core.scenes.{name}"
+
+
+def kind(name: str) -> "Kind":
+    """Return how a kind is simulated; raise UnknownKindError."""
+    found: Kind = import_module(scene_module(name)).KIND
+    return found
+
 
 _STAGES = "stickslip_workers.stages"
 _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
@@ -18,7 +34,7 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 def roots(stage: str, name: str) -> tuple[str, ...]:
     """Return the modules that run a stage for a kind."""
     if stage == "simulate":
-        return (f"{_STAGES}.run", f"{_STAGES}.simulate", scene_module(name))
+        return (f"{_STAGES}.run", scene_module(name))
     if stage == "pack":
         return (f"{_STAGES}.run", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
     raise ValueError(f"stage must be simulate or pack; got {stage!r}")

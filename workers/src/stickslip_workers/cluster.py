@@ -1,14 +1,21 @@
-"""The Ray cluster, of which the dispatcher is a driver. Somebody else runs it: `ray_head` does for `stickslip up`."""
+"""The Ray cluster, of which the dispatcher is a driver, and a head for one machine, as `stickslip up` has it."""
 
 import contextlib
 import logging
 import os
+import secrets
+import shutil
 import signal
 import socket
+import stat
+import sys
 import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from stickslip_schemas.base import sha256
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +29,7 @@ RETRY_SECONDS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a cluster is: at an address, or that of the head which `ray_head` runs in a directory."""
+    """Where a cluster is: at an address, or that of the head which `run_head` runs in a directory."""
 
     where: str | Path
 
@@ -67,3 +74,78 @@ class Place:
                 if lines := path.read_text(errors="replace").split("\n")[:-1]:
                     return f"last line of {path}: {lines[-1][:300]}"
         return f"it has not written to {self.where} yet"
+
+
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # everything listens on loopback, as on those systems
+    "RAY_enable_pipe_based_agent_to_parent_health_check": "1",  # agents end with their raylet, at once
+    "RAY_worker_register_timeout_seconds": "600",  # Python may import slowly
+    "RAY_enable_metrics_collection": "0",
+    "RAY_event_stats": "0",
+    "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
+    "RAY_prestart_worker_first_driver": "0",
+    "RAY_num_workers_soft_limit": "0",  # Ray also starts so many for calls that wait, and they come too late
+    "RAY_idle_worker_killing_time_threshold_ms": "86400000",  # Blender takes seconds to start: idle processes stay
+    "RAY_raylet_report_resources_period_milliseconds": "1000",  # small tasks cost less where Ray looks seldom
+    "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
+    "RAY_memory_monitor_refresh_ms": "1000",
+}
+"""Settings of a head for one machine."""
+
+
+def own_directory(data: Path) -> Path:
+    """Return the directory of the head of a data directory. Sockets below it must have paths of at most 107 bytes."""
+    root = Path("/tmp") / f"stickslip-ray-{os.getuid()}"
+    root.mkdir(mode=0o700, exist_ok=True)
+    there = root.lstat()
+    if there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode) or there.st_mode & 0o077:
+        raise PermissionError(f"{root} must be a directory of this user, which others cannot enter, and no link")
+    return root / sha256(str(data).encode())[:8]
+
+
+def run_head(directory: Path, cpus: int | None) -> None:
+    """Run `ray start --head --block` on loopback, with a token; write `token` and `address` to a directory before.
+
+    The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then (ray-project/ray#65983). It
+    does not wait for ports that it already knows. One of them is no option of `ray start`, so a private function of Ray
+    adds it. It also ends the head with its raylet: a raylet that has lost an agent exits with 0, which `--block` takes
+    for an ordinary end.
+    """
+    shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
+    directory.mkdir(exist_ok=True)
+    (directory / "token").touch(mode=0o600)
+    (directory / "token").write_text(secrets.token_hex(32))
+    os.environ |= SETTINGS | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
+    from ray._private import services
+    from ray.scripts.scripts import main as ray
+
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(5)]
+    port, *ports = (free.getsockname()[1] for free in sockets)
+    for free in sockets:
+        free.close()
+    start = services.start_ray_process
+
+    def start_ray_process(command: list[str], *arguments: object, **options: object) -> Any:
+        if is_raylet := command[0] == services.RAYLET_EXECUTABLE:
+            command = [*command, f"--dashboard_agent_listen_port={ports[0]}"]
+        started = start(command, *arguments, **options)
+        if is_raylet:  # this process ends with it, and the kernel ends its other children then
+            threading.Thread(target=lambda: os._exit(started.process.wait() or 1), daemon=True).start()
+        return started
+
+    services.start_ray_process = start_ray_process
+    told = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "runtime-env-agent-port", "metrics-export-port")
+    options = {
+        "port": port,
+        "num-cpus": cpus or len(os.sched_getaffinity(0)),
+        "node-ip-address": "127.0.0.1",
+        "temp-dir": directory,
+        "object-store-memory": 128 * 2**20,  # tasks and results are small: bulk data goes through the store
+        "include-dashboard": "false",
+        "include-log-monitor": "false",
+        **dict(zip(told, ports, strict=True)),
+    }
+    (directory / "address").write_text(f"127.0.0.1:{port}")
+    sys.argv = ["ray", "start", "--head", "--block", "--no-monitor", *(f"--{o}={v}" for o, v in options.items())]
+    ray()

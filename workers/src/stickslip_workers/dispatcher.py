@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from stickslip_schemas.base import Reason, Stage
+from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import LeaseRequest, WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import open_store
@@ -21,9 +22,8 @@ from stickslip_workers.batches import LARGEST_BATCH, Call, Pace
 from stickslip_workers.calls import Calls, NotDoneError, StartError
 from stickslip_workers.cluster import Place
 from stickslip_workers.lease_client import Backoff, CoordinatorClient, Session, UnreachableError
-from stickslip_workers.results import failed, process_failure
 from stickslip_workers.settings import Settings
-from stickslip_workers.stages.run import StageActor, with_damaged_inputs
+from stickslip_workers.stages.run import StageActor, failed, failure, with_damaged_inputs
 
 log = logging.getLogger(__name__)
 
@@ -218,3 +218,17 @@ class Dispatcher:
             if missing > ahead / 2:  # not for one at a time
                 wanted[stage] = min(missing * self._pace.tasks(stage), LARGEST_BATCH)
         return wanted
+
+
+def process_failure(error: Exception, *, renders: bool) -> TaskResult:
+    """Return the result of a task of Ray that raised `error`, or whose process or node died."""
+    from ray import exceptions as ray_errors
+
+    if isinstance(error, ray_errors.RayTaskError):
+        # What was raised in the process; Ray leaves the traceback when the exception itself cannot travel.
+        return failure(error.cause) if isinstance(error.cause, Exception) else failed(Reason.internal_error, str(error))
+    if isinstance(error, ray_errors.OutOfMemoryError):
+        return failed(Reason.oom_killed, str(error))
+    if isinstance(error, ray_errors.WorkerCrashedError):
+        return failed(Reason.renderer_crash if renders else Reason.process_crash, str(error))
+    return failed(Reason.worker_lost, str(error))

@@ -6,15 +6,15 @@ Blender leaves no partial result.
 """
 
 import time
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
-from stickslip_schemas.documents.tasks import RenderTask
-from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.documents.tasks import RenderTask, TaskResult
+from stickslip_schemas.kinds import KINDS, kind_named
 
-from stickslip_blender.build import build_digest
-from stickslip_blender.cycles.blender import blender_version, described
-from stickslip_blender.scenes import renders
-from stickslip_blender.workshop import Workshop, check_rig
+from stickslip_blender.cycles.engine import blender_version, described
+from stickslip_blender.workshop import Workshop, build_digest, check_rig
 
 
 class RenderActor:
@@ -38,3 +38,13 @@ class RenderActor:
         result = renders(job.render.kind)(job.render, job, self._workshop)
         spent = {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
         return result.model_copy(update=spent).model_dump(mode="json")
+
+
+def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
+    """Return the function that renders a kind, from its render document, the task of it and a workshop to a result.
+
+    Raises UnknownKindError where the contract does not have the kind.
+    """
+    kind_named(kind)
+    render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(f"stickslip_blender.scenes.{kind}").render
+    return render

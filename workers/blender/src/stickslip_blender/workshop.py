@@ -1,4 +1,4 @@
-"""Services for the scenes of all kinds: records and pictures in the store, and one renderer at a time."""
+"""Services for the scenes of all kinds: the build, records and pictures in the store, and one renderer at a time."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import io
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base import Reason
+from stickslip_schemas.base import Reason, content_key
 from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, TaskResult
 from stickslip_schemas.format.codecs import encode_chunk
+from stickslip_schemas.plan.builds import UNCOUNTED, digests, sources
 from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.store import open_store, write_durably
+
+from stickslip_blender.cycles.engine import blender_version, described
+from stickslip_blender.raster._raster import BUILD_HASH
 
 if TYPE_CHECKING:  # content keys hold whole documents; the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
@@ -25,11 +31,31 @@ if TYPE_CHECKING:  # content keys hold whole documents; the modules that define 
 
 FRAME_MARGIN = 1.0
 """Least distance of a rod or a cloth from the edge of the frame [px]."""
-
 SHADING_BYTES = 4 * 2**30
 """Limit of the shadings kept in a store [bytes]: some hundred clips of 30 frames."""
 
+_LIBRARIES = ("numcodecs", "google-crc32c", "numpy", "pillow")
+
 Array = npt.NDArray[Any]
+
+
+def roots(kind: str) -> tuple[str, ...]:
+    """Return the modules that render a kind."""
+    return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
+
+
+@cache
+def build_digest(kind: str) -> str:
+    """Return the SHA-256 over the sources that render a kind, and versions; no path, time or machine is part of it."""
+    content = {
+        "kind": kind,
+        "sources": digests(sources(roots(kind), cut=UNCOUNTED)),
+        "raster": BUILD_HASH,
+        "libraries": {library: metadata.version(library) for library in _LIBRARIES},
+        **blender_version(),
+        **described(),
+    }
+    return content_key("build/render", content)
 
 
 class Workshop:

@@ -57,7 +57,7 @@ def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> Non
 _FRESH = """
 import hashlib, sys
 import numpy as np
-from stickslip_blender.cycles.blender import import_bpy
+from stickslip_blender.cycles.engine import import_bpy
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
@@ -161,7 +161,7 @@ def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: 
 
 
 def _glowing(stage: Any, points: Any, sampling: Any) -> npt.NDArray[np.float32]:
-    from stickslip_blender.cycles.blender import import_bpy
+    from stickslip_blender.cycles.engine import import_bpy
 
     data = import_bpy().data
     tree = data.materials["fabric"].node_tree

@@ -10,9 +10,8 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.cloth.looks import drawn_light
+from stickslip_blender.cloth.looks import drawn_light, drawn_substrate
 from stickslip_blender.cloth.scene import ClothScene
-from stickslip_blender.cloth.substrates import drawn_substrate
 from stickslip_blender.cloth.textures import SIZE, custom_texture, texture_image
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_digests, task_adapter
 from stickslip_schemas.format.codecs import decode_clip

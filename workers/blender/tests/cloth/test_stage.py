@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_blender.actor import RenderActor
-from stickslip_blender.cloth.geometry import FLOOR, Geometry
+from stickslip_blender.cloth.geometry import FLOOR, Geometry, gores, rounded
 from stickslip_blender.cloth.ground_truth import ground_truth
 from stickslip_blender.cloth.shading import Composer
-from stickslip_blender.cloth.shapes import gores, rounded
 from stickslip_blender.cloth.stage import SUNK, Stage
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
@@ -135,20 +134,20 @@ def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
     camera = framed("high", np.concatenate([track[-1], *stage.placed(2, track[-1])]), size=224)
     points = geometry.points(track[-1], 2)
     truth = ground_truth(geometry, points, points, camera)
-    seen = {names[code] for code in np.unique(truth.segmentation)}
+    seen = {names[code] for code in np.unique(truth["segmentation"])}
     assert seen == {*names} - {"background"}
-    cloth = np.isin(truth.segmentation, [names.index("rug"), names.index("towel")])
-    assert np.isfinite(truth.uv[cloth]).all()
-    assert np.isnan(truth.uv[~cloth]).all()
-    assert np.nanmax(truth.uv[..., 1]) < 0.68  # a picture covers the longer side
+    cloth = np.isin(truth["segmentation"], [names.index("rug"), names.index("towel")])
+    assert np.isfinite(truth["uv"][cloth]).all()
+    assert np.isnan(truth["uv"][~cloth]).all()
+    assert np.nanmax(truth["uv"][..., 1]) < 0.68  # a picture covers the longer side
     floor = np.full((224, 224, 3), 3.0, dtype=np.float32)
     factor = Composer(geometry).floor_factor(points, camera, floor)
-    red = factor[truth.segmentation == names.index("block")]
+    red = factor[truth["segmentation"] == names.index("block")]
     np.testing.assert_allclose(np.median(red, axis=0), np.array([0.6, 0.1, 0.05]) / 0.25, rtol=1e-3)
-    rug = factor[truth.segmentation == names.index("rug")]
+    rug = factor[truth["segmentation"] == names.index("rug")]
     assert rug.mean() == pytest.approx(1.0, abs=0.15)
     assert rug[:, 1].std() > 0.5  # red and white stripes
-    np.testing.assert_allclose(factor[truth.segmentation == names.index("towel")][:, 0].mean(), 1.0, atol=0.2)
+    np.testing.assert_allclose(factor[truth["segmentation"] == names.index("towel")][:, 0].mean(), 1.0, atol=0.2)
 
 
 @pytest.mark.parametrize("name", FRAMING)
@@ -175,8 +174,8 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
     points = geometry.points(record["towel.positions"][0], 0)
     truth = ground_truth(geometry, points, points, framed("front", record["towel.positions"], size=224))
     assert stage.floor is None
-    assert np.isinf(truth.depth[truth.segmentation == 0]).all()
-    assert (truth.segmentation == 0).any()
+    assert np.isinf(truth["depth"][truth["segmentation"] == 0]).all()
+    assert (truth["segmentation"] == 0).any()
 
 
 def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
@@ -234,7 +233,7 @@ def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None
     middle, radius = np.array([0.3, 0.0, 0.04]), 0.04 - SUNK
     camera = framed("high", corners_about(middle, 0.06), size=224)
     truth = ground_truth(geometry, now, then, camera)
-    rows, columns = np.nonzero(truth.segmentation == scene_segments(scene["sheets"], scene["bodies"]).index("ball"))
+    rows, columns = np.nonzero(truth["segmentation"] == scene_segments(scene["sheets"], scene["bodies"]).index("ball"))
     rotation, ray = np.asarray(camera.rotation), rays(camera)[rows, columns]
     center = rotation @ middle + camera.translation
     along, square = ray @ center, (ray**2).sum(axis=1)
@@ -242,9 +241,9 @@ def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None
     kept = met > 0.1 * square * radius**2  # away from the silhouette
     assert kept.sum() > 4000
     normal = ((along - np.sqrt(np.maximum(met, 0.0))) / square)[:, None] * ray - center
-    angle = degrees_between(truth.normals[rows, columns], normal / radius)[kept]
+    angle = degrees_between(truth["normals"][rows, columns], normal / radius)[kept]
     moved, _ = camera.project(normal @ rotation @ record["body_pose"][1, 0, :, :3].T + middle)
-    error = np.linalg.norm(truth.flow[rows, columns] - moved + np.column_stack([columns, rows]), axis=1)[kept]
+    error = np.linalg.norm(truth["flow"][rows, columns] - moved + np.column_stack([columns, rows]), axis=1)[kept]
     print(kept.sum(), np.percentile(angle, [50, 99]), np.percentile(error, [50, 99]))
     assert np.median(angle) < 1.0
     assert np.percentile(angle, 99) < 4.0
@@ -261,13 +260,13 @@ def test_normals_of_bodies_are_those_of_their_depth(usual: Any, name: str, middl
     camera = framed("high", corners_about(middle, half), size=224)
     points = geometry.points(track[0], 0)
     truth = ground_truth(geometry, points, points, camera)
-    place = truth.depth[..., None].astype(float) * rays(camera)
+    place = truth["depth"][..., None].astype(float) * rays(camera)
     normal = np.cross(np.gradient(place, axis=0), np.gradient(place, axis=1))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     near = np.lib.stride_tricks.sliding_window_view(normal, (7, 7), axis=(0, 1))
-    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (truth.segmentation == names.index(name))
-    angle = degrees_between(truth.normals, normal)[kept]
-    print(name, kept.sum(), (truth.segmentation == names.index(name)).sum())
+    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (truth["segmentation"] == names.index(name))
+    angle = degrees_between(truth["normals"], normal)[kept]
+    print(name, kept.sum(), (truth["segmentation"] == names.index(name)).sum())
     print(name, np.percentile(angle, [50, 99]) if len(angle) else "")
     assert kept.sum() > 300
     assert np.median(angle) < 1.0

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_blender.cloth.subdivision import subdivide
+from stickslip_blender.cloth.surface import subdivide
 
 
 def test_every_triangle_becomes_four(sheet: Any) -> None:

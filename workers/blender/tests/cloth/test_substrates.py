@@ -6,8 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_blender.cloth.geometry import FLOOR
-from stickslip_blender.cloth.looks import SOURCES, drawn_light, grained, look_of, looks
-from stickslip_blender.cloth.substrates import HARD, drawn_substrate, finishes, floor_factor
+from stickslip_blender.cloth.looks import (
+    FINISHES,
+    HARD,
+    LOOKS,
+    SOURCES,
+    drawn_light,
+    drawn_substrate,
+    floor_factor,
+    grained,
+    look_of,
+)
 from stickslip_blender.cloth.surface import Surface
 from stickslip_blender.raster import decoded
 from stickslip_schemas.spec.appearance import Lighting, Substrate
@@ -17,8 +26,8 @@ from stickslip_schemas.spec.fabrics import Material
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:
     assert tuple(Lighting) == tuple(SOURCES)
-    assert tuple(Substrate) == (*finishes(), "any")
-    assert set(Material) == set(looks())
+    assert tuple(Substrate) == (*FINISHES, "any")
+    assert set(Material) == set(LOOKS)
 
 
 @pytest.mark.parametrize("name", Substrate)
@@ -59,7 +68,7 @@ def test_marks_lie_still_on_the_floor() -> None:
 def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
     surface = Surface(sheet.triangles, sheet.rest)
     white = np.full((256, 256, 3), 200, dtype=np.uint8)
-    prints = {material: grained(white, look_of(material), surface) for material in looks()}
+    prints = {material: grained(white, look_of(material), surface) for material in LOOKS}
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
     inner = {material: picture[20:-20, 20:-20].astype(float) for material, picture in prints.items()}
     for one, other in combinations(inner.values(), 2):  # prints of one brightness that a pixel of 3 mm still shows

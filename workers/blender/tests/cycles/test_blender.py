@@ -6,15 +6,13 @@ import sys
 from contextlib import suppress
 
 import pytest
-from stickslip_blender import build
-from stickslip_blender.cycles import blender
-from stickslip_blender.cycles.blender import CPU, DEVICES, VARIABLE, NoDeviceError, described
-from stickslip_blender.cycles.engine import new_scene
+from stickslip_blender import workshop
+from stickslip_blender.cycles.engine import CPU, DEVICES, VARIABLE, NoDeviceError, described, new_scene
 
 _RENDER = """
 import hashlib, sys
 import numpy as np
-from stickslip_blender.cycles.blender import NoDeviceError
+from stickslip_blender.cycles.engine import NoDeviceError
 from stickslip_blender.rods.renderer import RodRenderer
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
@@ -61,7 +59,7 @@ def test_a_device_that_is_not_there_is_refused(name: str, monkeypatch: pytest.Mo
     with pytest.raises(NoDeviceError):
         new_scene()
     with pytest.raises(NoDeviceError):
-        build.build_digest.__wrapped__("rod_hang")
+        workshop.build_digest.__wrapped__("rod_hang")
 
 
 def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,16 +69,16 @@ def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_device_names_and_driver_are_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:
-    digest = build.build_digest.__wrapped__
+    digest = workshop.build_digest.__wrapped__
     found = {digest("rod_hang")}
     for driver, names in (("550", ["one"]), ("570", ["one"]), ("570", ["another"])):
         gpu = {"device": "optix", "names": names, "driver": driver}
-        monkeypatch.setattr(build, "described", lambda gpu=gpu: gpu)
+        monkeypatch.setattr(workshop, "described", lambda gpu=gpu: gpu)
         found.add(digest("rod_hang"))
     assert len(found) == 4
 
 
 def test_a_scene_without_a_wish_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
-    assert blender.described() == {"device": "cpu"}
+    assert described() == {"device": "cpu"}
     assert new_scene().cycles.device == "CPU"

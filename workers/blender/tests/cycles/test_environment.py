@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.engine import Sampling, new_scene, set_sampling
-from stickslip_blender.cycles.environment import SoftBox, panorama, set_environment
-from stickslip_blender.cycles.objects import add_view, set_view
+from stickslip_blender.cycles.engine import Sampling, import_bpy, new_scene, set_sampling
+from stickslip_blender.cycles.objects import SoftBox, add_view, panorama, set_environment, set_view
 from stickslip_blender.cycles.pixels import FrameReader
 from stickslip_testing.cameras import looking_at
 

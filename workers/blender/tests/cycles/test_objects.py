@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.cycles.blender import import_bpy
-from stickslip_blender.cycles.engine import Sampling, new_scene, set_sampling
+from stickslip_blender.cycles.engine import Sampling, import_bpy, new_scene, set_sampling
 from stickslip_blender.cycles.objects import add_view, set_view
 from stickslip_blender.cycles.pixels import FrameReader
 from stickslip_schemas.spec.cameras import Camera, load_rig

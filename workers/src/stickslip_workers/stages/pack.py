@@ -11,7 +11,7 @@ from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 
-from stickslip_workers.stages.records import Array, Records
+from stickslip_workers.stages.run import Array, Records
 
 
 def pack(task: PackTask, store: Store) -> PackOutput:

@@ -1,6 +1,7 @@
-"""Publish: metadata, manifest and directory of a dataset version. The manifest is written last."""
+"""Publish: metadata, which zarr-python makes, manifest and directory of a dataset version. The manifest is last."""
 
 import os
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base import canonical_json
 from stickslip_schemas.documents.tasks import PublishOutput, PublishSection, PublishTask
-from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, shard_index_size
+from stickslip_schemas.format.codecs import (
+    ZSTD_LEVEL,
+    axes_order,
+    decode_chunk,
+    decode_shard_index,
+    encode_chunk,
+    packing,
+    shard_index_size,
+)
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -30,12 +39,62 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS
-from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
+from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
+from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
 from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, PREVIEW_NAME, card, pictured, preview
-from stickslip_workers.stages.metadata import metadata_files
+
+
+def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: int) -> dict[str, bytes]:
+    """Return the metadata files of a dataset by path: the group, consolidated, and every array."""
+    import zarr
+    from zarr.storage import MemoryStore
+
+    files: dict[str, object] = {}
+    group = zarr.create_group(
+        MemoryStore(files),  # type: ignore[arg-type]  # the values are zarr's own buffers
+        zarr_format=3,
+        attributes={
+            "format": FORMAT,
+            "dataset": dataset,
+            "version": version,
+            "kind": spec.kind,
+            "spec_digest": spec.content_digest,
+        },
+    )
+    for array in layout(spec):
+        create_array(group, array, sample_count=sample_count, samples_per_file=samples_per_file(array, spec))
+    with warnings.catch_warnings():
+        # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs #383].
+        warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
+        zarr.consolidate_metadata(group.store)
+    return {path: buffer.to_bytes() for path, buffer in files.items()}  # type: ignore[attr-defined]
+
+
+def create_array(group: object, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> object:
+    """Create `array` in a zarr group, empty, with the codecs that the packer writes."""
+    from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
+
+    group_shape = (samples_per_file, *array.shape)
+    order = axes_order(array)
+    compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
+    if (packed := packing(array)) is not None:
+        compressor = BloscCodec(typesize=np.dtype(array.dtype).itemsize, blocksize=0, **packed._asdict())
+    return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
+        array.name,
+        shape=(sample_count, *array.shape),
+        dtype=array.dtype,
+        chunks=(1, *array.shape) if array.per_sample else group_shape,
+        shards=group_shape if array.per_sample else None,  # the index: crc32c, at the end, as zarr has it
+        filters=() if order is None else (TransposeCodec(order=order),),
+        serializer=BytesCodec(endian="little"),
+        compressors=(compressor, Crc32cCodec()),
+        fill_value=array.fill,
+        dimension_names=("sample", *array.dimensions),
+        attributes=describe(array),
+    )
 
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:

@@ -1,17 +1,74 @@
-"""Run tasks in this process. Exceptions become results here, and time is measured here."""
+"""Run tasks in this process, simulations first of all. Exceptions become results here, and time is measured here."""
 
+import io
 import time
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from stickslip_schemas.base import Reason
-from stickslip_schemas.documents.tasks import AnyTask, TaskResult, input_digests, results_adapter, tasks_adapter
+from stickslip_schemas.documents.tasks import (
+    AnyTask,
+    RecordRef,
+    SimulateOutput,
+    SimulateTask,
+    TaskResult,
+    input_digests,
+    results_adapter,
+    tasks_adapter,
+)
+from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds import KINDS
-from stickslip_schemas.store import Store, in_parallel, open_store
+from stickslip_schemas.store import Store, in_parallel, is_unavailable, open_store
 
-from stickslip_workers import builds, progress
-from stickslip_workers.results import failure
+from stickslip_workers.builds import kind, kind_builds, versions
+
+if TYPE_CHECKING:
+    from stickslip_sim_core.scenes.kind import Outcome
+
+frames: tuple[int, int] | None = None
+"""Frames done and frames in all of the simulation that runs in this process; None if none reports progress."""
+MESSAGE_LENGTH = 2000
+"""Limit of the message of a result [characters]; the log has all of it."""
+KEPT_BYTES = 256 * 2**20
+"""Of records that are kept in memory."""
+
+Array = npt.NDArray[np.generic]
+
+
+def encode_records(arrays: Mapping[str, Array]) -> bytes:
+    """Return the file of `arrays`. The same arrays give the same bytes: numpy dates every member 1980-01-01."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+class Records:
+    """Reads records; an artifact that several slots share is read and checked once, while it is among the last ones."""
+
+    def __init__(self, store: Store, *, kept_bytes: int = KEPT_BYTES) -> None:
+        self._store = store
+        self._artifacts: OrderedDict[str, dict[str, Array]] = OrderedDict()
+        self._kept_bytes = kept_bytes
+        self._bytes = 0
+
+    def __call__(self, digest: str) -> dict[str, Array]:
+        if digest in self._artifacts:
+            self._artifacts.move_to_end(digest)
+            return self._artifacts[digest]
+        with np.load(io.BytesIO(self._store.read(digest)), allow_pickle=False) as arrays:
+            artifact = self._artifacts[digest] = dict(arrays)
+        self._bytes += _size(artifact)
+        while self._bytes > self._kept_bytes and len(self._artifacts) > 1:
+            self._bytes -= _size(self._artifacts.popitem(last=False)[1])
+        return artifact
+
+
+def _size(artifact: Mapping[str, Array]) -> int:
+    return sum(values.nbytes for values in artifact.values())
 
 
 class StageActor:
@@ -22,18 +79,19 @@ class StageActor:
 
     def describe(self) -> dict[str, Any]:
         """Return the builds of each kind, and versions of libraries."""
-        return {"builds": {name: builds.kind_builds(name) for name in KINDS}, "versions": builds.versions()}
+        return {"builds": {name: kind_builds(name) for name in KINDS}, "versions": versions()}
 
     def run(self, tasks: str) -> str:
         """Run tasks, see `run_tasks`."""
         try:
             return results_adapter.dump_json(run_tasks(tasks_adapter.validate_json(tasks), self._store)).decode()
         finally:
-            progress.frames = None
+            global frames
+            frames = None
 
     def frames(self) -> tuple[int, int] | None:
         """Return the progress of the running simulation, (frames done, frames total); another thread may call it."""
-        return progress.frames
+        return frames
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
@@ -67,10 +125,70 @@ def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> Task
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    """Call the module of the stage, imported here: packing needs no simulator."""
+    """Call the module of another stage, imported here: simulating needs no packer."""
     (stage,) = {task.stage for task in tasks}
-    work = getattr(import_module(f"stickslip_workers.stages.{stage}"), stage)
     if stage == "simulate":
-        results: list[TaskResult] = work(tasks, store)
-        return results
+        return simulate([task for task in tasks if isinstance(task, SimulateTask)], store)
+    work = getattr(import_module(f"stickslip_workers.stages.{stage}"), stage)
     return [TaskResult(outcome="succeeded", output=work(task, store)) for task in tasks]
+
+
+def _note(done: int, total: int) -> None:
+    global frames
+    frames = done, total
+
+
+def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
+    """Simulate tasks of one kind together; return one result for each. Raise ValueError for several kinds."""
+    names = sorted({task.simulation.kind for task in tasks})
+    if len(names) != 1:
+        raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
+    made = kind(names[0])
+    simulations = [task.simulation.given(store.read) for task in tasks]
+    outcomes = made.simulate(simulations, _note)
+    records = _stored(outcomes, made.batch, store)
+    return [
+        _rejection(physics, outcome)
+        if outcome.reason
+        else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
+        for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
+    ]
+
+
+def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
+    """Store the records of valid outcomes, at most `batch` of the same shapes in an artifact; return where they are."""
+    alike: dict[Any, list[int]] = {}
+    for number, outcome in enumerate(outcomes):
+        if not outcome.reason:
+            shapes = tuple((name, np.shape(values)) for name, values in outcome.record.items())
+            alike.setdefault(shapes, []).append(number)
+    found: dict[int, RecordRef] = {}
+    for members in alike.values():
+        for first in range(0, len(members), batch):
+            some = members[first : first + batch]
+            arrays = {name: np.stack([outcomes[n].record[name] for n in some]) for name in outcomes[some[0]].record}
+            digest = store.publish(encode_records(arrays))
+            found |= {number: RecordRef(digest=digest, row=row) for row, number in enumerate(some)}
+    return found
+
+
+def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
+    shown = {name: f"{value:g}" if isinstance(value, float) else value for name, value in physics.items()}
+    numbers = ", ".join(f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str))
+    return TaskResult(outcome="rejected", reason=Reason(outcome.code), message=f"{outcome.reason} at {numbers}")
+
+
+def failed(reason: Reason, message: str) -> TaskResult:
+    return TaskResult(outcome="failed", reason=reason, message=message[:MESSAGE_LENGTH])
+
+
+def failure(error: Exception) -> TaskResult:
+    """Return the result of a stage that raised `error`."""
+    message = f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and is_unavailable(error):
+        return failed(Reason.store_unavailable, message)
+    if isinstance(error, OSError | CorruptChunkError):
+        return failed(Reason.storage_error, message)
+    if isinstance(error, MemoryError):
+        return failed(Reason.oom_killed, message)
+    return failed(Reason.internal_error, message)

@@ -20,20 +20,17 @@ from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.spec.fabrics import Texture
 
-from stickslip_blender.build import build_digest
 from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
-from stickslip_blender.cloth.ground_truth import ground_truth
-from stickslip_blender.cloth.lens import bent
-from stickslip_blender.cloth.looks import Look, drawn_light, grained, look_of
+from stickslip_blender.cloth.ground_truth import bent, ground_truth
+from stickslip_blender.cloth.looks import Look, drawn_light, drawn_substrate, floor_factor, grained, look_of
 from stickslip_blender.cloth.quality import BAND, UNMEASURED, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.shading import FINE, SHOWN
-from stickslip_blender.cloth.substrates import drawn_substrate, floor_factor
 from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling
 from stickslip_blender.raster import Points, Textures
-from stickslip_blender.workshop import Workshop, rejected, why_unfit
+from stickslip_blender.workshop import Workshop, build_digest, rejected, why_unfit
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask
@@ -165,7 +162,7 @@ class ClipRenderer:
             ground_truth(self.scene.geometry, here, following, self.camera)
             for here, following in zip(self.shots, [*self.shots[1:], self.shots[-1]], strict=True)
         ]
-        return {name: np.stack([getattr(frame, name) for frame in known]) for name in names}
+        return {name: np.stack([frame[name] for frame in known]) for name in names}
 
 
 @dataclass(frozen=True)

@@ -3,41 +3,57 @@
 All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the floor.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import BACKGROUND, Geometry
-from stickslip_blender.cloth.lens import traced
-from stickslip_blender.raster import Window, _raster, projected, see
-
-Floats = npt.NDArray[np.float32]
-Halves = npt.NDArray[np.float16]
+from stickslip_blender.cycles.pixels import encode
+from stickslip_blender.raster import Window, _raster, decoded, projected, see
 
 
-@dataclass(frozen=True)
-class GroundTruth:
-    """The ground truth of one frame."""
+def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
+    """Return what a camera shows of a video (frames, height, width, 3) that its `pinhole` took, 8-bit sRGB.
 
-    depth: Floats
-    """Along the optical axis [m], infinite where there is nothing; shape (height, width)."""
-    segmentation: npt.NDArray[np.uint8]
-    """Codes, shape (height, width)."""
-    normals: Halves
-    """Of length 1, towards the camera, in its axes (x right, y down, z forward); 0 where there is nothing; shape
-    (height, width, 3)."""
-    uv: Halves
-    """Texture coordinates of the cloth, NaN elsewhere; shape (height, width, 2)."""
-    flow: Halves
-    """Motion of the visible points until the next frame [px], columns and rows; shape (height, width, 2)."""
+    A pixel is interpolated between four, in linear light.
+    """
+    if not any(camera.distortion):
+        return video
+    _, _, places = traced(camera)
+    corner = np.floor(places).astype(int)
+    share = (places - corner)[..., None].astype(np.float32)
+    column, row = corner[..., 0], corner[..., 1]
+    across, down = share[:, :, 0], share[:, :, 1]
+    result = np.empty((len(video), *column.shape, 3), dtype=np.uint8)
+    for frame, picture in enumerate(video):
+        a, b, c, d = (decoded(picture[row + y, column + x]) for y in range(2) for x in range(2))
+        upper, lower = a + across * (b - a), c + across * (d - c)
+        result[frame] = encode(upper + down * (lower - upper))
+    return result
+
+
+@lru_cache(maxsize=4)  # every frame and every texture asks
+def traced(camera: Camera) -> tuple[Camera, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return a camera's pinhole, its rays (height, width, 3), and where in the pinhole's frame they land [px]."""
+    pinhole, rays = camera.pinhole(), camera.rays()
+    return pinhole, rays, rays[..., :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
 def ground_truth(
     geometry: Geometry, points: npt.NDArray[np.float64], following: npt.NDArray[np.float64], camera: Camera
-) -> GroundTruth:
-    """Return the ground truth of an instant: all vertices (V, 3) [m] then, and at the next frame."""
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the ground truth of an instant by name: all vertices (V, 3) [m] then, and at the next frame.
+
+    - `depth` (height, width): along the optical axis [m], infinite where there is nothing
+    - `segmentation` (height, width): codes
+    - `normals` (height, width, 3): of length 1, towards the camera, in its axes (right, down, forward); 0 for nothing
+    - `uv` (height, width, 2): texture coordinates of the cloth, NaN elsewhere
+    - `flow` (height, width, 2): motion of the visible points until the next frame [px], columns and rows
+    """
     pinhole, rays, places = traced(camera)
     here = projected(pinhole, points)
     seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
@@ -59,13 +75,13 @@ def ground_truth(
     normal = normal / np.maximum(length, 1e-12)
     normal = np.where((normal * rays).sum(axis=-1, keepdims=True) > 0.0, -normal, normal)
     normal[segmentation == BACKGROUND] = 0.0
-    return GroundTruth(
-        depth=np.where(thing, values[..., 0], floor).astype(np.float32),
-        segmentation=segmentation.astype(np.uint8),
-        normals=normal.astype(np.float16),
-        uv=np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float16),
-        flow=np.where(thing[..., None], moved - pixels, 0.0).astype(np.float16),
-    )
+    return {
+        "depth": np.where(thing, values[..., 0], floor).astype(np.float32),
+        "segmentation": segmentation.astype(np.uint8),
+        "normals": normal.astype(np.float16),
+        "uv": np.where(cloth[..., None], values[..., 1:3], np.nan).astype(np.float16),
+        "flow": np.where(thing[..., None], moved - pixels, 0.0).astype(np.float16),
+    }
 
 
 def _floor_depth(camera: Camera, rays: npt.NDArray[np.float64], height: float | None) -> npt.NDArray[np.float64]:

@@ -9,11 +9,9 @@ import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry
-from stickslip_blender.cloth.looks import Light, Look
+from stickslip_blender.cloth.looks import Light, Look, Substrate
 from stickslip_blender.cloth.shading import ELSEWHERE, FINE, SHOWN, Composer
-from stickslip_blender.cloth.substrates import Substrate
 from stickslip_blender.cycles.engine import ClothSampling, Sampling, new_scene, set_sampling
-from stickslip_blender.cycles.environment import set_curtains
 from stickslip_blender.cycles.objects import (
     Fabric,
     Lamp,
@@ -21,6 +19,7 @@ from stickslip_blender.cycles.objects import (
     add_mesh,
     add_view,
     move_mesh,
+    set_curtains,
     set_inputs,
     set_roughness,
     set_view,

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry, mirrored
-from stickslip_blender.cloth.substrates import Substrate
+from stickslip_blender.cloth.looks import Substrate
 from stickslip_blender.raster import (
     GRID,
     Seen,
@@ -44,7 +44,7 @@ SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
 
 FINE = 2  # pixels of a shading across one of a picture, and down
 TOLERANCE: int = _raster.TOLERANCE
-"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/composition.hpp sets it."""
+"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/raster.hpp sets it."""
 
 _MIRROR_GRID = 8
 _PROP_GRID = 3

@@ -10,9 +10,22 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera, framed
 
-from stickslip_blender.cloth.geometry import BACKGROUND, FLOOR, HOLDER_COLOR, HOLDER_ROUGHNESS, Geometry, Print, Prop
+from stickslip_blender.cloth.geometry import (
+    BACKGROUND,
+    FLOOR,
+    HOLDER_COLOR,
+    HOLDER_ROUGHNESS,
+    Faces,
+    Geometry,
+    Print,
+    Prop,
+    box,
+    gores,
+    rounded,
+    square,
+    tiled,
+)
 from stickslip_blender.cloth.looks import grained, look_of
-from stickslip_blender.cloth.shapes import Faces, box, gores, rounded, square, tiled
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 

@@ -1,0 +1,206 @@
+"""What a command does without Ray and coordinator: replay a task, draw a scene, certify a preset."""
+
+import json
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from stickslip_schemas.base import Reason, canonical_json, content_key, referred
+from stickslip_schemas.documents.certificate import Certificate, ProtocolReport
+from stickslip_schemas.documents.tasks import AnyTask, RenderTask, TaskResult
+from stickslip_schemas.kinds.cloth.arrays import scene_segments
+from stickslip_schemas.plan.builds import digests, sources
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.files import with_arrays
+from stickslip_schemas.scene.parameters import with_values
+from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.store import Store, open_store, write_durably
+from stickslip_sim_core import build_info, protocols
+from stickslip_sim_core.protocols import ProtocolResult
+from stickslip_sim_core.protocols.result import dense_master
+from stickslip_sim_core.scenes import cloth_scene
+from stickslip_sim_core.scenes.scene import ClothRun
+
+from stickslip_workers.builds import solver_build
+from stickslip_workers.settings import RENDER_ACTOR
+from stickslip_workers.stages.run import failed, run_tasks
+
+# Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what it likes.
+_RENDER = """
+import importlib, json, sys
+factory, store, task, answer = sys.argv[1:]
+module, name = factory.split(":")
+actor = getattr(importlib.import_module(module), name)(store)
+with open(task) as file:
+    result = actor.render(json.load(file))
+with open(answer, "w") as file:
+    json.dump(result, file)
+"""
+
+
+def replay(task: AnyTask, *, store: str, blender_python: Path, render_actor: str = RENDER_ACTOR) -> TaskResult:
+    """Run a task and return its result; a render runs in Blender's interpreter."""
+    if not isinstance(task, RenderTask):
+        return run_tasks([task], open_store(store))[0]
+    with TemporaryDirectory() as scratch:
+        given, answer = Path(scratch, "task.json"), Path(scratch, "result.json")
+        given.write_text(task.model_dump_json())
+        command = [blender_python, "-c", _RENDER, render_actor, store, given, answer]
+        status = subprocess.run([str(word) for word in command], check=False).returncode
+        if status != 0:
+            return failed(Reason.renderer_crash, f"the renderer ended with status {status}")
+        return TaskResult.model_validate_json(answer.read_bytes())
+
+
+FRAMES = 24
+"""Of the animation."""
+
+
+def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list[str]:
+    """Draw the start and the motions of a scene; return the names of the pictures: of each camera, and an animation.
+
+    Cloth is not simulated: it stays as it starts. A sheet that starts hung is drawn flat.
+
+    `store` has the files that it names; `out`, a directory, is made where it does not exist. Raises ValueError, whose
+    message begins with the place of the wrong value, OSError, or RuntimeError where the drawing failed.
+    """
+    given = scene.looks.cameras
+    views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
+    cameras = load_rig(given) if isinstance(given, str) else views
+    with TemporaryDirectory(prefix="stickslip-preview-") as folder:
+        pictures = {place: Path(folder, referred(name) or "") for place, name in scene.files() if place[0] == "looks"}
+        for path in pictures.values():
+            path.write_bytes(store.read(path.name))
+        request = {
+            "scene": with_values(scene.staged(), {place: str(path) for place, path in pictures.items()}),
+            "sheet": scene.textured,
+            "segments": scene_segments(scene.sheets, scene.bodies),
+            "cameras": [camera.model_dump(mode="json") for camera in cameras],
+        }
+        record, document = Path(folder, "record.npz"), Path(folder, "scene.json")
+        np.savez(record, allow_pickle=False, **_record(scene, with_arrays(scene, store.read)))
+        document.write_text(json.dumps(request), encoding="utf-8")
+        out.mkdir(parents=True, exist_ok=True)
+        command = [str(blender_python), "-m", "stickslip_blender.preview", str(record), str(document), str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the drawing failed: {done.stderr[-2000:]}")
+    return done.stdout.split()
+
+
+def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of a scene at the times of the animation."""
+    for sheet in document["sheets"].values():
+        if sheet["start"]["type"] == "hung":
+            sheet["start"] = {"type": "flat"}
+    made = cloth_scene.scene(document)
+    times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
+    start = SimpleNamespace(positions=np.repeat(made.start[None], FRAMES, axis=0))
+    tracks = {name: np.stack([np.asarray(at(time)) for time in times]) for name, at in made.tracks.items()}
+    return {**made.arrays(cast(ClothRun, start)), **made.record, **tracks}
+
+
+DOCUMENT_NAME = "certificate.json"
+
+Say = Callable[[str], None]
+
+
+def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
+    """Certify a preset: write `certificate.json` into `out`.
+
+    A protocol that raises has not passed; the others run all the same. Raises ValueError for an unknown preset.
+    """
+    if preset not in protocols.CERTIFICATION:
+        raise ValueError(f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}")
+    certification = protocols.CERTIFICATION[preset]
+    environment = _environment()
+    reports: list[ProtocolReport] = []
+    for number, name in enumerate(certification.protocols, 1):
+        say(f"{number}/{len(certification.protocols)} {name} ...")
+        cpu, wall = time.process_time(), time.monotonic()
+        try:
+            result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
+            report = ProtocolReport.model_validate(_with_dense_curves(result))
+            canonical_json(report.model_dump(mode="json"))  # settings are free in form
+        except Exception as error:  # any error becomes part of the certificate
+            report = _broken_off(name, error)
+        reports.append(report)
+        spent = time.process_time() - cpu
+        environment[f"cpu_seconds/{name}"] = f"{spent:.2f}"
+        say(f"    {verdict(report)}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
+    certificate = Certificate(
+        preset=preset,
+        numbers=dict(certification.numbers()),
+        sim_core=solver_build(certification.solver),
+        protocol_sources=content_key("protocols", digests(sources(["stickslip_sim_core.protocols"]))),
+        extent="quick" if quick else "full",
+        protocols=tuple(reports),
+        passed=all(report.passed for report in reports),
+        environment=environment,
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    write_durably(out / DOCUMENT_NAME, certificate.canonical())
+    return certificate
+
+
+def verdict(report: ProtocolReport) -> str:
+    if report.message:
+        return f"broke off: {report.message}"
+    error = "infinite" if report.error is None else f"{report.error:.1e}"
+    return f"{'passed' if report.passed else 'FAILED'}, largest error {error} of {report.tolerance:g} allowed"
+
+
+def _with_dense_curves(result: ProtocolResult) -> dict[str, Any]:
+    document = result.as_dict()
+    for shown, curve in zip(document["curves"], result.curves, strict=True):
+        shown["dense_x"], shown["dense_master"] = (v.tolist() for v in dense_master(result.protocol, curve))
+    return document
+
+
+def _broken_off(name: str, error: Exception) -> ProtocolReport:
+    return ProtocolReport(
+        protocol=name,
+        x="",
+        y="",
+        tolerance=0.0,
+        error=None,
+        passed=False,
+        settings={},
+        build_hash=build_info().build_hash,
+        curves=(),
+        message=f"{type(error).__name__}: {error}"[:2000],
+    )
+
+
+def _environment() -> dict[str, str]:
+    build = build_info()
+    return {
+        "made_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "processor": _processor(),
+        "cores": str(os.cpu_count()),
+        "load": f"{os.getloadavg()[0]:.1f}",
+        "python": platform.python_version(),
+        "numpy": metadata.version("numpy"),
+        "sim_core": build.version,
+        "compiler": build.compiler,
+        "isa": build.isa,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
