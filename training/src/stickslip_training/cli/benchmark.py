@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from stickslip_schemas.store import write_durably
 
-from stickslip_training.cli.errors import DatasetArgument, readable_errors
+from stickslip_training.cli.commands import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
 SECRET_BYTES = 32

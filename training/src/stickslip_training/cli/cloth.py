@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.errors import readable_errors, shows_epochs
+from stickslip_training.cli.commands import readable_errors, shows_epochs
 from stickslip_training.data.reader import DatasetReader, Split
 
 NO_ANSWER = 3
