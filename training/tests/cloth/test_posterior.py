@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from stickslip_training.cloth.posterior import Bins, Posterior, estimates, quantile_of_truth
+from stickslip_training.cloth.posterior import Bins, Posterior, estimates
 
 BINS = Bins(0.0, 1.6, 64)
 
@@ -45,21 +45,11 @@ def test_the_share_is_that_asked_for():
         assert np.mean(held) < share + 0.03
 
 
-def test_quantiles_of_the_truth_are_uniform_where_it_is_drawn_from_the_histogram():
-    generator = np.random.default_rng(1)
-    histogram = np.repeat(normal([0.8], 0.15), 4000, axis=0)
-    below = quantile_of_truth(histogram, BINS, generator.normal(0.8, 0.15, 4000))
-    assert np.histogram(below, 10, (0, 1))[0] / 4000 == pytest.approx(np.full(10, 0.1), abs=0.02)
-
-
-def test_the_joint_histogram_has_both_models_of_the_thesis():
+def test_the_joint_histogram_has_material_mu_and_the_likelihood_of_both():
     joint = np.zeros((2, 2, 64))
     joint[:, 0], joint[:, 1] = 0.25 * normal([0.3], 0.05), 0.75 * normal([0.6], 0.05)
     posterior = Posterior(("denim", "interlock"), BINS, joint)
     assert posterior.material == pytest.approx(np.array([[0.25, 0.75]] * 2))
-    assert posterior.given(np.array([0, 1])) == pytest.approx(
-        np.concatenate([normal([0.3], 0.05), normal([0.6], 0.05)])
-    )
     assert posterior.mu.sum(axis=1) == pytest.approx([1.0, 1.0])
     densities = np.exp(posterior.log_likelihood(np.array([0, 1]), np.array([0.3, 0.6])))
     assert densities[1] / densities[0] == pytest.approx(3.0, rel=1e-3)

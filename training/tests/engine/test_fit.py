@@ -46,15 +46,15 @@ def equal(first, second):
 @pytest.mark.physics
 def test_it_learns_and_keeps_the_best_weights():
     fitted = fit(Line(), replace(SETTINGS, steps=400, averaging=0.0))
-    losses = [report.validation_loss for report in fitted.history]
+    losses = [report.validation_loss for report in fitted.run.history]
     assert min(losses) < 0.02 < losses[0]
-    assert fitted.history[losses.index(min(losses))].step == fitted.best_step
+    assert fitted.run.history[losses.index(min(losses))].step == fitted.run.best_step
     assert Line().validate(fitted.net) == min(losses)
     assert not fitted.net.training
 
 
 def test_without_validation_the_last_weights_are_kept():
-    assert fit(Line(validates=False), SETTINGS).best_step == 23
+    assert fit(Line(validates=False), SETTINGS).run.best_step == 23
 
 
 def test_the_same_settings_give_the_same_weights_and_leave_the_generator_alone():
@@ -73,10 +73,10 @@ def test_resume_equals_uninterrupted_to_the_bit(tmp_path, stop):
     fit(Line(), replace(SETTINGS, steps=stop), out=tmp_path / "stopped")
     resumed = fit(Line(), SETTINGS, out=tmp_path / "stopped", resume=True)
     assert equal(resumed.net, straight.net)
-    assert resumed.best_step == straight.best_step
+    assert resumed.run.best_step == straight.run.best_step
     told = [
-        [(report.step, report.train_loss, report.validation_loss) for report in run.history]
-        for run in (straight, resumed)
+        [(report.step, report.train_loss, report.validation_loss) for report in fitted.run.history]
+        for fitted in (straight, resumed)
     ]
     assert told[0] == told[1]
     ends = [load_tensors(tmp_path / name / "checkpoint.pt") for name in ("straight", "stopped")]

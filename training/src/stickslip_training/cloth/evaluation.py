@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from stickslip_training.arrays import Array, Floats, Integers
-from stickslip_training.cloth.posterior import SHARE, Estimates, Posterior, estimates, quantile_of_truth
+from stickslip_training.cloth.posterior import SHARE, Estimates, Posterior, estimates
 
 BANDS = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.2), (1.2, 1.6))
 """Of mu: below 0.3 or so there are two branches, and above 1 a difference of 0.1 moves edges by less than half
 a pixel."""
-
-LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 PRIOR = (0.8, 0.16, 1.44)
 """Median, low and high of who knows only that mu is from 0 to 1.6."""
@@ -62,17 +60,11 @@ class Scores:
 
     blind: Errors
     """Material not known."""
-    given: Errors | None
-    """Material known; None if the answers have no mu for it."""
-    top_1: Measure | None
+    top_1: Measure
     """Share of the clips whose likeliest material is the true one."""
-    top_2: Measure | None
-    log_likelihood: Measure | None
-    """Mean of log p(m, mu), mu a density."""
+    top_2: Measure
     bands: dict[str, Errors]
     sides: dict[str, Errors]
-    reliability: dict[str, float]
-    """Share of the clips whose truth lies in the central interval of each level."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,19 +79,7 @@ class Truth:
     """Number of the simulation: errors count simulations and not clips."""
 
 
-def score(posterior: Posterior, truth: Truth) -> Scores:
-    below = quantile_of_truth(posterior.mu, posterior.bins, truth.mu)
-    return _scores(
-        estimates(posterior.mu, posterior.bins),
-        posterior.material,
-        truth,
-        given=errors(estimates(posterior.given(truth.material), posterior.bins), truth.mu, truth.run),
-        log_likelihood=measure(posterior.log_likelihood(truth.material, truth.mu), truth.run),
-        reliability={f"{level:g}": float((np.abs(below - 0.5) <= level / 2).mean()) for level in LEVELS},
-    )
-
-
-def _scores(found: Estimates, material: Floats, truth: Truth, **more: Any) -> Scores:
+def _scores(found: Estimates, material: Floats, truth: Truth) -> Scores:
     """Return scores of estimates of mu and of probabilities of materials (clips, materials)."""
     of_true = material[np.arange(len(material)), truth.material][:, None]
     rank = (material >= of_true).sum(axis=1) - 1
@@ -117,7 +97,6 @@ def _scores(found: Estimates, material: Floats, truth: Truth, **more: Any) -> Sc
         top_2=measure((rank < 2).astype(float), truth.run),
         bands=parts({f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}),
         sides=parts({f"{side:+d}": truth.landed == side for side in (-1, 1)}),
-        **more,
     )
 
 
@@ -211,13 +190,5 @@ def score_predictions(answers: Sequence[Any], materials: Sequence[str], slots: S
     missing = sorted(set(slots) - set(found))
     if missing:
         raise ValueError(f"every slot of the test set must be answered, and {len(missing)} are not, {missing[0]} first")
-    estimated = Estimates(*np.array([found[slot][1] for slot in slots]).T)
-    inside = (estimated.low <= truth.mu) & (truth.mu <= estimated.high)
-    return _scores(
-        estimated,
-        np.array([found[slot][0] for slot in slots]),
-        truth,
-        given=None,
-        log_likelihood=None,
-        reliability={f"{SHARE:g}": float(inside.mean())},
-    )
+    materials_found, mu_found = (np.array(part) for part in zip(*(found[slot] for slot in slots), strict=True))
+    return _scores(Estimates(*mu_found.T), materials_found, truth)

@@ -76,10 +76,6 @@ class PosteriorNet(nn.Module):
         logits = self.silhouette(torch.stack([x, *still], dim=2).flatten(0, 1))
         return torch.as_tensor(logits.reshape(*crops.shape[:2], *logits.shape[2:]))
 
-    def forward(self, crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return log p(m) and log p(mu | m)."""
-        return self.read(self.features(crops, direction))
-
 
 def _silhouette_net() -> nn.Sequential:
     """Return the layers that find cloth; dilations let every place see most of the crop."""

@@ -76,11 +76,6 @@ class Posterior:
         """Histogram of mu whatever the material, (clips, bins)."""
         return np.asarray(self.joint.sum(axis=1))
 
-    def given(self, material: Integers) -> Floats:
-        """Return the histogram of mu with the material of each clip known, (clips, bins)."""
-        chosen = self.joint[np.arange(len(self)), material] + 1e-300
-        return np.asarray(chosen / chosen.sum(axis=1, keepdims=True))
-
     def log_likelihood(self, material: Integers, mu: Floats) -> Floats:
         """Return log p(m, mu) of the truth, (clips,), with mu a density."""
         density = self.joint[np.arange(len(self)), material, self.bins.place(mu)] / (self.bins.edges[1] - self.bins.low)
@@ -119,10 +114,3 @@ def estimates(histogram: Floats, bins: Bins, share: float = SHARE) -> Estimates:
         first = starts[np.argmin(edges[ends[starts]] - edges[starts])]
         low[clip], high[clip] = edges[first], edges[ends[first]]
     return Estimates(median, low, high)
-
-
-def quantile_of_truth(histogram: Floats, bins: Bins, truth: Floats) -> Floats:
-    """Return the share of the probability that lies below the truth, (clips,): uniform where all is calibrated."""
-    cumulated = np.concatenate([np.zeros((len(histogram), 1)), np.cumsum(histogram, axis=1)], axis=1)
-    rows = [np.interp(value, bins.edges, row / row[-1]) for value, row in zip(truth, cumulated, strict=True)]
-    return np.array(rows)

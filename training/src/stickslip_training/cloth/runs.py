@@ -56,30 +56,21 @@ class Runs:
         codes = np.array([materials.index(name) for name in self.materials])
         return replace(self, materials=materials, material=codes[self.material])
 
-    @property
-    def side(self) -> int:
-        """Vertices along a side of the mesh."""
-        return int(self.positions.shape[2])
-
 
 def load_runs(path: str | Path) -> Runs:
     """Read a packed file; raise ValueError where it is damaged, or none."""
     try:
-        return _load(path)
+        with np.load(path) as file:
+            low, high = file["differences"]
+            about = [json.loads(str(line)) for line in file["about"]]
+            rest, instants = file["rest"], tuple(map(int, file["instants"]))
+        names, mu = [run["material"] for run in about], np.array([run["mu"] for run in about])
     except (BadZipFile, zlib.error, KeyError, EOFError) as error:
         raise ValueError(f"{path} must be a packed file of simulations: {error}") from error
-
-
-def _load(path: str | Path) -> Runs:
-    with np.load(path) as file:
-        low, high = file["differences"]
-        differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
-        positions = np.cumsum(differences, axis=1, dtype=np.int16).astype(np.float32) * np.float32(STEP)
-        about = [json.loads(str(line)) for line in file["about"]]
-        rest, instants = file["rest"], tuple(map(int, file["instants"]))
-    materials = tuple(sorted({run["material"] for run in about}))
-    material = np.array([materials.index(run["material"]) for run in about])
-    mu = np.array([run["mu"] for run in about])
+    differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
+    positions = np.cumsum(differences, axis=1, dtype=np.int16).astype(np.float32) * np.float32(STEP)
+    materials = tuple(sorted(set(names)))
+    material = np.array([materials.index(name) for name in names])
     return _runs(positions, rest, instants, materials, material, mu)
 
 

@@ -79,23 +79,15 @@ class Registration:
 
     def refusals(self) -> list[str]:
         """Return why the video must not be measured, if it must not."""
-        reasons = []
-        if not self.residual <= RESIDUAL_MAX:
-            reasons.append(
-                f"the holders must move as one on their path to within {RESIDUAL_MAX:g} px of a picture 224 px "
-                f"wide, and are {self.residual:.2f} px off"
-            )
-        if not self.timing <= TIMING_MAX:
-            reasons.append(
-                f"the start must be the same in both halves of the video to within {TIMING_MAX:g} s, and differs by "
-                f"{self.timing:.2f} s"
-            )
-        if not abs(self.tilt) <= TILT_MAX:
-            reasons.append(
-                f"the line of the holders must have the calibration's direction to within {TILT_MAX:g} degrees, and "
-                f"is turned by {self.tilt:.1f}"
-            )
-        return reasons
+        rules = {
+            f"the holders must move as one on their path to within {RESIDUAL_MAX:g} px of a picture 224 px wide, and "
+            f"are {self.residual:.2f} px off": self.residual <= RESIDUAL_MAX,
+            f"the start must be the same in both halves of the video to within {TIMING_MAX:g} s, and differs by "
+            f"{self.timing:.2f} s": self.timing <= TIMING_MAX,
+            f"the line of the holders must have the calibration's direction to within {TILT_MAX:g} degrees, and is "
+            f"turned by {self.tilt:.1f}": abs(self.tilt) <= TILT_MAX,
+        }
+        return [rule for rule, holds in rules.items() if not holds]
 
 
 def load_camera(path: str | Path) -> Camera:

@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
-from stickslip_schemas.format.codecs import axes_order, empty_in_order, in_order_of_chunks, packing
+from stickslip_schemas.format.codecs import axes_order, in_order_of_chunks, packing
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     SEAL_NAME,
@@ -181,7 +181,7 @@ class DatasetReader:
     def read_into(self, name: str, slots: Slots, out: Array) -> None:
         """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample shape).
 
-        `out` of clips may also have the order in memory that their chunks have, which is quicker: see `empty`.
+        `out` of clips may also have the order in memory that their chunks have, which is quicker.
 
         Raises:
             ValueError: There is no such array, or `out` has another shape, type or order.
@@ -200,10 +200,6 @@ class DatasetReader:
         for place, slot in enumerate(map(int, slots)):
             self._check_slot(slot)
             self.index.read_sample(array, slot, out[place, ...])
-
-    def empty(self, name: str, count: int) -> Array:
-        """Return an array for `count` samples, with its axes in memory as chunks have them: C-ordered but for clips."""
-        return empty_in_order(self.array(name), count)
 
     def _check_slot(self, slot: int) -> None:
         if not 0 <= slot < len(self):

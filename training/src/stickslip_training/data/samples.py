@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed
+from stickslip_schemas.format.codecs import empty_in_order
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
@@ -169,7 +170,7 @@ class Samples(Dataset[Item]):
         return {name: tensor[:count] for name, tensor in self._ring[place].items()}
 
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
-        return {name: torch.from_numpy(self.reader.empty(name, count)) for name in self._arrays}
+        return {name: torch.from_numpy(empty_in_order(self.reader.array(name), count)) for name in self._arrays}
 
 
 def _for_torch(values: Array) -> Array:

@@ -92,25 +92,35 @@ class EpochReport:
     validation_loss: float | None
 
 
+@dataclass
+class Progress:
+    """What changes during a run, besides the weights and the optimiser."""
+
+    step: int = 0
+    seconds: float = 0.0
+    history: list[EpochReport] = field(default_factory=list)
+    epoch_losses: list[float] = field(default_factory=list)
+    best_step: int = 0
+    """The step whose averaged weights validated best."""
+    best_loss: float = math.inf
+    best: dict[str, torch.Tensor] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Fitted:
     """What came out of a run."""
 
     net: nn.Module
-    """With the averaged weights of the epoch that validated best, ready to estimate."""
-    steps: int
-    seconds: float
-    history: tuple[EpochReport, ...]
-    best_step: int
-    """The step whose weights the network has."""
+    """With the best averaged weights, ready to estimate."""
+    run: Progress
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of every run, as plain values, with the versions that its numbers depend on."""
         return {
-            "steps": self.steps,
-            "best_step": self.best_step,
-            "seconds": round(self.seconds, 3),
-            "history": [asdict(report) for report in self.history],
+            "steps": self.run.step,
+            "best_step": self.run.best_step,
+            "seconds": round(self.run.seconds, 3),
+            "history": [asdict(report) for report in self.run.history],
             "parameters": sum(parameter.numel() for parameter in self.net.parameters()),
             "versions": {
                 "stickslip-training": __version__,
@@ -120,19 +130,6 @@ class Fitted:
                 "scipy": scipy.__version__,
             },
         }
-
-
-@dataclass
-class _State:
-    """What changes during a run, besides the weights and the optimiser."""
-
-    step: int = 0
-    seconds: float = 0.0
-    history: list[EpochReport] = field(default_factory=list)
-    epoch_losses: list[float] = field(default_factory=list)
-    best_step: int = 0
-    best_loss: float = math.inf
-    best: dict[str, torch.Tensor] = field(default_factory=dict)
 
 
 def fit(
@@ -153,25 +150,21 @@ def fit(
         return _Run(learner, settings, out, dict(identity or {}), on_epoch).go(resume)
 
 
+@dataclass
 class _Run:
-    def __init__(
-        self,
-        learner: Learner,
-        settings: FitSettings,
-        out: Path | None,
-        identity: dict[str, Any],
-        on_epoch: Callable[[EpochReport], None] | None,
-    ) -> None:
-        self.learner = learner
-        self.settings = settings
-        self.checkpoint_path = None if out is None else out / CHECKPOINT_NAME
+    learner: Learner
+    settings: FitSettings
+    out: Path | None
+    identity: dict[str, Any]
+    on_epoch: Callable[[EpochReport], None] | None
+
+    def __post_init__(self) -> None:
         kept = ("epoch", "seed", "averaging", "clip")
-        self.identity = identity | {name: getattr(settings, name) for name in kept}
-        self.on_epoch = on_epoch
-        self.net = learner.net.to(settings.device)  # the learner sees it move, and puts its batches there
+        self.identity |= {name: getattr(self.settings, name) for name in kept}
+        self.net = self.learner.net.to(self.settings.device)  # the learner sees it move, and puts its batches there
         self.averaged = copy.deepcopy(self.net).eval()
-        self.optimizer = learner.optimizer(self.net.parameters())
-        self.state = _State()
+        self.optimizer = self.learner.optimizer(self.net.parameters())
+        self.state = Progress()
 
     def go(self, resume: bool) -> Fitted:
         if resume:
@@ -193,7 +186,7 @@ class _Run:
             # checkpoint: a run that goes on from it will end the epoch.
             self._end_epoch()
         self.averaged.load_state_dict(state.best)
-        return Fitted(self.averaged.eval(), state.step, state.seconds, tuple(state.history), state.best_step)
+        return Fitted(self.averaged.eval(), state)
 
     def _step(self) -> None:
         state = self.state
@@ -246,7 +239,7 @@ class _Run:
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _checkpoint(self) -> None:
-        if self.checkpoint_path is None:
+        if self.out is None:
             return
         content = {
             "identity": self.identity,
@@ -255,12 +248,13 @@ class _Run:
             "optimizer": self.optimizer.state_dict(),
             "state": {**vars(self.state), "history": [asdict(report) for report in self.state.history]},
         }
-        save_tensors(self.checkpoint_path, content)
+        save_tensors(self.out / CHECKPOINT_NAME, content)
 
     def _restore(self) -> None:
-        if self.checkpoint_path is None or not self.checkpoint_path.exists():
-            raise ValueError(f"there is nothing to resume: {self.checkpoint_path} does not exist")
-        content = load_tensors(self.checkpoint_path, device=self.settings.device)
+        path = None if self.out is None else self.out / CHECKPOINT_NAME
+        if path is None or not path.exists():
+            raise ValueError(f"there is nothing to resume: {path} does not exist")
+        content = load_tensors(path, device=self.settings.device)
         for name, value in self.identity.items():
             if (stored := content["identity"].get(name)) != value:
                 raise ValueError(f"{name} must be that of the run that is resumed, {stored}, and is {value}")
