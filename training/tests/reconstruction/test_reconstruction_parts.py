@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.reconstruction.refinement import _Problem, draw, samples, start
-from stickslip_training.reconstruction.silhouette import NoRodError, View, silhouette, to_linear
-from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
+from stickslip_training.reconstruction.silhouette import ReconstructionError, View, silhouette, to_linear
+from stickslip_training.reconstruction.starts import follow, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, fit_curve, tube_image
 
 RADIUS = 0.008
@@ -76,7 +76,7 @@ def test_dirt_is_no_rod_and_no_rod_is_an_error():
     dirty[50:52, 5:7] = 1.0
     assert silhouette(to_linear(dirty))[45:56, :10].max() == 0.0
     random = np.random.default_rng(0)
-    with pytest.raises(NoRodError, match="must show a rod brighter than its ground"):
+    with pytest.raises(ReconstructionError, match="must show a rod brighter than its ground"):
         silhouette(to_linear(0.2 + 0.01 * random.standard_normal((64, 64))))
     with pytest.raises(ValueError, match=r"shape \(y, x\), \(y, x, 1\) or \(y, x, 3\); got \(64,\)"):
         to_linear(np.zeros(64))
@@ -165,8 +165,7 @@ def test_the_hull_holds_the_rod_and_little_else(views, line):
     nearest = np.linalg.norm(cloud[:, None] - line, axis=-1).min(axis=1)
     assert np.quantile(nearest, 0.9) < 2.0 * RADIUS
     full = [replace(view, coverage=np.ones_like(view.coverage)) for view in views]
-    with pytest.raises(HullTooLargeError, match="leave room for more than"):
-        visual_hull(full)
+    assert len(visual_hull(full)) == 0
 
 
 def test_the_moving_cylinder_follows_a_gentle_rod(views, line):

@@ -32,9 +32,6 @@ class Measure:
     low: float
     high: float
 
-    def __str__(self) -> str:
-        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Errors:

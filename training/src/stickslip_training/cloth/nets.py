@@ -80,13 +80,7 @@ class PosteriorNet(nn.Module):
 def _silhouette_net() -> nn.Sequential:
     """Return the layers that find cloth; dilations let every place see most of the crop."""
     layers: list[nn.Module] = [nn.PixelUnshuffle(2)]
-    for before, after, stride, dilation in (
-        (12, 32, 1, 1),
-        (32, 48, 2, 1),
-        (48, 48, 1, 1),
-        (48, 48, 1, 2),
-        (48, 48, 1, 4),
-        (48, 48, 1, 1),
-    ):
+    sizes = [(12, 32, 1, 1), (32, 48, 2, 1), *((48, 48, 1, dilation) for dilation in (1, 2, 4, 1))]
+    for before, after, stride, dilation in sizes:
         layers += [nn.Conv2d(before, after, 3, stride, dilation, dilation), nn.GroupNorm(8, after), nn.ReLU()]
     return nn.Sequential(*layers, nn.Conv2d(48, 1, 1))

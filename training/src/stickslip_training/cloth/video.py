@@ -14,6 +14,7 @@ import math
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -200,6 +201,7 @@ def _follow(
         seen = np.array(holders).reshape(2, 2)
     window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
+    flow = partial(cv2.calcOpticalFlowPyrLK, winSize=(window, window), criteria=precise)
     times: list[float] = []
     places: list[Any] = []
     before = kept = None
@@ -213,22 +215,12 @@ def _follow(
                 f"{width} x {height}"
             )
         if before is not None:
-            step, found, _ = cv2.calcOpticalFlowPyrLK(
-                before, picture, place, None, winSize=(window, window), maxLevel=2, criteria=precise
-            )
+            step, found, _ = flow(before, picture, place, None, maxLevel=2)
             if not found.all():
                 raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
             # Errors of steps from frame to frame add up. Those of a match with one kept frame do not.
-            place, found, _ = cv2.calcOpticalFlowPyrLK(
-                kept,
-                picture,
-                kept_place,
-                step.copy(),
-                winSize=(window, window),
-                maxLevel=0,
-                criteria=precise,
-                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            )
+            first = {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+            place, found, _ = flow(kept, picture, kept_place, step.copy(), **first)
             if not found.all() or np.abs(place - step).max() > MATCH_MAX:
                 place, kept, kept_place = step, picture, step
         else:

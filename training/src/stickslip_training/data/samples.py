@@ -112,7 +112,8 @@ class Samples(Dataset[Item]):
         self.slots = self.reader.slots(split)
         """Slot in the dataset of each item, int64 (items,)."""
         self._arrays = tuple(arrays)
-        self._labels = {name: _for_torch(self.reader.label(name)[self.slots]) for name in labels}
+        values = {name: self.reader.label(name)[self.slots] for name in labels}
+        self._labels = {n: v.astype(np.float32 if v.dtype.kind == "f" else np.int64) for n, v in values.items()}
         self.categories = {name: self.reader.categories(name) for name in labels if self.reader.categories(name)}
         """Names of the codes 0, 1, ... of each categorical label."""
         self._ring_length = ring
@@ -171,11 +172,6 @@ class Samples(Dataset[Item]):
 
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
         return {name: torch.from_numpy(empty_in_order(self.reader.array(name), count)) for name in self._arrays}
-
-
-def _for_torch(values: Array) -> Array:
-    """Return labels in the types that models are made for: float32, and int64 for codes."""
-    return values.astype(np.float32 if values.dtype.kind == "f" else np.int64)
 
 
 class Stream:

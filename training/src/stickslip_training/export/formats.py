@@ -153,8 +153,7 @@ def _feature(array: ArrayLayout) -> Any:
         return datasets.Value(array.dtype)
     if len(array.shape) == 1:
         return datasets.Sequence(datasets.Value(array.dtype), length=array.shape[0])
-    of_rank = {2: datasets.Array2D, 3: datasets.Array3D, 4: datasets.Array4D, 5: datasets.Array5D}
-    return of_rank[len(array.shape)](array.shape, array.dtype)
+    return getattr(datasets, f"Array{len(array.shape)}D")(array.shape, array.dtype)
 
 
 def _column(values: Array, kind: Any) -> Any:

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from pydantic import ValidationError
 from stickslip_schemas.spec.cameras import Camera, read_rigs
 
-from stickslip_training.reconstruction.pipeline import Reconstruction, ReconstructionError, reconstruct
+from stickslip_training.reconstruction.pipeline import Reconstruction, reconstruct
+from stickslip_training.reconstruction.silhouette import ReconstructionError
 
 FOUND, TRUE = (0, 255, 255), (255, 60, 255)
 """Colours of centrelines."""

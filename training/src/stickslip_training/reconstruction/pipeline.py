@@ -20,8 +20,8 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
-from stickslip_training.reconstruction.silhouette import NoRodError, View, shrink_image, silhouette, to_linear
-from stickslip_training.reconstruction.starts import HullTooLargeError, follow, moving_cylinder, visual_hull
+from stickslip_training.reconstruction.silhouette import ReconstructionError, View, shrink_image, silhouette, to_linear
+from stickslip_training.reconstruction.starts import follow, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, basis, fit_curve
 
 CONTROL_POINTS = 44
@@ -79,10 +79,6 @@ class Reconstruction:
     def residual_rms(self) -> float:
         """Root mean square of the residuals [px]."""
         return float(np.sqrt(np.nanmean(self.residual**2)))
-
-
-class ReconstructionError(ValueError):
-    """The views do not hold what a reconstruction needs; the message names the view."""
 
 
 def reconstruct(
@@ -157,7 +153,7 @@ def _silhouettes(
             )
         try:
             seen.append(_view(image, camera, length, clamp))
-        except NoRodError as error:
+        except ReconstructionError as error:
             raise ReconstructionError(f"view {camera.name!r}: {error}") from error
     return seen
 
@@ -187,24 +183,14 @@ def _radius(views: Sequence[View]) -> float:
 def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radius: bool) -> list[Fit]:
     """Return the fits of all different starts."""
     lines = follow(views, radius, direction, STARTS)
-    try:
-        by_hull = moving_cylinder(visual_hull(views), radius, direction)
-    except HullTooLargeError:
-        by_hull = np.zeros((1, 3))
+    by_hull = moving_cylinder(visual_hull(views), radius, direction)
     if 0.8 < arc_length(by_hull)[-1] < 1.2:
         lines.append(by_hull)
     coarse_views = [view.shrunk(2) for view in views]
+    starts = [start(fit_curve(line, CONTROL_POINTS), radius, len(views)) for line in lines]
     coarse = [
-        refine(
-            coarse_views,
-            start(fit_curve(line, CONTROL_POINTS), radius, len(views)),
-            direction,
-            extra_blur=1.2,
-            shading=False,
-            fixed_radius=True,
-            iterations=10,
-        )
-        for line in lines
+        refine(coarse_views, fit, direction, extra_blur=1.2, shading=False, fixed_radius=True, iterations=10)
+        for fit in starts
     ]
     kept: list[Fit] = []
     for fit in sorted(coarse, key=lambda fit: fit.cost):

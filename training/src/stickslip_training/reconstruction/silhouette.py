@@ -22,8 +22,8 @@ NOISE_FACTOR = 6.0  # standard deviations of the ground's noise that the brightn
 SMALLEST_PART = 0.02  # of the silhouette's area: smaller bright spots are dirt
 
 
-class NoRodError(ValueError):
-    """The picture shows no rod: nothing stands out from its ground."""
+class ReconstructionError(ValueError):
+    """The views do not hold what a reconstruction needs; the message names the view."""
 
 
 def silhouette(light: Floats) -> Floats:
@@ -39,7 +39,7 @@ def silhouette(light: Floats) -> Floats:
     typical = float(np.sum(signal.clip(0) ** 2) / max(np.sum(signal.clip(0)), 1e-12))  # weighted by itself: the rod's
     floor = max(NOISE_FACTOR * noise, FAINTEST * typical)
     if typical < 2.0 * NOISE_FACTOR * noise or typical < 1e-3:
-        raise NoRodError(
+        raise ReconstructionError(
             f"image must show a rod brighter than its ground; the brightest stands out by {typical:.3g} of linear "
             f"light, noise {noise:.3g}"
         )

@@ -11,18 +11,7 @@ from torch import nn
 
 from stickslip_training.arrays import Array, Integers, SingleFloats
 from stickslip_training.data.reader import DatasetReader, Split
-from stickslip_training.engine.fit import (
-    EpochReport,
-    FitSettings,
-    Learner,
-    check_positive,
-    fit,
-    load_tensors,
-    save_tensors,
-    seeded,
-    torch_threads,
-    write_report,
-)
+from stickslip_training.engine import fit as engine
 from stickslip_training.rods.evaluation import estimate_strains, evaluate, rms, with_white_noise
 
 KIND = "rod_hang"
@@ -111,17 +100,10 @@ class CurvatureNet(nn.Module):
         def convolution(channels_in: int, channels_out: int) -> list[nn.Module]:
             return [nn.Conv1d(channels_in, channels_out, kernel_size=3, padding="same"), nn.ReLU()]
 
-        self.features = nn.Sequential(
-            *convolution(3, 64),
-            *convolution(64, 64),
-            nn.MaxPool1d(3, stride=1),
-            *convolution(64, 128),
-            *convolution(128, 128),
-            nn.MaxPool1d(2, stride=1),
-            *convolution(128, 128),
-            *convolution(128, 128),
-            nn.MaxPool1d(2, stride=1),
-        )
+        blocks: list[nn.Module] = []
+        for before, after, window in ((3, 64, 3), (64, 128, 2), (128, 128, 2)):
+            blocks += [*convolution(before, after), *convolution(after, after), nn.MaxPool1d(window, stride=1)]
+        self.features = nn.Sequential(*blocks)
         self.head = nn.Sequential(
             nn.Flatten(), nn.Linear(128 * (POINTS - 4), 512), nn.ReLU(), nn.Linear(512, POINTS * 3)
         )
@@ -160,7 +142,7 @@ def _positive(scale: torch.Tensor) -> torch.Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CurvatureTraining(FitSettings):
+class CurvatureTraining(engine.FitSettings):
     """Settings of a run; an epoch is a pass over the training rods."""
 
     dataset: str
@@ -187,7 +169,7 @@ class CurvatureTraining(FitSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self, "batch_size", "learning_rate", "evaluation_rods")
+        engine.check_positive(self, "batch_size", "learning_rate", "evaluation_rods")
         if not 0 <= self.noise < 1:
             raise ValueError(f"noise must be a share of L, from 0 to less than 1, and is {self.noise}")
         if not 0 < self.decay < 1:
@@ -195,7 +177,7 @@ class CurvatureTraining(FitSettings):
 
 
 def train_curvature(
-    config: CurvatureTraining, *, resume: bool = False, on_epoch: Callable[[EpochReport], None] | None = None
+    config: CurvatureTraining, *, resume: bool = False, on_epoch: Callable[[engine.EpochReport], None] | None = None
 ) -> dict[str, Any]:
     """Train and evaluate; write the model, a checkpoint and the report below `config.out`, and return the report.
 
@@ -212,8 +194,8 @@ def train_curvature(
     names = ("noise", "batch_size", "learning_rate", "decay")
     identity = {"manifest": digest, **{name: getattr(config, name) for name in names}}
     config = replace(config, epoch=learner.steps_per_epoch)
-    fitted = fit(learner, config, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
-    with torch_threads(config.threads):
+    fitted = engine.fit(learner, config, out=config.out, identity=identity, resume=resume, on_epoch=on_epoch)
+    with engine.torch_threads(config.threads):
         noisy = with_white_noise(rods["test"].centerline, config.noise, (config.seed, TEST))
         methods, test_loss = evaluate(fitted.net, noisy, rods["test"].strains)
     report = {
@@ -229,19 +211,19 @@ def train_curvature(
         "notes": notes,
     }
     content = {"net": fitted.net.state_dict(), "noise": config.noise, "manifest": digest}
-    save_tensors(config.out / "model.pt", content)
-    write_report(config.out, report)
+    engine.save_tensors(config.out / "model.pt", content)
+    engine.write_report(config.out, report)
     return report
 
 
 def load_model(path: str | Path) -> CurvatureNet:
     """Return the network of a `model.pt`, ready to estimate."""
     net = CurvatureNet()
-    net.load_state_dict(load_tensors(path)["net"])
+    net.load_state_dict(engine.load_tensors(path)["net"])
     return net.eval()
 
 
-class _CurvatureLearner(Learner):
+class _CurvatureLearner(engine.Learner):
     """Passes over the training rods in random orders; noise is drawn afresh at every step."""
 
     def __init__(self, config: CurvatureTraining, train: Rods, validation: Rods) -> None:
@@ -250,7 +232,7 @@ class _CurvatureLearner(Learner):
         self.validation = validation
         self.noisy_validation = with_white_noise(validation.centerline, config.noise, (config.seed, VALIDATION))
         self.steps_per_epoch = -(-len(train) // config.batch_size)
-        with seeded(config.seed):
+        with engine.seeded(config.seed):
             self.net = CurvatureNet()
         self.net.standardise(torch.from_numpy(train.centerline), torch.from_numpy(train.strains), config.noise)
 

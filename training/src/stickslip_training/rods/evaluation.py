@@ -12,7 +12,6 @@ see. So errors that compare methods are errors of |kappa|.
 import time
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -68,22 +67,14 @@ def _curvature(first: Floats, second: Floats) -> Floats:
     return np.asarray(np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3)
 
 
-class _SplineBasis(NamedTuple):
-    """Splines that are orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a
-    [Demmler, Reinsch 1975]: in this basis smoothing is a division, and every lambda can be tried on every curve.
-    """
-
-    value: Floats
-    """At the points, (points, basis)."""
-    first: Floats
-    second: Floats
-    weight: Floats
-    """a, (basis,)."""
-
-
 @cache
-def _spline_basis(points: int, order: int) -> _SplineBasis:
-    """Return the basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]."""
+def _spline_basis(points: int, order: int) -> tuple[Floats, ...]:
+    """Return a basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]: values, first and
+    second derivatives at the points, (points, basis) each, and a, (basis,).
+
+    It is orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a [Demmler, Reinsch 1975]:
+    smoothing is a division in it, and every lambda can be tried on every curve.
+    """
     degree = 2 * order - 1
     s = np.linspace(0.0, 1.0, points)
     knots = np.concatenate([np.zeros(degree), s, np.ones(degree)])
@@ -96,7 +87,7 @@ def _spline_basis(points: int, order: int) -> _SplineBasis:
     P = D.T @ (np.tile(h * weights / 2, points - 1)[:, None] * D)
     P *= np.trace(B.T @ B) / np.trace(P)  # the scale of lambda is free, and rounding is least where the two are alike
     weight, V = eigh(B.T @ B, B.T @ B + P)
-    return _SplineBasis(B @ V, splines.derivative(1)(s) @ V, splines.derivative(2)(s) @ V, np.clip(weight, 0.0, 1.0))
+    return B @ V, splines.derivative(1)(s) @ V, splines.derivative(2)(s) @ V, np.clip(weight, 0.0, 1.0)
 
 
 _SMOOTHING = np.geomspace(1e-3, 1e16, 400)
@@ -113,10 +104,9 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
     """
     x = np.asarray(centerline, dtype=np.float64)
     points = x.shape[-2]
-    basis = _spline_basis(points, order)
-    a = basis.weight
+    basis, first, second, a = _spline_basis(points, order)
     y = x.swapaxes(-1, -2).reshape(-1, points)
-    z = y @ basis.value
+    z = y @ basis
     power = np.square(y).sum(axis=1)
     best, smoothing = np.full(len(y), np.inf), np.zeros(len(y))
     for candidate in _SMOOTHING:
@@ -129,11 +119,7 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
         better = score < best
         best[better], smoothing[better] = score[better], candidate
     c = z / (a + smoothing[:, None] * (1.0 - a))
-    first, second = (
-        (c @ derivative.T).reshape(*x.shape[:-2], 3, points).swapaxes(-1, -2)
-        for derivative in (basis.first, basis.second)
-    )
-    return _curvature(first, second)
+    return _curvature(*((c @ each.T).reshape(*x.shape[:-2], 3, points).swapaxes(-1, -2) for each in (first, second)))
 
 
 # --- errors ---------------------------------------------------------------------------------------------------
