@@ -23,6 +23,7 @@ SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "
 """Fixtures that start a server, and the group of the tests that share it. These tests are marked `real`."""
 
 CPU_SECONDS = pytest.StashKey[float]()
+LAST_OF = pytest.StashKey[list[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -64,6 +65,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         turn = (mark is None, -patience.args[0] if patience else 0, *is_other)
         turns[item.path] = min(turn, turns.get(item.path, turn))
     items.sort(key=lambda item: turns[item.path])
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Note the last test of each server."""
+    last = {name: item for item in session.items for name in SERVERS if name in item._fixtureinfo.name2fixturedefs}
+    for name, item in last.items():
+        item.stash.setdefault(LAST_OF, []).append(name)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Stop a server when its last test is over: Ray takes a tenth of a processor while nobody uses it."""
+    yield
+    for name in item.stash.get(LAST_OF, ()):
+        item._fixtureinfo.name2fixturedefs[name][-1].finish(item._request)
 
 
 @pytest.hookimpl(wrapper=True)
