@@ -26,10 +26,10 @@ import numpy as np  # noqa: E402
 import numpy.typing as npt  # noqa: E402
 from stickslip_schemas.spec.cameras import load_rig  # noqa: E402
 from stickslip_sim_core import solve_general_rods, solve_rods  # noqa: E402
-from stickslip_training.reconstruction import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.photographs import save_overlay  # noqa: E402
-from stickslip_training.reconstruction.silhouette import View, silhouette, to_linear  # noqa: E402
+from stickslip_training.reconstruction.pipeline import Reconstruction, Verdict, reconstruct  # noqa: E402
 from stickslip_training.reconstruction.starts import moving_cylinder, visual_hull  # noqa: E402
+from stickslip_training.reconstruction.views import View, silhouette, to_linear  # noqa: E402
 
 Floats = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from stickslip_schemas.format.manifest import Contents
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.sources import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError
-from stickslip_training.export.content import Content
+from stickslip_training.export.formats import Content
 
 SELECTION = Selection(arrays=("video",), where=("material==gray-interlock",))
 

@@ -12,8 +12,8 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import content as content_module
-from stickslip_training.export.content import Content
+from stickslip_training.export import formats as content_module
+from stickslip_training.export.formats import Content
 from typer.testing import CliRunner
 
 run = CliRunner().invoke

@@ -9,8 +9,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_training.cli import app
-from stickslip_training.reconstruction import ReconstructionError, Verdict, reconstruct
 from stickslip_training.reconstruction.photographs import read_calibration, reconstruct_folder
+from stickslip_training.reconstruction.pipeline import Verdict, reconstruct
+from stickslip_training.reconstruction.views import ReconstructionError
 from typer.testing import CliRunner
 
 RIG = load_rig("rod-4")

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_training.reconstruction.refinement import _Problem, draw, samples, start
-from stickslip_training.reconstruction.silhouette import ReconstructionError, View, silhouette, to_linear
 from stickslip_training.reconstruction.starts import follow, moving_cylinder, visual_hull
-from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, fit_curve, tube_image
+from stickslip_training.reconstruction.views import (
+    ReconstructionError,
+    View,
+    arc_length,
+    at_uniform_arc_length,
+    fit_curve,
+    silhouette,
+    to_linear,
+    tube_image,
+)
 
 RADIUS = 0.008
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -21,7 +21,6 @@ import numpy as np
 from stickslip_schemas.base import canonical_json, sha256
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.store import write_durably
 
 from stickslip_training.arrays import Array, Integers
 from stickslip_training.benchmark.tasks import ClothTask, RodTask, Task
@@ -127,10 +126,8 @@ class Record:
     """SHA-256 of the file of answers."""
     scores: dict[str, Any]
 
-    def write(self, path: Path) -> None:
-        """Write the record as JSON, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, (json.dumps(_rounded(asdict(self)), indent=1, allow_nan=False) + "\n").encode())
+    def document(self) -> bytes:
+        return (json.dumps(asdict(self), indent=1, allow_nan=False) + "\n").encode()
 
 
 def enter(

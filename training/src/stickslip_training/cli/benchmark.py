@@ -96,7 +96,8 @@ def score(
     with readable_errors():
         entry = enter(name, predictions, dataset, method=method, by=by, trained_on=trained_on, link=link)
         if record is not None:
-            entry.write(record)
+            record.parent.mkdir(parents=True, exist_ok=True)
+            write_durably(record, entry.document())
         typer.echo(table(name, [entry]))
 
 

@@ -18,7 +18,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.sources import DatasetError
 from stickslip_training.export import formats, lerobot
-from stickslip_training.export.content import Content, OnBytes, made_whole, to_directory
+from stickslip_training.export.formats import Content, OnBytes, made_whole, to_directory
 
 if TYPE_CHECKING:
     from stickslip_training.engine.fit import EpochReport

@@ -122,13 +122,8 @@ class Fitted:
             "seconds": round(self.run.seconds, 3),
             "history": [asdict(report) for report in self.run.history],
             "parameters": sum(parameter.numel() for parameter in self.net.parameters()),
-            "versions": {
-                "stickslip-training": __version__,
-                "python": platform.python_version(),
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-                "scipy": scipy.__version__,
-            },
+            "versions": {"stickslip-training": __version__, "python": platform.python_version()}
+            | {library.__name__: str(library.__version__) for library in (torch, np, scipy)},
         }
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.arrays import Array
-from stickslip_training.export.content import Content, OnBytes
+from stickslip_training.export.formats import Content, OnBytes
 
 FILES = 1000
 """Files of a folder."""
@@ -30,7 +30,6 @@ KEY_FRAMES = 10
 
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 NEEDED = ("video", "holder_pose", "grasped")
 _POSE = ("x", "y", "z", "xx", "yx", "zx", "xy", "yy", "zy")
 _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
@@ -99,7 +98,7 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
                 **{f"stats/{name}/{key}": value for name, own in stats.items() for key, value in own.items()},
             }
         )
-    path = directory / EPISODES.format(chunk_index=0, file_index=0)
+    path = directory / "meta/episodes/chunk-000/file-000.parquet"
     path.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), path)
     pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(directory / "meta" / "tasks.parquet")

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from stickslip_schemas.spec.cameras import Camera, read_rigs
 
 from stickslip_training.reconstruction.pipeline import Reconstruction, reconstruct
-from stickslip_training.reconstruction.silhouette import ReconstructionError
+from stickslip_training.reconstruction.views import ReconstructionError
 
 FOUND, TRUE = (0, 255, 255), (255, 60, 255)
 """Colours of centrelines."""
@@ -76,25 +76,17 @@ class FolderReconstruction:
 
 
 def reconstruct_folder(
-    folder: str | Path,
-    calibration: str | Path,
-    *,
-    length: float,
-    clamp: npt.ArrayLike = (0.0, 0.0, 0.0),
-    direction: npt.ArrayLike = (0.0, 0.0, -1.0),
-    rig: str | None = None,
-    points: int = 150,
-    radius: float | None = None,
+    folder: str | Path, calibration: str | Path, *, length: float, rig: str | None = None, **options: Any
 ) -> FolderReconstruction:
     """Reconstruct the rod in the photographs of a folder.
 
     The calibration is laid out as `rigs/rod-4.toml` of the schemas; `rig` says which of its rigs, if it has several.
-    Lengths and positions are in its unit. Photographs must have been freed of lens distortion.
+    Lengths and positions are in its unit; `options` are those of `reconstruct`. Photographs must have been freed of
+    lens distortion.
     """
     cameras = read_calibration(calibration, rig)
     views = [read_photograph(Path(folder), camera) for camera in cameras]
-    found = reconstruct(views, cameras, length=length, clamp=clamp, direction=direction, points=points, radius=radius)
-    return FolderReconstruction(found, cameras, views, length)
+    return FolderReconstruction(reconstruct(views, cameras, length=length, **options), cameras, views, length)
 
 
 def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, ...]:

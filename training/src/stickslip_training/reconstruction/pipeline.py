@@ -20,9 +20,18 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
-from stickslip_training.reconstruction.silhouette import ReconstructionError, View, shrink_image, silhouette, to_linear
 from stickslip_training.reconstruction.starts import follow, moving_cylinder, visual_hull
-from stickslip_training.reconstruction.tube_image import arc_length, at_uniform_arc_length, basis, fit_curve
+from stickslip_training.reconstruction.views import (
+    ReconstructionError,
+    View,
+    arc_length,
+    at_uniform_arc_length,
+    basis,
+    fit_curve,
+    shrink_image,
+    silhouette,
+    to_linear,
+)
 
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined

@@ -18,8 +18,7 @@ from scipy import ndimage
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stickslip_training.arrays import Floats
-from stickslip_training.reconstruction.silhouette import View
-from stickslip_training.reconstruction.tube_image import TubeImage, basis, tube_image
+from stickslip_training.reconstruction.views import TubeImage, View, basis, tube_image
 
 PIXEL = 0.12  # of the brightness of the rod: what a pixel may be off
 ROBUST = 3.0  # in units of PIXEL: beyond it a pixel's pull falls again

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from stickslip_training.arrays import Floats
-from stickslip_training.reconstruction.silhouette import View
+from stickslip_training.reconstruction.views import View
 
 STEPS = 100
 BEAM = 200  # ways that are kept
