@@ -27,7 +27,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from stickslip_schemas.base import referred, sha256
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 from stickslip_schemas.scene.parts import FileMesh
@@ -145,7 +144,7 @@ def row(name: str, samples: int, seconds: float, *, coarse: bool, defaults: bool
     made = spec(name, samples, files, coarse=coarse, defaults=defaults)
     stage = made.stage
     found: list[dict[str, Any]] = []
-    for point in grid(made):
+    for point in made.grid():
         if sum(each["cpu"] for each in found) > seconds:
             break
         values = {key: value for key, value in point.items() if key in stage.parameters}

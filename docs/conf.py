@@ -24,7 +24,7 @@ autodoc_typehints = "signature"
 MODULES = (
     "stickslip",
     "stickslip_schemas.kinds",
-    "stickslip_schemas.plan.grid",
+    "stickslip_schemas.spec.jobs",
     "stickslip_sim_core",
     "stickslip_sim_core.protocols",
     "stickslip_training.data.reader",

@@ -22,7 +22,6 @@ from PIL import Image
 from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, SimulateOutput, SimulateTask
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 from stickslip_schemas.spec.appearance import CLIP_SIZE
 from stickslip_schemas.spec.cameras import FRAMING
@@ -52,7 +51,7 @@ def strip(name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views:
             "axes": {"texture": "checker", "viewpoint": views if all_views else VIEW, **axes},
         }
     )
-    points = list(grid(spec))
+    points = list(spec.grid())
     with TemporaryDirectory(prefix="stickslip-gallery-") as store:
         for data in built_in_files().values():
             open_store(store).publish(data)

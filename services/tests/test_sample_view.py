@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stickslip_schemas.format.manifest import layout, samples_per_file
+from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
 from stickslip_services.pages.browsing import coloured, mp4, sample_view, sliders, thumbs
@@ -23,7 +22,7 @@ def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:
     known = {name: np.zeros(array.shape, dtype=array.dtype) for name, array in arrays.items()} | (values or {})
     return SimpleNamespace(
         arrays=arrays,
-        manifest=SimpleNamespace(spec=parsed, samples_per_file=lambda array: samples_per_file(array, parsed)),
+        manifest=SimpleNamespace(spec=parsed),
         read=lambda name, _slot: known[name],
         named=lambda array, value: array.categories[value] if array.categories else value.tolist(),
         store=SimpleNamespace(read=built_in_files().__getitem__),
@@ -91,7 +90,7 @@ def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
         "viewpoint": "left",
     }
     data = sample(kind="cloth_drag", axes=axes)
-    points = list(grid(data.manifest.spec))
+    points = list(data.manifest.spec.grid())
     columns = {name: np.array([point[name] for point in points]) for name in ("mu", "material", "texture")}
     for name in ("material", "texture"):
         columns[name] = np.array([data.arrays[name].categories.index(value) for value in columns[name]])

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import zarr
 from stickslip_schemas.base import Reason, sha256
-from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry, Manifest, Rejection, layout, samples_per_file
+from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry, Manifest, Rejection, layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
 from stickslip_testing.samples import samples
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
@@ -91,7 +90,7 @@ def write_dataset(
             values = arrays[array.name].copy()
             if array.name not in ("valid", "split", "sample_key"):
                 values[~valid] = array.fill
-            _write_array(group, array, values, samples_per_file(array, spec))
+            _write_array(group, array, values, spec.samples_per_file(array))
             arrays[array.name] = values
         zarr.consolidate_metadata(group.store)
     files = sorted(path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json")
@@ -100,7 +99,7 @@ def write_dataset(
         for path in files
     )
     manifest = Manifest(
-        dataset=dataset_id(spec),
+        dataset=spec.dataset_id,
         version=1,
         spec=spec,
         spec_digest=spec.content_digest,

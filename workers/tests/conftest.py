@@ -17,7 +17,6 @@ from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.format.manifest import FileEntry, Rejection, layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import DirectoryStore
 from stickslip_testing.samples import samples
 from stickslip_workers.cluster import Place, own_directory
@@ -62,7 +61,7 @@ class Made:
     def publish(self) -> Path:
         """Pack and publish, and return the directory."""
         publish(self.publish_task, self.store)
-        return self.store.dataset_path(dataset_id(self.spec), 1)
+        return self.store.dataset_path(self.spec.dataset_id, 1)
 
 
 @pytest.fixture

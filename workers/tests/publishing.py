@@ -6,7 +6,6 @@ from typing import Any
 from stickslip_schemas.documents.tasks import PackOutput, PublishSection, PublishTask
 from stickslip_schemas.format.manifest import Rejection, section_samples
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 
@@ -31,7 +30,7 @@ def publish_task(
             labels=tuple(output.labels for output in shards),
         )
         sections.append(store.publish(section.model_dump_json().encode()))
-    return PublishTask(spec=spec, dataset=dataset_id(spec), version=1, builds=builds, sections=tuple(sections))
+    return PublishTask(spec=spec, dataset=spec.dataset_id, version=1, builds=builds, sections=tuple(sections))
 
 
 def changed(task: PublishTask, store: Store, **changes: Any) -> PublishTask:

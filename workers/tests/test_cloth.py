@@ -20,7 +20,6 @@ from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejectio
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.cameras import load_rig
@@ -279,7 +278,7 @@ def test_files_are_those_of_zarr_python(
 def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], store: DirectoryStore) -> None:
     made = make_clips(rejected=(3,))
     publish(made.publish_task([pack(task, store) for task in made.pack_tasks]), store)
-    directory = store.dataset_path(dataset_id(made.spec), 1)
+    directory = store.dataset_path(made.spec.dataset_id, 1)
     group = zarr.open_group(directory, mode="r")
     with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
         for name, expected in made.arrays.items():

@@ -10,7 +10,7 @@ from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
-from stickslip_workers.batches import merged, shading_of, split
+from stickslip_workers.calls import merged, shading_of, split
 from stickslip_workers.dispatcher import process_failure
 from stickslip_workers.stages.run import MESSAGE_LENGTH, failure
 

@@ -25,7 +25,6 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.plan.points import KeyedPoint, keyed_points
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -73,7 +72,7 @@ class Version:
             self.stored[path] = section.model_dump_json().encode()
             listed.append(_entry(path, self.stored[path]))
         self.document: dict[str, Any] = {
-            "dataset": dataset_id(self.spec),
+            "dataset": self.spec.dataset_id,
             "version": 1,
             "spec": self.spec,
             "spec_digest": self.spec.content_digest,

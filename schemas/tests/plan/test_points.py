@@ -10,7 +10,6 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.plan import points as plan
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.plan.points import KeyedPoint, keyed_points, publish_key, shards
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.jobs import JobSpec
@@ -81,8 +80,8 @@ def test_a_name_is_no_content_and_a_build_makes_no_other_dataset() -> None:
             {"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}, **more}
         )
 
-    assert dataset_id(spec(name="a")) == dataset_id(spec(name="b"))  # type: ignore[arg-type]
-    assert dataset_id(spec(seed=1)) != dataset_id(spec())  # type: ignore[arg-type]
+    assert spec(name="a").dataset_id == spec(name="b").dataset_id  # type: ignore[arg-type]
+    assert spec(seed=1).dataset_id != spec().dataset_id  # type: ignore[arg-type]
 
 
 def test_neighbours_in_the_grid_change_no_sample() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 from stickslip_schemas.base import content_key, derived_seed
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.jobs import JobSpec, Render, Simulation
 
 
@@ -32,7 +31,7 @@ class Sample:
 def samples(spec: JobSpec, builds: Builds) -> Iterator[Sample]:
     """Yield the samples of `spec` as `builds` would make them."""
     registered(spec)
-    for slot, point in enumerate(grid(spec)):
+    for slot, point in enumerate(spec.grid()):
         simulation, render = spec.simulation(point), spec.render(point)
         key = simulation_key(simulation, builds)
         yield Sample(

@@ -44,7 +44,6 @@ from stickslip_schemas.format.manifest import (
     ManifestSection,
     has_sections,
     layout,
-    samples_per_file,
     seal_text,
     section_path,
     with_manifest_digest,
@@ -252,7 +251,7 @@ class PretendWorker:
                 columns[array.name].append(bytes(decode_chunk(data[offset : offset + length])))
         for array in labels:
             values = b"".join(columns[array.name])
-            size = samples_per_file(array, task.spec) * array.sample_bytes
+            size = task.spec.samples_per_file(array) * array.sample_bytes
             for number in range(-(-len(values) // size)):
                 data = encode_chunk(values[number * size : (number + 1) * size].ljust(size, b"\0"))
                 yield FileEntry(path=array.shard_path(number), sha256=self.store.publish(data), size=len(data))

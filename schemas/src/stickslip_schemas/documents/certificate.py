@@ -123,7 +123,6 @@ class Certificate(Document):
         return self.passed and self.extent == "full"
 
     def canonical(self) -> bytes:
-        """Return the document as it is written."""
         return canonical_json(self.model_dump(mode="json")).encode()
 
     @model_validator(mode="after")

@@ -19,7 +19,6 @@ from pydantic import Field, model_validator
 from stickslip_schemas.base import Document, Int, Reason, Sha256, sha256
 from stickslip_schemas.kinds import AnyJobSpec, registered
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, FORMAT, ArrayLayout
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.jobs import JobSpec, Quality
@@ -28,14 +27,6 @@ from stickslip_schemas.spec.jobs import JobSpec, Quality
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
     """Return the arrays of the dataset of `spec`; raise UnknownKindError where nobody registered its class."""
     return (*registered(spec).arrays(), *COMMON_ARRAYS)
-
-
-def samples_per_file(array: ArrayLayout, spec: JobSpec) -> int:
-    """Return the number of consecutive samples in every file of an array except the last."""
-    if array.is_label:
-        most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
-        return min(most, arrays.LABEL_SAMPLES, spec.sample_count)
-    return spec.samples_per_shard
 
 
 def bytes_estimate(spec: JobSpec) -> int:
@@ -101,7 +92,6 @@ class ManifestSection(Document):
 
     @property
     def end(self) -> int:
-        """The slot after the last one."""
         return self.first + len(self.sample_keys)
 
 
@@ -178,10 +168,6 @@ class Manifest(Document):
         if self.sample_keys or self.rejections:
             raise ValueError("sample_keys and rejections must be empty, for there are sections, which have them")
         return self
-
-    def samples_per_file(self, array: ArrayLayout) -> int:
-        """Return the number of consecutive samples in every file of an array except the last."""
-        return samples_per_file(array, self.spec)
 
     @property
     def acceptance_rate(self) -> float:

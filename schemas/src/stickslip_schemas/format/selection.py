@@ -104,10 +104,10 @@ def part_files(contents: Contents, selection: Selection, label: Labels | None) -
         if array.is_label or slots is not None:
             paths.add(f"{array.name}/{GROUP_NAME}")
         if array.is_label:
-            count = -(-manifest.sample_count // manifest.samples_per_file(array))
+            count = -(-manifest.sample_count // manifest.spec.samples_per_file(array))
             paths.update(array.shard_path(number) for number in range(count))
         elif slots is not None:
-            paths.update(map(array.shard_path, np.unique(slots // manifest.samples_per_file(array)).tolist()))
+            paths.update(map(array.shard_path, np.unique(slots // manifest.spec.samples_per_file(array)).tolist()))
     found = [file for file in manifest.files if file.path in paths or file.path.split("/")[0] not in names]
     if manifest.sections and label is not None:
         for number in sections_of(contents, selection, label):

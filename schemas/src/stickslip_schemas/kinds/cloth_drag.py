@@ -150,7 +150,6 @@ class ClothDragSpec(ClipSpec):
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Return the protocols of contact where self-contact is on."""
         return () if self.self_friction is None else CONTACT_PROTOCOLS
 
     @property

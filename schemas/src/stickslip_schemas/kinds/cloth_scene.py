@@ -140,8 +140,6 @@ class ClothSceneSpec(ClipSpec):
     )
     axes: ClothSceneAxes
 
-    # --- rules --------------------------------------------------------------------------------------------
-
     @field_validator("set")
     @classmethod
     def _can_be_set(cls, values: dict[str, JsonValue], info: ValidationInfo) -> dict[str, JsonValue]:
@@ -186,8 +184,6 @@ class ClothSceneSpec(ClipSpec):
         for one, other in combinations(ends, 2):
             yield from ({one: a, other: b} for a, b in product(ends[one], ends[other]))
 
-    # --- the scene ----------------------------------------------------------------------------------------
-
     @cached_property
     def stage(self) -> Scene:
         """The scene with the values of `set`."""
@@ -226,10 +222,7 @@ class ClothSceneSpec(ClipSpec):
     def segments(self) -> tuple[str, ...]:
         return scene_segments(self.stage.sheets, self.stage.bodies)
 
-    # --- documents ----------------------------------------------------------------------------------------
-
     def fields_of(self, axis: str) -> tuple[str, ...]:
-        """Return the fields of documents that an axis sets; those of a parameter are places in the scene."""
         return self._places.get(axis) or super().fields_of(axis)
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
@@ -280,7 +273,6 @@ class ClothSceneSpec(ClipSpec):
         return (*super().built_in(axis), *self._own.get(axis, {}))
 
     def meaning(self, axis: str, name: str) -> Any:
-        """Return what the spec or the scene has defined a name of an axis to be."""
         return super().meaning(axis, name) or self._own.get(axis, {}).get(name)
 
     def cameras(self) -> tuple[Camera, ...]:
@@ -293,8 +285,6 @@ class ClothSceneSpec(ClipSpec):
     def artifacts(self) -> dict[str, Sha256]:
         files = ((place, referred(name)) for place, name in self.scene.files())
         return {"/".join(("/scene", *map(str, place))): digest for place, digest in files if digest} | super().artifacts
-
-    # --- certificate, cost, arrays ------------------------------------------------------------------------
 
     @property
     def certified_preset(self) -> str:

@@ -74,7 +74,6 @@ class RodHangSpec(JobSpec):
 
     @property
     def certified_preset(self) -> str:
-        """The rod solver has one set of numbers."""
         return ROD_PRESET
 
     @property
@@ -92,7 +91,6 @@ class RodHangSpec(JobSpec):
 
     @property
     def usual_costs(self) -> Costs:
-        """Usual CPU times; four views are a render."""
         view = {"preview": 0.016, "draft": 0.026, "standard": 0.055, "high": 0.18}[self.quality]
         return Costs(simulate=0.005, render=4 * view)
 

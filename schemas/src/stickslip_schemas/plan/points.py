@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from stickslip_schemas.base import Document, canonical_json, content_key, keyed_text, placed, seed_of_key, sha256
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.grid import columns_of, combined
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
 
@@ -44,8 +43,8 @@ def keyed_points(spec: JobSpec, builds: Builds, *, first: int = 0) -> Iterator[K
     """
     registered(spec)
     names = tuple(spec.named_axes)
-    columns = columns_of(spec)
-    some = dict(zip(names, next(combined(spec, columns)), strict=True))
+    columns = spec.columns()
+    some = dict(zip(names, next(spec.combined(columns)), strict=True))
     simulation = _Template.of(spec, spec.simulation(some), some, spec.simulation_seeds)
     shown = spec.render(some)
     render = None if shown is None else _Template.of(spec, shown, some, spec.render_seeds)
@@ -66,7 +65,7 @@ def keyed_points(spec: JobSpec, builds: Builds, *, first: int = 0) -> Iterator[K
     # A zipped axis may have a million values, of which each is needed once: its texts are made when it comes.
     start = first if spec.combine == "zip" else 0
     filled = [_filled(spec, name, column[start:]) for name, column in zip(names, columns, strict=True)]
-    for slot, cells in enumerate(islice(combined(spec, filled), first - start, None), start=first):
+    for slot, cells in enumerate(islice(spec.combined(filled), first - start, None), start=first):
         point: dict[str, Any] = {}
         texts: dict[str, str] = {}
         for name, (value, own) in zip(names, cells, strict=True):
@@ -164,7 +163,6 @@ class _Template(NamedTuple):
         )
 
     def draw(self, texts: dict[str, str]) -> None:
-        """Fill in the seeds of a point."""
         for hole, text in self.seeds:
             texts[hole] = str(_seed_of(text % texts))
 

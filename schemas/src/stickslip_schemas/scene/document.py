@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from stickslip_schemas.base import Document, Float, content_key
-from stickslip_schemas.scene.looks import Looks
 from stickslip_schemas.scene.parameters import (
     Parameter,
     ParameterName,
@@ -24,6 +23,7 @@ from stickslip_schemas.scene.parts import (
     Body,
     FileMesh,
     FromFile,
+    Looks,
     MeshBody,
     Motion,
     Plane,

@@ -3,9 +3,10 @@
 This module holds what all kinds have in common. A kind itself is one module of `stickslip_schemas.kinds`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from functools import cached_property
+from itertools import product
 from math import prod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
@@ -13,8 +14,9 @@ from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base import Document, Float, Int, Sha256, Stage, content_key, derived_seed, placed
+from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
-from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed
+from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed, axis_values
 from stickslip_schemas.spec.cameras import Camera
 
 D = TypeVar("D", bound=Document)
@@ -170,8 +172,6 @@ class JobSpec(Document):
         axes: Document
         quality: Quality
 
-    # --- defined by each kind ---------------------------------------------------------------------------
-
     @property
     def certified_preset(self) -> str:
         """Name of the preset whose certificate vouches for the samples."""
@@ -228,8 +228,6 @@ class JobSpec(Document):
         """Artifacts that the spec names and that have to be in the store, by JSON pointers into the spec."""
         return {}
 
-    # --- derived -------------------------------------------------------------------------------------
-
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
         """The axes by name, in the order in which a product is run through (the last one fastest)."""
@@ -250,6 +248,32 @@ class JobSpec(Document):
     def arrays_digest(self) -> str:
         """Key of the arrays of the dataset: their shapes, types, fill values and the names of their codes."""
         return content_key("arrays", [array.identity for array in (*self.arrays(), *COMMON_ARRAYS)])
+
+    @property
+    def dataset_id(self) -> str:
+        """Id of the dataset that answers the spec: the same spec has the same dataset, in any build."""
+        return f"ds-{self.content_digest[:16]}"
+
+    def columns(self) -> list[list[Any]]:
+        """Return the values of each axis, in order."""
+        axes = enumerate(self.named_axes.values())
+        return [axis_values(axis, dimension=place if self.combine == "zip" else 0) for place, axis in axes]
+
+    def combined(self, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[Any, ...]]:
+        """Combine one column of cells for each axis as the spec says: all with all, or row by row."""
+        return zip(*columns, strict=True) if self.combine == "zip" else product(*columns)
+
+    def grid(self) -> Iterator[dict[str, Any]]:
+        """Yield the point of the parameter grid of each sample, in the order of the slots."""
+        for point in self.combined(self.columns()):
+            yield dict(zip(self.named_axes, point, strict=True))
+
+    def samples_per_file(self, array: ArrayLayout) -> int:
+        """Return the number of consecutive samples in every file of an array except the last."""
+        if array.is_label:
+            most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
+            return min(most, arrays.LABEL_SAMPLES, self.sample_count)
+        return self.samples_per_shard
 
     def simulation(self, point: Mapping[str, Any]) -> Simulation:
         """Return what to simulate at a point of the grid."""

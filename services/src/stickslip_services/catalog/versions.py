@@ -19,7 +19,6 @@ from stickslip_schemas.format.manifest import (
     check_seal,
     seal_text,
 )
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
 from stickslip_services.client.signing import is_signature, sign
@@ -48,7 +47,7 @@ def read_version(store: Store, output: PublishOutput) -> Manifest:
     check_seal(*map(store.read, sealed_digests(output.manifest, output.group).values()))
     contents = stored_contents(store, output.manifest)
     manifest = contents.manifest
-    if dataset_id(manifest.spec) != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
+    if manifest.spec.dataset_id != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
         raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
     files = list(contents.files())
     sizes = in_parallel(lambda file: store.size(file.sha256), files, at_once=HEADS_AT_ONCE)

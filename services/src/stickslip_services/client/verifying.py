@@ -66,7 +66,7 @@ def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]
     from stickslip_schemas.format.codecs import decode_chunk
 
     array = next(array for array in layout(manifest.spec) if array.name == name)
-    numbers = range(-(-manifest.sample_count // manifest.samples_per_file(array)))
+    numbers = range(-(-manifest.sample_count // manifest.spec.samples_per_file(array)))
     content = b"".join(bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers)
     return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[: manifest.sample_count]
 
@@ -160,7 +160,7 @@ def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int])
     for number in numbers:
         section = contents.section(number)
         if stored[section.first : section.end].tobytes() != bytes.fromhex("".join(section.sample_keys)):
-            path = array.shard_path(section.first // manifest.samples_per_file(array))
+            path = array.shard_path(section.first // manifest.spec.samples_per_file(array))
             slots = f"slots {section.first} to {section.end - 1}"
             faults.append(Fault(path, "sample_key", f"{slots} have other keys than the manifest says"))
     return faults

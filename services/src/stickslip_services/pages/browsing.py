@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.kinds.cloth.arrays import clip_arrays, solver_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
-from stickslip_schemas.plan.grid import columns_of
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -29,7 +28,7 @@ GROUPS = ("Parameters", "Looks", "Physics", "Checks")
 def sliders(spec: JobSpec) -> list[dict[str, Any]]:
     """Return the names of the axes with more than one value, and at most `STOPS` of their values, in order."""
     found = []
-    for name, column in zip(spec.named_axes, columns_of(spec), strict=True):
+    for name, column in zip(spec.named_axes, spec.columns(), strict=True):
         values = sorted(set(column))
         stops = (
             np.unique(np.linspace(0, len(values) - 1, STOPS).astype(int)) if len(values) > STOPS else range(len(values))
@@ -139,7 +138,7 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
     frames = list(range(data.arrays[layers[0]].shape[0])) if layers else []
     return {
         "slot": slot,
-        "shard": stored.shard_path(slot // data.manifest.samples_per_file(stored)),
+        "shard": stored.shard_path(slot // data.manifest.spec.samples_per_file(stored)),
         "pictures": pictures,
         "layers": layers,
         "frames": data.arrays[layers[0]].attributes.get("instants", frames) if layers else [],

@@ -10,7 +10,6 @@ from sqlalchemy.exc import NoResultFound
 from stickslip_schemas.base import Sha256, Stage, TaskState, content_key
 from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishTask, RenderTask, task_adapter
 from stickslip_schemas.format.manifest import section_samples
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
@@ -169,8 +168,8 @@ def _publish_task(connection: Connection, task: Any, publish: Publish) -> Publis
     )
     return PublishTask(
         spec=spec,
-        dataset=dataset_id(spec),
-        version=version_number(connection, dataset_id(spec), task.seq),
+        dataset=spec.dataset_id,
+        version=version_number(connection, spec.dataset_id, task.seq),
         builds=terms.builds,
         sections=tuple(in_parallel(publish, sections)),
         certificate=certificate,
@@ -213,5 +212,5 @@ def reserve_version(connection: Connection, task: Any) -> None:
     """Reserve the version number of a publish task, for good, so that no other task takes it."""
     with suppress(*UNSOUND):  # composing it finds the damage
         if find_reserved(connection, task.seq) is None:
-            dataset = dataset_id(read_plan(connection, json.loads(task.payload)["job"])[0])
+            dataset = read_plan(connection, json.loads(task.payload)["job"])[0].dataset_id
             reserve_number(connection, dataset, version_number(connection, dataset, task.seq), task.seq)

@@ -9,8 +9,7 @@ from stickslip_schemas.base import JobState, Reason, Stage, sha256
 from stickslip_schemas.documents.responses import JobDetail, Validation
 from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import Interval, estimated
-from stickslip_schemas.plan.grid import Counts, count, grid
+from stickslip_schemas.plan.costs import Counts, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.access.asker import this_asker
@@ -125,7 +124,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
 
 def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Stage, Interval]:
     """Return what the stages cost of which tasks were measured."""
-    costs, points = read_costs(connection), list(islice(grid(spec), LOOKED_UP))
+    costs, points = read_costs(connection), list(islice(spec.grid(), LOOKED_UP))
     work = {Stage.pack: [StageWork(counts.shards, timings_of(costs, Stage.pack, spec.kind, ""))]}
     for stage, number in ((Stage.simulate, counts.simulation_count), (Stage.render, counts.render_count)):
         groups = Counter(spec.cost_group(stage, point) for point in points)

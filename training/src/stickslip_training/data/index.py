@@ -119,7 +119,7 @@ class Index:
         """Return a label of all slots, (slots, ...), read-only."""
         if name not in self._labels:
             array, count = self.arrays[name], self.manifest.sample_count
-            numbers = range(-(-count // self.manifest.samples_per_file(array)))
+            numbers = range(-(-count // self.manifest.spec.samples_per_file(array)))
             values = np.concatenate([self._read_chunk(array, number) for number in numbers])[:count]
             values.flags.writeable = False
             self._labels[name] = values
@@ -128,7 +128,7 @@ class Index:
     def read_sample(self, array: ArrayLayout, slot: int, out: Array) -> None:
         """Read a valid sample of an array into `out`, (*sample shape)."""
         self.check_section(slot)
-        number, position = divmod(slot, self.manifest.samples_per_file(array))
+        number, position = divmod(slot, self.manifest.spec.samples_per_file(array))
         if not array.per_sample:
             out[...] = self._kept_chunk(array, number)[position]
             return
@@ -169,7 +169,7 @@ class Index:
 
     def _read_chunk(self, array: ArrayLayout, number: int) -> Array:
         """Return the chunk that is all of a file, (samples per file, *sample shape)."""
-        size = self.manifest.samples_per_file(array)
+        size = self.manifest.spec.samples_per_file(array)
         last = min((number + 1) * size, self.manifest.sample_count) - 1
         what = f"array {array.name}, samples {number * size} to {last}"
         file = self.file(array.shard_path(number), what)

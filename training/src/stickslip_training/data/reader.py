@@ -239,7 +239,8 @@ class DatasetReader:
             else:
                 file = self.index.file(f"{name}/{GROUP_NAME}", "metadata")
                 found = _parse_metadata(self.index.read_file(file), self.index.at(file))
-            _check_array(found, array, sample_count=len(self), samples_per_file=self.manifest.samples_per_file(array))
+            size = self.manifest.spec.samples_per_file(array)
+            _check_array(found, array, sample_count=len(self), samples_per_file=size)
 
     def _check_labels(self) -> None:
         """Check that the manifest fits the arrays `valid` and `split`.
@@ -247,7 +248,7 @@ class DatasetReader:
         A section is checked when the first of its samples is read.
         """
         for array in self.arrays.values():
-            for number in range(-(-len(self) // self.manifest.samples_per_file(array)) if array.is_label else 0):
+            for number in range(-(-len(self) // self.manifest.spec.samples_per_file(array)) if array.is_label else 0):
                 self.index.file(array.shard_path(number), f"array {array.name}, file {number}")
         if not self.manifest.sections:
             self.index.check_section(0)

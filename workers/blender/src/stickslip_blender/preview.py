@@ -4,7 +4,6 @@
 cameras side by side. The record has the arrays of `cloth_scene` that the cameras and bodies need; no light is traced.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -121,18 +120,8 @@ def _floor(geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, 
     return np.where(np.isfinite(depth), ground, _SKY)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Draw a scene; return 0."""
-    parser = argparse.ArgumentParser(prog="stickslip_blender.preview", description=__doc__.splitlines()[0])
-    parser.add_argument("record", type=Path, help="NPZ file with the arrays")
-    parser.add_argument("scene", type=Path, help="JSON file with the scene")
-    parser.add_argument("out", type=Path, help="directory for the pictures")
-    options = parser.parse_args(arguments)
-    with np.load(options.record, allow_pickle=False) as record:
-        names = draw(json.loads(options.scene.read_text(encoding="utf-8")), dict(record), options.out)
-    sys.stdout.write("\n".join(names) + "\n")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    _record, _scene, _out = map(Path, sys.argv[1:])
+    with np.load(_record, allow_pickle=False) as _arrays:
+        _names = draw(json.loads(_scene.read_text(encoding="utf-8")), dict(_arrays), _out)
+    sys.stdout.write("\n".join(_names) + "\n")

@@ -12,7 +12,6 @@ import numpy as np
 from stickslip_schemas.format.codecs import decode_sample
 from stickslip_schemas.format.manifest import Manifest, layout
 from stickslip_schemas.format.pictures import labelled, moving, sheet
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.spec.appearance import shown_frames
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis
@@ -151,7 +150,7 @@ def preview(spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Call
     if not valid:
         return None
     shown = [valid[place] for place in shown_frames(min(SHOWN_SAMPLES, len(valid)), len(valid))]
-    points = {slot: point for slot, point in enumerate(grid(spec)) if slot in shown}
+    points = {slot: point for slot, point in enumerate(spec.grid()) if slot in shown}
     tiles = []
     for slot in shown:
         pictures = np.empty(array.shape, dtype=np.uint8)

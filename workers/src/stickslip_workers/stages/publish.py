@@ -31,13 +31,11 @@ from stickslip_schemas.format.manifest import (
     Rejection,
     has_sections,
     layout,
-    samples_per_file,
     seal_text,
     section_path,
     section_samples,
     with_manifest_digest,
 )
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.spec.appearance import REGIONS
 from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
 from stickslip_schemas.spec.jobs import JobSpec
@@ -65,7 +63,7 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
         },
     )
     for array in layout(spec):
-        create_array(group, array, sample_count=sample_count, samples_per_file=samples_per_file(array, spec))
+        create_array(group, array, sample_count=sample_count, samples_per_file=spec.samples_per_file(array))
     with warnings.catch_warnings():
         # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs #383].
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
@@ -150,8 +148,8 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
 
 def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
     """Raise if the version lacks a file: a Zarr reader would silently return fill values."""
-    if task.dataset != dataset_id(task.spec):
-        raise ValueError(f"dataset must be the id of its spec, {dataset_id(task.spec)}; got {task.dataset!r}")
+    if task.dataset != task.spec.dataset_id:
+        raise ValueError(f"dataset must be the id of its spec, {task.spec.dataset_id}; got {task.dataset!r}")
     bounds = [0, *(section.end for section in given)]
     if bounds[:-1] != [section.first for section in given] or bounds[-1] != task.spec.sample_count:
         raise ValueError(f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at {bounds}")
@@ -198,13 +196,13 @@ class _Labels:
         numbers = [
             (array, number)
             for array in self.arrays
-            for number in range(-(-self.count // samples_per_file(array, self._spec)))
+            for number in range(-(-self.count // self._spec.samples_per_file(array)))
         ]
         return in_parallel(self._file, numbers)
 
     def _file(self, which: tuple[ArrayLayout, int]) -> FileEntry:
         array, number = which
-        size = samples_per_file(array, self._spec)
+        size = self._spec.samples_per_file(array)
         chunk = np.full((size, *array.shape), array.fill, array.dtype)  # a chunk is always whole
         values = self._columns[array.name][number * size : (number + 1) * size]
         chunk[: len(values)] = values

@@ -14,5 +14,4 @@ if TYPE_CHECKING:
 
 
 def render(look: ClothDragRender, task: RenderTask, workshop: Workshop) -> TaskResult:
-    """Render the clips of a dragged cloth."""
     return render_clips(look, task, workshop, Holders)
