@@ -19,9 +19,9 @@ from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.quality import pooled, trio
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 SHOWN = (("left", "matt", 21), ("calibrated", "stainless-steel", 22), ("right", "cloth", 23))
 TEXTURES = tuple(map(str, Texture))[:8]

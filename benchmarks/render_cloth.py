@@ -44,10 +44,10 @@ from stickslip_blender.workshop import Workshop, build_digest
 from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
+from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.store import DirectoryStore
 
 MATERIAL = "gray-interlock"

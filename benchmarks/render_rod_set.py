@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from stickslip_blender.rods.renderer import RodRenderer, silicone_color
+from stickslip_blender.scenes.rod_hang import RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from stickslip_blender.cycles.engine import SAMPLING, Sampling, import_bpy
-from stickslip_blender.rods.renderer import GROUND_LEVEL, POINTS, RodRenderer, silicone_color
+from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, POINTS, RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 
 REFERENCE = Sampling(samples=256, seed=1)

@@ -31,7 +31,7 @@ from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
 from stickslip_schemas.scene.parts import FileMesh
 from stickslip_schemas.spec.axes import SobolAxis, drawn_values
-from stickslip_schemas.spec.fabrics import Material
+from stickslip_schemas.spec.names import Material
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes import cloth_scene

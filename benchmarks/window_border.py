@@ -19,9 +19,9 @@ from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import Sampling
 from stickslip_blender.cycles.pixels import encode
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 SHOWN = (("left", "matt", 61), ("calibrated", "matt", 62), ("right", "white-table", 63))
 FRAMES, MARGIN, WIDTH, PATHS = 30, 10, 4, 32

@@ -11,7 +11,7 @@ from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.kinds.cloth.spec import SEGMENTS
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples

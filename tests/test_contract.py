@@ -15,8 +15,8 @@ from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.plan.points import keyed_points
-from stickslip_schemas.spec.fabrics import FabricNumbers, Material
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
+from stickslip_schemas.spec.names import FabricNumbers, Material
 from stickslip_services.queue.plan import Terms, expand, terms_for
 from stickslip_sim_core._sim_core import kernels
 from stickslip_sim_core.cloth.contact import MU_MAX

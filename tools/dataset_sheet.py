@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from stickslip_schemas.format.pictures import labelled, moving, sheet
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_training.data.reader import DatasetReader
 from stickslip_workers.stages.card import text_of
 

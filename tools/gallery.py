@@ -23,7 +23,7 @@ from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTas
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
-from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import FRAMING
 from stickslip_schemas.store import open_store
 from stickslip_workers.commands import replay

@@ -12,9 +12,8 @@ from stickslip_schemas.base import Document
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
-from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
-from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.names import Calibration, FabricNumbers, FloorNumbers, LampNumbers
 
 HEAD = """# Every key of a spec
 

@@ -17,8 +17,8 @@ from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
+from stickslip_schemas.spec.names import Texture
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another
 
 import numpy as np  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
-from stickslip_schemas.spec.appearance import shown_frames  # noqa: E402
+from stickslip_schemas.spec.arrays import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, fabric_names  # noqa: E402
 from stickslip_sim_core import fabric as fabric_named  # noqa: E402
 from stickslip_sim_core.scenes import cloth_drag  # noqa: E402

@@ -141,8 +141,8 @@ def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
     ("file", "stage", "kinds"),
     [
         ("fabrics.toml", "simulate", set(KINDS) - {"rod_hang"}),
-        ("fabrics.py", "simulate", set()),
-        ("fabrics.py", "pack", set(KINDS) - {"rod_hang"}),
+        ("names.py", "simulate", set()),
+        ("names.py", "pack", set(KINDS) - {"rod_hang"}),
         ("arrays.py", "pack", set(KINDS)),
         ("codecs.py", "pack", set(KINDS)),
     ],

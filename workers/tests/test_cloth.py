@@ -20,8 +20,7 @@ from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejectio
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragSimulation, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.appearance import REGIONS
-from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import REGIONS, ArrayLayout
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.store import DirectoryStore

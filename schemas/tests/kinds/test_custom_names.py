@@ -16,9 +16,8 @@ from stickslip_schemas.format.pictures import MAX_BYTES, UnfitPictureError, read
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragRender, ClothDragSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.spec.appearance import Calibration, Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Calibration, Lighting, Substrate, Texture
 from stickslip_testing.samples import samples
 
 BUILDS = Builds(sim_core="1" * 64, simulate="2" * 64, render="3" * 64, pack="4" * 64)

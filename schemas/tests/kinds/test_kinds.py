@@ -7,7 +7,7 @@ from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS
 from stickslip_schemas.spec.arrays import SPLITS
-from stickslip_schemas.spec.fabrics import Material, Texture
+from stickslip_schemas.spec.names import Material, Texture
 
 
 def test_codes_of_labels_are_pinned() -> None:

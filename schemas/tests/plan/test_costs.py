@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from stickslip_schemas.base import Stage
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import Estimate, Interval, count, estimated
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.plan.points import Estimate, Interval, count, estimated
+from stickslip_schemas.spec.names import Texture
 
 
 def estimate(slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any) -> Estimate:

@@ -75,13 +75,13 @@ def test_render_depends_on_simulation_look_and_renderer() -> None:
 
 
 def test_a_name_is_no_content_and_a_build_makes_no_other_dataset() -> None:
-    def spec(**more: object) -> object:
+    def spec(**more: object) -> JobSpec:
         return job_spec_adapter.validate_python(
             {"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}, **more}
         )
 
-    assert spec(name="a").dataset_id == spec(name="b").dataset_id  # type: ignore[arg-type]
-    assert spec(seed=1).dataset_id != spec().dataset_id  # type: ignore[arg-type]
+    assert spec(name="a").dataset_id == spec(name="b").dataset_id
+    assert spec(seed=1).dataset_id != spec().dataset_id
 
 
 def test_neighbours_in_the_grid_change_no_sample() -> None:

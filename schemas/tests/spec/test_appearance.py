@@ -1,7 +1,7 @@
 """Clips: which frames of a trajectory they show."""
 
 import pytest
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 
 
 def test_a_clip_shows_the_first_frame_and_then_evenly_spread_ones() -> None:

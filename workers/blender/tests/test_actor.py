@@ -21,20 +21,20 @@ from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.looks import drawn_light, drawn_substrate
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING
-from stickslip_blender.rods.renderer import RodRenderer, silicone_color, to_linear
+from stickslip_blender.scenes.rod_hang import RodRenderer, silicone_color, to_linear
 from stickslip_blender.workshop import roots
 from stickslip_schemas.base import Reason, is_sha256
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.plan.builds import UNCOUNTED, sources
-from stickslip_schemas.spec.appearance import shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import Camera, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
+from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore
 
-DOCUMENTS = tuple(f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/appearance"))
+DOCUMENTS = tuple(f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/names"))
 """Modules of documents, which are in the content key as a whole."""
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
 

@@ -26,7 +26,6 @@ STEADY_SECONDS = 60.0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command and return its exit status."""
     blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
     blender, stored = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
     blender.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")

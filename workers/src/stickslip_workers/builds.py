@@ -32,7 +32,6 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
 def roots(stage: str, name: str) -> tuple[str, ...]:
-    """Return the modules that run a stage for a kind."""
     if stage == "simulate":
         return (f"{_STAGES}.run", scene_module(name))
     if stage == "pack":

@@ -14,21 +14,9 @@ from typing import TypeVar
 
 import httpx
 from pydantic import BaseModel
+from stickslip_schemas.documents import worker_api as api
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.documents.tasks import TaskResult
-from stickslip_schemas.documents.worker_api import (
-    Heartbeat,
-    HeartbeatAnswer,
-    Lease,
-    LeaseBatch,
-    LeaseRequest,
-    LeaseState,
-    Report,
-    ReportAnswer,
-    ReportBatch,
-    WorkerRegistration,
-    WorkerSession,
-)
 
 log = logging.getLogger(__name__)
 
@@ -81,17 +69,17 @@ class CoordinatorClient:
         self._urls = deque(url.rstrip("/") for url in urls)
         """Of coordinators with one database; the first one is asked."""
 
-    def register(self, registration: WorkerRegistration) -> WorkerSession:
-        return self._post("/v1/workers", registration, WorkerSession)
+    def register(self, registration: api.WorkerRegistration) -> api.WorkerSession:
+        return self._post("/v1/workers", registration, api.WorkerSession)
 
-    def lease(self, request: LeaseRequest) -> LeaseBatch:
-        return self._post("/v1/worker/lease", request, LeaseBatch, timeout=PATIENT)
+    def lease(self, request: api.LeaseRequest) -> api.LeaseBatch:
+        return self._post("/v1/worker/lease", request, api.LeaseBatch, timeout=PATIENT)
 
-    def heartbeat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
-        return self._post("/v1/worker/heartbeat", heartbeat, HeartbeatAnswer)
+    def heartbeat(self, heartbeat: api.Heartbeat) -> api.HeartbeatAnswer:
+        return self._post("/v1/worker/heartbeat", heartbeat, api.HeartbeatAnswer)
 
-    def report(self, reports: ReportBatch) -> ReportAnswer:
-        return self._post("/v1/worker/report", reports, ReportAnswer, timeout=PATIENT)
+    def report(self, reports: api.ReportBatch) -> api.ReportAnswer:
+        return self._post("/v1/worker/report", reports, api.ReportAnswer, timeout=PATIENT)
 
     def close(self) -> None:
         self._http.close()
@@ -142,31 +130,31 @@ class LeaseBook:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._states: dict[str, LeaseState] = {}
-        self._reports: dict[str, Report] = {}
+        self._states: dict[str, api.LeaseState] = {}
+        self._reports: dict[str, api.Report] = {}
         self.due = math.inf
         """When to report at the latest."""
 
-    def add(self, leases: Iterable[Lease]) -> None:
+    def add(self, leases: Iterable[api.Lease]) -> None:
         """Add leases; they take the place of older ones of the same tasks."""
         with self._lock:
             for lease in leases:
-                self._states[lease.task_id] = LeaseState(task_id=lease.task_id, token=lease.token, started=False)
+                self._states[lease.task_id] = api.LeaseState(task_id=lease.task_id, token=lease.token, started=False)
                 self._reports.pop(lease.task_id, None)
 
-    def note(self, leases: Iterable[Lease], **changes: object) -> None:
+    def note(self, leases: Iterable[api.Lease], **changes: object) -> None:
         """Note that tasks have `started`, or their `frames`: (frames done, frames total)."""
         with self._lock:
             for lease in leases:
                 if self.holds(lease):
                     self._states[lease.task_id] = self._states[lease.task_id].model_copy(update=changes)
 
-    def settle(self, lease: Lease | LeaseState, result: TaskResult | None) -> None:
+    def settle(self, lease: api.Lease | api.LeaseState, result: TaskResult | None) -> None:
         """Keep the result of a lease that is still held, or its return, until it is reported."""
         with self._lock:
             if self.holds(lease):
                 self.due = min(self.due, time.monotonic() + REPORT_SECONDS)
-                self._reports[lease.task_id] = Report(task_id=lease.task_id, token=lease.token, result=result)
+                self._reports[lease.task_id] = api.Report(task_id=lease.task_id, token=lease.token, result=result)
 
     def give_back(self, *, started: bool) -> None:
         """Return the leases that have no result, those of started tasks only if `started`."""
@@ -174,7 +162,7 @@ class LeaseBook:
             if state.task_id not in self._reports and (started or not state.started):
                 self.settle(state, None)
 
-    def remove(self, leases: Iterable[Lease | LeaseState | Report]) -> None:
+    def remove(self, leases: Iterable[api.Lease | api.LeaseState | api.Report]) -> None:
         """Remove leases; newer ones of the same tasks stay."""
         with self._lock:
             for lease in leases:
@@ -182,16 +170,15 @@ class LeaseBook:
                     del self._states[lease.task_id]
                     self._reports.pop(lease.task_id, None)
 
-    def holds(self, lease: Lease | LeaseState | Report) -> bool:
+    def holds(self, lease: api.Lease | api.LeaseState | api.Report) -> bool:
         state = self._states.get(lease.task_id)
         return state is not None and state.token == lease.token
 
-    def states(self) -> tuple[LeaseState, ...]:
+    def states(self) -> tuple[api.LeaseState, ...]:
         with self._lock:
             return tuple(self._states.values())
 
-    def reports(self) -> tuple[Report, ...]:
-        """Return what waits to be reported."""
+    def reports(self) -> tuple[api.Report, ...]:
         with self._lock:
             return tuple(self._reports.values())
 
@@ -203,7 +190,7 @@ class Session(threading.Thread):
     It is a daemon and never keeps the process alive.
     """
 
-    def __init__(self, coordinator: CoordinatorClient, registration: Callable[[], WorkerRegistration]) -> None:
+    def __init__(self, coordinator: CoordinatorClient, registration: Callable[[], api.WorkerRegistration]) -> None:
         super().__init__(name="session", daemon=True)
         self._coordinator = coordinator
         self._registration = registration
@@ -232,7 +219,7 @@ class Session(threading.Thread):
     def beat(self) -> float:
         """Send one heartbeat; return when the next one is due [s]."""
         states, condition = self.book.states(), self._registration().condition
-        message = Heartbeat(worker_id=self._worker_id, leases=states, condition=condition)
+        message = api.Heartbeat(worker_id=self._worker_id, leases=states, condition=condition)
         if drop := set(self._coordinator.heartbeat(message).drop):
             log.info("dropping %d tasks", len(drop))
             self.book.remove(state for state in states if state.task_id in drop)
@@ -243,7 +230,7 @@ class Session(threading.Thread):
         reports = self.book.reports()
         for first in range(0, len(reports), REPORTS_A_REQUEST):
             batch = reports[first : first + REPORTS_A_REQUEST]
-            for verdict in self._coordinator.report(ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
+            for verdict in self._coordinator.report(api.ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
                 if verdict.verdict == "stale":
                     log.warning("the report of task %s came too late and was refused", verdict.task_id)
             self.book.remove(batch)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from stickslip_schemas.base import literals, models_at, unit_of
-from stickslip_schemas.spec.fabrics import did_you_mean
+from stickslip_schemas.spec.names import did_you_mean
 
 MEDIA_TYPE = "application/problem+json"
 

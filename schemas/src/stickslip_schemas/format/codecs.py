@@ -82,7 +82,6 @@ def decode_clip(chunk: bytes, out: np.ndarray) -> None:
 
 
 def encode_sample(array: ArrayLayout, values: np.ndarray) -> bytes:
-    """Return the encoded chunk of one sample's values of an array."""
     settings = packing(array)
     return encode_chunk(values) if settings is None else _packed(_turned(array, values), settings)
 

@@ -20,8 +20,8 @@ from stickslip_schemas.kinds.cloth.spec import (
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, name_schema
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, SeedRule, Simulation
+from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, name_schema
 
 RIG = "drag"
 """The cameras; their names are those of the viewpoints."""

@@ -26,7 +26,6 @@ from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
 from stickslip_schemas.scene.parts import MeshBody
-from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import (
     SHORTHAND,
@@ -41,8 +40,8 @@ from stickslip_schemas.spec.axes import (
     quantity,
 )
 from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, SeedRule, Simulation
+from stickslip_schemas.spec.names import CustomName, FloorNumbers, LampNumbers, did_you_mean
 
 OF_SCENE = "scene"
 """Name of the light and the floor that the scene gives as numbers."""

@@ -36,7 +36,6 @@ class Builds(Document):
 
     @property
     def digest(self) -> str:
-        """One key for all of them."""
         return content_key("builds", self.model_dump())
 
     @property

@@ -31,8 +31,8 @@ from stickslip_schemas.scene.parts import (
     Time,
     Vector,
 )
-from stickslip_schemas.spec.fabrics import CustomName, FabricNumbers, Material, Texture, did_you_mean
 from stickslip_schemas.spec.jobs import PresetName
+from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, Texture, did_you_mean
 
 MAX_FRAMES = 10_000
 """Of a scene."""

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.spec.fabrics import did_you_mean
+from stickslip_schemas.spec.names import did_you_mean
 
 SCENES = Path(__file__).parents[1] / "scenes"
 """Folder of the built-in scenes."""

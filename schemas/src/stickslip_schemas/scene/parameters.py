@@ -7,7 +7,7 @@ from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base import Document, Float, placed, unit_in, unit_of
-from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
+from stickslip_schemas.spec.names import CustomName, did_you_mean
 
 Path = tuple[str | int, ...]
 """A place in a document: names, and positions in lists."""

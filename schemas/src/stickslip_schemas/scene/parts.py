@@ -1,4 +1,4 @@
-"""Parts of a scene: motions, bodies that cloth touches, sheets of cloth, and what is seen of them, and how."""
+"""Parts of a scene: motions, bodies that cloth touches, sheets of cloth, and their looks."""
 
 import math
 from itertools import pairwise
@@ -9,18 +9,19 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from stickslip_schemas.base import ARTIFACT, Bool, Document, Float, Int, is_sha256
-from stickslip_schemas.spec.appearance import (
-    CLIP_SIZE,
+from stickslip_schemas.spec.arrays import CLIP_SIZE
+from stickslip_schemas.spec.cameras import Camera, rig_names
+from stickslip_schemas.spec.names import (
     FARTHEST,
     LOWEST,
+    CustomName,
     FloorNumbers,
     LampNumbers,
     Lighting,
     Share,
     Substrate,
+    did_you_mean,
 )
-from stickslip_schemas.spec.cameras import Camera, rig_names
-from stickslip_schemas.spec.fabrics import CustomName, did_you_mean
 
 Length = Annotated[Float, Field(gt=0, le=100)]
 Place = Annotated[Float, Field(ge=-100, le=100)]

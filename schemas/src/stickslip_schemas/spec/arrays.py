@@ -20,6 +20,16 @@ LABEL_CHUNK_BYTES = 2**21
 
 SAMPLE_KEY_BYTES = 32
 
+CLIP_SIZE = 224
+"""Width and height of a clip [px]."""
+
+REGIONS = {
+    "cloth": "all cloth",
+    "landed": "cloth within 40 mm of the floor",
+    "edge": "a band of 4 px along the silhouette",
+}
+"""Where it is measured how good a clip is."""
+
 NAN = float("nan")
 
 
@@ -97,3 +107,10 @@ def describe(array: ArrayLayout) -> dict[str, Any]:
     if array.categories:
         attributes["categories"] = list(array.categories)
     return attributes
+
+
+def shown_frames(count: int, instants: int) -> tuple[int, ...]:
+    """Return the instants that a clip of `count` frames shows of `instants`: the first, and then evenly spread."""
+    if not 1 <= count <= instants:
+        raise ValueError(f"frames must be from 1 to {instants}, and is {count}")
+    return tuple(position * instants // count for position in range(count))

@@ -3,6 +3,7 @@
 The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, model_validator
@@ -23,11 +24,11 @@ Count = Annotated[int, Strict(), Field(ge=1, le=MAX_SAMPLES), WHOLE]
 Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31, description="seed of all random draws"), WHOLE]
 
 
+@dataclass(frozen=True)
 class quantity:  # noqa: N801 - reads as an annotation
     """Name a value's type in the JSON schema: `Annotated[float, quantity("Mu"), ...]`."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    name: str
 
 
 def _quantity_name(parameter: Any) -> str:

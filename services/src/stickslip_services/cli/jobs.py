@@ -22,7 +22,7 @@ from stickslip_schemas.documents.responses import (
 )
 from stickslip_schemas.documents.responses import Progress as JobProgress
 from stickslip_schemas.format.manifest import bytes_estimate
-from stickslip_schemas.plan.costs import Counts, Estimate, count, estimated
+from stickslip_schemas.plan.points import Counts, Estimate, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.cli import wording

@@ -14,8 +14,8 @@ from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
 from stickslip_schemas.scene.library import parse_yaml
-from stickslip_schemas.spec.fabrics import MATERIAL_NAME
 from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.names import MATERIAL_NAME
 
 from stickslip_services.errors import CommandError
 

@@ -3,7 +3,7 @@
 import click
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import DatasetRef, Eta, Progress, StageProgress
-from stickslip_schemas.plan.costs import Interval
+from stickslip_schemas.plan.points import Interval
 
 from stickslip_services.units import duration
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.format.pictures import moving, png
 from stickslip_schemas.spec.cameras import FRAMING, Camera
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.stage import Stage

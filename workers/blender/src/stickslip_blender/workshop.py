@@ -40,7 +40,6 @@ Array = npt.NDArray[Any]
 
 
 def roots(kind: str) -> tuple[str, ...]:
-    """Return the modules that render a kind."""
     return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
 
 

@@ -16,7 +16,7 @@ from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.raster import projected, see, window_about
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 LOOK = {
     "rig": "drag",
@@ -63,7 +63,7 @@ from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 sheet = np.load(sys.argv[1])
 look = ClothDragRender.model_validate_json(sys.argv[2])
 renderer = ClothRenderer(sheet["triangles"], sheet["rest"], Holders)

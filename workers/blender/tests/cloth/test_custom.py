@@ -16,9 +16,8 @@ from stickslip_blender.cloth.textures import SIZE, custom_texture, texture_image
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_digests, task_adapter
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
-from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers
 from stickslip_schemas.spec.cameras import distorted, load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Calibration, FloorNumbers, LampNumbers, Texture
 from stickslip_schemas.store import DirectoryStore
 
 Clip = npt.NDArray[np.uint8]

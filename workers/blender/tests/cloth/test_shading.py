@@ -13,8 +13,8 @@ from stickslip_blender.cycles.pixels import encode
 from stickslip_blender.raster import decoded
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
-from stickslip_schemas.spec.fabrics import Texture
 from stickslip_schemas.spec.jobs import Quality
+from stickslip_schemas.spec.names import Texture
 
 
 def test_encoding_is_srgb() -> None:

@@ -17,7 +17,7 @@ from stickslip_schemas.format.codecs import decode_chunk
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
 from stickslip_schemas.scene.document import Staged
 from stickslip_schemas.spec.cameras import FRAMING, framed
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.store import DirectoryStore
 
 INSTANTS = 3

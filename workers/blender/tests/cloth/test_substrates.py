@@ -19,9 +19,8 @@ from stickslip_blender.cloth.looks import (
 )
 from stickslip_blender.cloth.surface import Surface
 from stickslip_blender.raster import decoded
-from stickslip_schemas.spec.appearance import Lighting, Substrate
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_schemas.spec.fabrics import Material
+from stickslip_schemas.spec.names import Lighting, Material, Substrate
 
 
 def test_the_contract_and_the_renderer_name_the_same_things() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from stickslip_blender.cloth.textures import SIZE, texture_image
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 
 @pytest.mark.parametrize("texture", list(Texture))

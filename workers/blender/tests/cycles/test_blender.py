@@ -13,7 +13,7 @@ _RENDER = """
 import hashlib, sys
 import numpy as np
 from stickslip_blender.cycles.engine import NoDeviceError
-from stickslip_blender.rods.renderer import RodRenderer
+from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 line = np.linspace((0.0, 0.0, 0.0), (0.2, 0.1, -0.9), 150)

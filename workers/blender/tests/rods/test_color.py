@@ -4,7 +4,7 @@ import colorsys
 
 import numpy as np
 import pytest
-from stickslip_blender.rods.renderer import silicone_color, to_linear
+from stickslip_blender.scenes.rod_hang import silicone_color, to_linear
 
 
 def test_a_seed_has_one_color() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from stickslip_blender.cycles.pixels import Window
-from stickslip_blender.rods.renderer import GROUND_LEVEL, RADIUS, RodRenderer
+from stickslip_blender.scenes.rod_hang import GROUND_LEVEL, RADIUS, RodRenderer
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.jobs import Quality
 
@@ -38,7 +38,7 @@ def test_a_repeat_has_the_same_bytes(curl: npt.NDArray[np.float64], rig: tuple[C
 _FRESH = """
 import hashlib, sys
 import numpy as np
-from stickslip_blender.rods.renderer import RodRenderer
+from stickslip_blender.scenes.rod_hang import RodRenderer
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.spec.jobs import Quality
 renderer = RodRenderer(quality=Quality.draft)
@@ -61,7 +61,7 @@ def test_the_ground_is_dark_even_and_what_blender_would_render(
     assert GROUND_LEVEL < 16
     assert np.median(views) == GROUND_LEVEL
     whole = Window(0, 0, 224, 224)
-    monkeypatch.setattr("stickslip_blender.rods.renderer.window_about", lambda vertices, camera: whole)
+    monkeypatch.setattr("stickslip_blender.scenes.rod_hang.window_about", lambda vertices, camera: whole)
     renderer = RodRenderer(quality=Quality.draft)
     full = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(full, views)
@@ -130,7 +130,7 @@ def test_an_idle_renderer_takes_no_processor_time() -> None:
     script = """
 import time
 import numpy as np
-from stickslip_blender.rods.renderer import RodRenderer, silicone_color
+from stickslip_blender.scenes.rod_hang import RodRenderer, silicone_color
 from stickslip_schemas.spec.cameras import load_rig
 line = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), 150)
 renderer = RodRenderer(quality="draft")

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_blender.rods.renderer import CAP_RINGS, SIDES, transport_frames, tube_faces, tube_vertices
+from stickslip_blender.scenes.rod_hang import CAP_RINGS, SIDES, transport_frames, tube_faces, tube_vertices
 
 
 def test_every_vertex_of_a_ring_lies_a_radius_from_its_point(curl: npt.NDArray[np.float64]) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from stickslip_schemas.format.codecs import decode_sample
 from stickslip_schemas.format.manifest import Manifest, layout
 from stickslip_schemas.format.pictures import labelled, moving, sheet
-from stickslip_schemas.spec.appearance import shown_frames
-from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import ArrayLayout, shown_frames
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis
 from stickslip_schemas.spec.jobs import JobSpec
 
@@ -162,5 +161,4 @@ def preview(spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Call
 
 
 def text_of(values: Mapping[str, object]) -> str:
-    """Return parameters as people read them."""
     return " ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in values.values())

@@ -36,8 +36,7 @@ from stickslip_schemas.format.manifest import (
     section_samples,
     with_manifest_digest,
 )
-from stickslip_schemas.spec.appearance import REGIONS
-from stickslip_schemas.spec.arrays import FORMAT, SPLITS, ArrayLayout, describe
+from stickslip_schemas.spec.arrays import FORMAT, REGIONS, SPLITS, ArrayLayout, describe
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 
@@ -192,7 +191,6 @@ class _Labels:
         return self._columns[name]
 
     def files(self) -> list[FileEntry]:
-        """Write the files of the labels."""
         numbers = [
             (array, number)
             for array in self.arrays

@@ -78,11 +78,9 @@ class StageActor:
         self._store = open_store(store)
 
     def describe(self) -> dict[str, Any]:
-        """Return the builds of each kind, and versions of libraries."""
         return {"builds": {name: kind_builds(name) for name in KINDS}, "versions": versions()}
 
     def run(self, tasks: str) -> str:
-        """Run tasks, see `run_tasks`."""
         try:
             return results_adapter.dump_json(run_tasks(tasks_adapter.validate_json(tasks), self._store)).decode()
         finally:

@@ -7,9 +7,8 @@ from typing import Any
 
 from stickslip_schemas.kinds.cloth.spec import ClipSpec, GroundTruth
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.spec.appearance import CLIP_SIZE, REGIONS
-from stickslip_schemas.spec.arrays import ArrayLayout, array
-from stickslip_schemas.spec.fabrics import Material
+from stickslip_schemas.spec.arrays import CLIP_SIZE, REGIONS, ArrayLayout, array
+from stickslip_schemas.spec.names import Material
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
 """Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""

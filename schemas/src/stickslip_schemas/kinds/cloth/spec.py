@@ -9,11 +9,21 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from stickslip_schemas.base import ArtifactRef, Bool, Document, Float, Int, Sha256, Stage, referred
 from stickslip_schemas.scene.parts import View
-from stickslip_schemas.spec.appearance import Calibration, FloorNumbers, LampNumbers, Lighting, Substrate, shown_frames
+from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, Seed, quantity
 from stickslip_schemas.spec.cameras import Camera
-from stickslip_schemas.spec.fabrics import CustomName, Texture, did_you_mean, name_schema
 from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render
+from stickslip_schemas.spec.names import (
+    Calibration,
+    CustomName,
+    FloorNumbers,
+    LampNumbers,
+    Lighting,
+    Substrate,
+    Texture,
+    did_you_mean,
+    name_schema,
+)
 
 VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoints`")
 TextureAxis = Annotated[
@@ -181,7 +191,6 @@ class ClipSpec(JobSpec):
 
     @property
     def segments(self) -> tuple[str, ...]:
-        """Names of the codes of the array `segmentation`."""
         return SEGMENTS
 
     @property

@@ -18,7 +18,7 @@ from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, encode_chunk, encode_clip
 from stickslip_schemas.format.pictures import moving
 from stickslip_schemas.spec.cameras import Camera, load_rig
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
@@ -122,11 +122,8 @@ class ClipRenderer:
             sights.append(
                 self.scene.composer.compose(light, shot, camera, self.scene.substrate, self.floor, packed, frame)
             )
-        labels = self.labels | {
-            "frame_share": float(np.mean([sight.frame_share for sight in sights])),
-            "visible_share": float(np.mean([sight.visible_share for sight in sights])),
-        }
-        return videos, labels
+        shares = zip(("frame_share", "visible_share"), zip(*sights, strict=True), strict=True)
+        return videos, self.labels | {name: float(np.mean(share)) for name, share in shares}
 
     def weights(self, shading: Light) -> tuple[npt.NDArray[np.float64], list[float]]:
         """Return the weights of pixels by region, (frames, 3, height, width), and their means, for `pooled`."""

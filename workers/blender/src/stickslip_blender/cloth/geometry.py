@@ -311,7 +311,6 @@ class Holders:
         self.props = tuple(Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2))
 
     def placed(self, _instant: int, vertices: Array) -> list[Array]:
-        """Move the holders with the corners that they hold."""
         return [prop.vertices + at for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)]
 
 

@@ -17,7 +17,7 @@ from stickslip_blender.cycles.pixels import encode
 from stickslip_blender.raster import decoded
 
 if TYPE_CHECKING:
-    from stickslip_schemas.spec.appearance import FloorNumbers, LampNumbers
+    from stickslip_schemas.spec.names import FloorNumbers, LampNumbers
 
 Field = npt.NDArray[np.float64]
 Grain = Literal["plain", "twill", "check", "melange", "rib", "sparkle", "ribbon", "target", "waves", "pin-dots"]

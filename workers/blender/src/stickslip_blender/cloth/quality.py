@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.spec.appearance import REGIONS
+from stickslip_schemas.spec.arrays import REGIONS
 from stickslip_schemas.spec.cameras import Camera
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.shading import FINE

@@ -127,7 +127,6 @@ class ClothScene:
         return window_about(projected(self._camera, cloth), self._camera, margin)
 
     def _place(self, points: Points) -> None:
-        """Move everything."""
         for mesh, part in zip(self._meshes, self.geometry.parts(points), strict=True):
             move_mesh(mesh, part)
 

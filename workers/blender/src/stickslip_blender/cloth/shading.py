@@ -18,7 +18,7 @@ Each level of a picture is within TOLERANCE of the exact value, and chosen so th
 before (clips are 6 % smaller for it), and that the colours of grey are equal (a tenth smaller).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -54,16 +54,6 @@ _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
 Floats = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Sight:
-    """Visibility of the cloth in a frame."""
-
-    frame_share: float
-    """Share of the frame that is cloth."""
-    visible_share: float
-    """Share of the cloth, its area taken as it is turned to the camera, that nothing hides."""
-
-
 class Composer:
     """Composes pictures of textures from shadings of one cloth."""
 
@@ -79,11 +69,12 @@ class Composer:
         floor: Floats,
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
-    ) -> Sight:
+    ) -> tuple[float, float]:
         """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into `pictures`.
 
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
-        those of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3).
+        those of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3). Returns the share of the
+        frame that is cloth, and of the cloth that nothing hides, its area taken as it is turned to the camera.
         """
         window, parts = self._window(points, camera).times(FINE), scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
@@ -106,7 +97,7 @@ class Composer:
         )
         frame = parts.width * parts.height
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
-        return Sight(float(sight.coverage.sum()) / frame, float(min(visible, 1.0)))
+        return float(sight.coverage.sum()) / frame, float(min(visible, 1.0))
 
     def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1) -> Floats:
         """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is rendered directly."""

@@ -90,7 +90,6 @@ class Stage:
         self.props = tuple(props)
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
-        """Move everything to its place at an instant."""
         return [place(instant) for place in self._placers]
 
     def moving(self) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from stickslip_schemas.format.pictures import read_picture
-from stickslip_schemas.spec.fabrics import Texture
+from stickslip_schemas.spec.names import Texture
 
 SIZE = 512
 """Side of a texture [texels]: 0.4 mm on the cloth, a seventh of a pixel."""
@@ -54,7 +54,6 @@ def _phase(x: Field, count: float) -> Field:
 
 
 def _dots(u: Field, v: Field) -> Field:
-    """Draw dots on a staggered grid."""
     odd = np.mod(np.floor(v * 8), 2) == 1
     x, y = _phase(u + np.where(odd, 1 / 16, 0.0), 8) - 0.5, _phase(v, 8) - 0.5
     return _mix(np.hypot(x, y) < 0.3, (240, 234, 220), (38, 62, 122))

@@ -218,7 +218,6 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
 
 
 def set_sampling(scene: Any, sampling: Sampling) -> None:
-    """Set the parameters that a quality names."""
     cycles = scene.cycles
     cycles.samples = sampling.skipped + sampling.samples
     cycles.use_sample_subset = sampling.skipped > 0

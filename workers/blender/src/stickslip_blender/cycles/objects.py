@@ -116,7 +116,6 @@ class Fabric:
         self._from: Any = None
 
     def set_look(self, *, roughness: float, specular: float, sheen: float, translucency: float) -> None:
-        """Set the gloss, the sheen and the share of light that the fabric transmits."""
         set_roughness(self._shader, roughness)
         set_inputs(self._shader, Specular_IOR_Level=specular, Sheen_Weight=sheen)
         set_inputs(self._both, Fac=translucency)
@@ -162,7 +161,6 @@ def set_pixels(image: Any, color: npt.NDArray[np.floating[Any]]) -> None:
 
 
 def add_view(scene: Any) -> Any:
-    """Add a camera object, make it the scene's, and return it."""
     bpy = import_bpy()
     data = bpy.data.cameras.new("view")
     data.type = "PERSP"

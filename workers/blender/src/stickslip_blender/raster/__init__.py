@@ -38,7 +38,6 @@ class Window:
 
     @property
     def area(self) -> int:
-        """Number of pixels in it."""
         return max(self.right - self.left, 0) * max(self.bottom - self.top, 0)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stickslip_schemas.spec.appearance import CLIP_SIZE
+from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.clips import picture, render_clips, rig_camera

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import count, estimated
+from stickslip_schemas.plan.points import count, estimated
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream

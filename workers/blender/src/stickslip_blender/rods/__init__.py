@@ -1,1 +1,0 @@
-"""Pictures of rods: the tube, its colour, and the renderer."""
