@@ -1,6 +1,6 @@
 #include "kernel_levels.hpp"
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 

@@ -48,12 +48,10 @@ std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
 
 void bind_cloth(nb::module_& m) {
   m.def(
-      "check_mesh", [](const Points2& rest, const Triangles& triangles) { ClothMesh(rest, triangles); }, "rest"_a,
-      "triangles"_a,
-      "Internal: raises ValueError, naming the field, unless this is a triangulation that cloth can have.");
-  m.def(
       "sheet_count", [](const Points2& rest, const Triangles& triangles) { return ClothMesh(rest, triangles).sheets; },
-      "rest"_a, "triangles"_a, "Internal: number of pieces of a mesh that hang together.");
+      "rest"_a, "triangles"_a,
+      "Internal: number of pieces of a mesh that hang together. Raises ValueError, naming the field, unless it is a "
+      "triangulation that cloth can have.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def(

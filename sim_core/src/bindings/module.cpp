@@ -8,15 +8,16 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstdlib>
 #include <memory>
-#include <stdexcept>
 #include <string>
 #include <tuple>
 #include <vector>
 
 #include "build_constants.hpp"
 #include "kernel_levels.hpp"
+#include "math/refusal.hpp"
 #include "rods/chain.hpp"
 #include "rods/rods.hpp"
 
@@ -24,8 +25,8 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace sim_core {
+
 void bind_cloth(nb::module_& m);
-}  // namespace sim_core
 
 namespace {
 
@@ -66,7 +67,7 @@ struct RodArrays {
   Truths converged = allocate<Truths>({n}), stable = allocate<Truths>({n});
   Counts iterations = allocate<Counts>({n});
 
-  sim_core::RodOutput output() {
+  RodOutput output() {
     return {centerline.data(), curvature.data(),  frame.data(),     energy.data(), residual.data(),
             refinement.data(), iterations.data(), converged.data(), stable.data()};
   }
@@ -77,9 +78,8 @@ struct RodArrays {
 };
 
 template <class Batch, class Kernel>
-void solve_in_parts(Kernel solve, const Batch& batch, const sim_core::RodSettings& settings, int points,
-                    std::size_t n) {
-  const auto samples = sim_core::sample_points(points, settings.elements);
+void solve_in_parts(Kernel solve, const Batch& batch, const RodSettings& settings, int points, std::size_t n) {
+  const auto samples = sample_points(points, settings.elements);
   const auto total = static_cast<std::int64_t>(n);
   for (std::int64_t begin = 0; begin < total; begin += rods_between_signals) {
     {
@@ -93,13 +93,15 @@ void solve_in_parts(Kernel solve, const Batch& batch, const sim_core::RodSetting
 Solution solve_rods(Input gamma, Input phi0, Input phi1, double twist_stiffness, int elements, int points,
                     int start_level, const std::string& kernel) {
   const std::size_t n = gamma.size(), p = static_cast<std::size_t>(points);
-  if (phi0.size() != n || phi1.size() != n) throw std::invalid_argument("gamma, phi0, phi1: lengths must be equal");
-  const sim_core::RodSettings settings{twist_stiffness, elements,
-                                       start_level < 0 ? sim_core::default_start_level(elements) : start_level};
-  sim_core::check_rods(settings, points, phi0.data(), phi1.data(), static_cast<std::int64_t>(n));
-  const sim_core::RodKernels kernels = sim_core::kernel_level(kernel).rods;
+  if (phi0.size() != n || phi1.size() != n) refuse("gamma, phi0, phi1: lengths must be equal");
+  const RodSettings settings{twist_stiffness, elements, start_level < 0 ? default_start_level(elements) : start_level};
+  double curvature_max = 0.0;
+  for (std::size_t i = 0; i < n; ++i)
+    curvature_max = std::max(curvature_max, std::hypot(phi0.data()[i], phi1.data()[i]));
+  check_settings(settings, points, curvature_max);
+  const RodKernels kernels = kernel_level(kernel).rods;
   RodArrays arrays{n, p};
-  const sim_core::RodBatch batch{gamma.data(), phi0.data(), phi1.data(), arrays.output()};
+  const RodBatch batch{gamma.data(), phi0.data(), phi1.data(), arrays.output()};
   solve_in_parts(kernels.solve, batch, settings, points, n);
   return arrays.solution();
 }
@@ -109,18 +111,17 @@ Solution solve_general_rods(Input gamma, InputRows<3> stiffness, InputRows<4> cl
                             double curvature_max, const std::string& kernel) {
   const std::size_t n = gamma.size(), p = natural_at_points.shape(1), N = static_cast<std::size_t>(elements);
   const int points = static_cast<int>(p);
-  const sim_core::RodSettings settings{0.0, elements, sim_core::default_start_level(elements)};
-  sim_core::check_settings(settings, points, curvature_max);
+  const RodSettings settings{0.0, elements, default_start_level(elements)};
+  check_settings(settings, points, curvature_max);
   if (stiffness.shape(0) != n || clamp.shape(0) != n || natural.shape(0) != n || start.shape(0) != n ||
       slope.shape(0) != n || natural_at_points.shape(0) != n || natural.shape(1) != 2 * N + 1 ||
       start.shape(1) != 2 * N + 1 || slope.shape(1) != N / 2 + 1) {
-    throw std::invalid_argument("solve_general_rods: shapes disagree");
+    refuse("solve_general_rods: shapes disagree");
   }
-  const sim_core::RodKernels kernels = sim_core::kernel_level(kernel).rods;
+  const RodKernels kernels = kernel_level(kernel).rods;
   RodArrays arrays{n, p};
-  const sim_core::GeneralRodBatch batch{
-      gamma.data(), stiffness.data(),         clamp.data(),   natural.data(), start.data(),
-      slope.data(), natural_at_points.data(), arrays.output()};
+  const GeneralRodBatch batch{gamma.data(), stiffness.data(),         clamp.data(),   natural.data(), start.data(),
+                              slope.data(), natural_at_points.data(), arrays.output()};
   solve_in_parts(kernels.solve_general, batch, settings, points, n);
   return arrays.solution();
 }
@@ -132,12 +133,9 @@ struct BuildInfo {
 BuildInfo build_info() {
   const char* pinned = std::getenv("STICKSLIP_CLOTH_KERNEL");
   const std::string isa = SIM_CORE_BUILD_ISA;
-  return {SIM_CORE_VERSION,
-          SIM_CORE_BUILD_HASH,
-          SIM_CORE_BUILD_COMPILER,
-          isa.empty() ? SIM_CORE_BUILD_PROCESSOR : isa,
-          sim_core::kernel_names().back(),
-          sim_core::kernel_level(pinned ? pinned : "").cloth.name,
+  return {SIM_CORE_VERSION,        SIM_CORE_BUILD_HASH,
+          SIM_CORE_BUILD_COMPILER, isa.empty() ? SIM_CORE_BUILD_PROCESSOR : isa,
+          kernel_names().back(),   kernel_level(pinned ? pinned : "").cloth.name,
           SIM_CORE_BUILD_EIGEN};
 }
 
@@ -170,18 +168,20 @@ NB_MODULE(_sim_core, m) {
   m.def("solve_general_rods", &solve_general_rods, "gamma"_a, "stiffness"_a, "clamp"_a, "natural"_a, "start"_a,
         "slope"_a, "natural_at_points"_a, "elements"_a, "curvature_max"_a, "kernel"_a = "",
         "Internal: see stickslip_sim_core.solve_general_rods; arrays as in rods/rods.hpp.");
-  m.def("relax_chain", &sim_core::relax_chain, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
-        "natural"_a, "quaternions"_a,
+  m.def("relax_chain", &relax_chain, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a, "natural"_a,
+        "quaternions"_a,
         "Internal: equilibrium of one chain: quaternions (N + 1, 4), and whether it is stable. See rods/chain.hpp.");
-  m.def("chain_frames", &sim_core::chain_frames, "curvature"_a, "clamp"_a,
+  m.def("chain_frames", &chain_frames, "curvature"_a, "clamp"_a,
         "Internal: quaternions (N + 1, 4) of the chain with curvature (N, 3) in its elements.");
-  m.def("chain_centerline", &sim_core::chain_centerline, "quaternions"_a,
+  m.def("chain_centerline", &chain_centerline, "quaternions"_a,
         "Internal: positions (N + 1, 3) of the nodes of a chain, L.");
-  m.def("chain_jacobian", &sim_core::chain_jacobian, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
+  m.def("chain_jacobian", &chain_jacobian, nb::call_guard<nb::gil_scoped_release>(), "gamma"_a, "stiffness"_a,
         "natural"_a, "quaternions"_a, "basis"_a, "stride"_a,
         "Internal: derivatives of nodal positions by gamma and natural curvature. See rods/chain.hpp.");
-  m.def("kernels", &sim_core::kernel_names, "Internal: levels of kernels that this processor runs, narrowest first.");
-  m.def("relax_rod", &sim_core::relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
+  m.def("kernels", &kernel_names, "Internal: levels of kernels that this processor runs, narrowest first.");
+  m.def("relax_rod", &relax_rod, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
         "Internal: as relax_chain, of a uniform round rod.");
-  sim_core::bind_cloth(m);
+  bind_cloth(m);
 }
+
+}  // namespace sim_core

@@ -4,8 +4,8 @@
 #include <numeric>
 #include <utility>
 
-#include "cloth/refusal.hpp"
 #include "cloth/solver.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 namespace {

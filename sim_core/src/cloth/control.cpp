@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 namespace {

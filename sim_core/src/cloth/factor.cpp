@@ -204,7 +204,7 @@ StaleFactor::StaleFactor(const Numbering& numbering)
 
 double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
                           const ClothSettings& settings) {
-  if (!made_ || cost_.too_much(settings)) {
+  if (!age.exists() || age.too_much(settings)) {
     make(assembly, x, contact, dt);
     return 1.0;
   }
@@ -219,9 +219,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   storage_.mark_all();
   matrix_ = assembly.neighbour(x, numbers_);
   refresh(assembly, contact);
-  made_ = true;
-  dt_ = dt;
-  cost_.restart();
+  age.made(dt);
 }
 
 void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {
@@ -231,13 +229,11 @@ void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact)
   modes_ = contact.mode;
 }
 
-void FactorCost::spent(int iterations) {
+void FactorAge::spent(int iterations) {
   last_ = iterations;
   if (fresh_ < 0) fresh_ = last_, excess_ = 0;
   excess_ += std::max(0, last_ - fresh_);
 }
-
-bool StaleFactor::fits(double dt) const { return made_ && std::abs(dt - dt_) <= 1e-9 * dt_; }
 
 FactorPool::FactorPool(const Numbering& numbering, int size) : numbering_(numbering), size_(size) {
   factors_.push_back(std::make_unique<StaleFactor>(numbering));
@@ -245,13 +241,13 @@ FactorPool::FactorPool(const Numbering& numbering, int size) : numbering_(number
 
 StaleFactor& FactorPool::of(double dt) {
   std::size_t place = 0;
-  while (place < factors_.size() && !factors_[place]->fits(dt)) ++place;
+  while (place < factors_.size() && !factors_[place]->age.fits(dt)) ++place;
   if (place == factors_.size()) {
     if (place < size_) {
       factors_.push_back(std::make_unique<StaleFactor>(numbering_));
     } else {
       --place;
-      factors_[place]->forget();
+      factors_[place]->age.forget();
     }
   }
   std::rotate(factors_.begin(), factors_.begin() + place, factors_.begin() + place + 1);

@@ -1,6 +1,9 @@
 // A Cholesky factor that is kept while it is worth keeping: the preconditioner of every linear solve.
 #pragma once
 
+#include <Eigen/Core>
+#include <array>
+#include <cmath>
 #include <memory>
 #include <vector>
 
@@ -8,6 +11,7 @@
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
 #include "cloth/settings.hpp"
+#include "contact/contact_set.hpp"
 #include "contact/state.hpp"
 #include "math/buffer.hpp"
 
@@ -37,10 +41,14 @@ struct FactorStorage {
   double mark(const std::vector<char>& touched);
 };
 
-// GMRES iterations that a factor has cost since it was new.
-class FactorCost {
+// Whether a factor was made, for steps of which length, and GMRES iterations that it has cost since.
+class FactorAge {
  public:
-  void restart() { fresh_ = -1, last_ = excess_ = 0; }
+  void made(double dt) { dt_ = dt, fresh_ = -1, last_ = excess_ = 0; }
+  void forget() { dt_ = 0.0; }
+  bool exists() const { return dt_ > 0.0; }
+  // Whether it is for steps of this length.
+  bool fits(double dt) const { return exists() && std::abs(dt - dt_) <= 1e-9 * dt_; }
   void spent(int iterations);
   // Whether a new one would have cost less, or may help.
   bool too_much(const ClothSettings& settings) const {
@@ -48,6 +56,7 @@ class FactorCost {
   }
 
  private:
+  double dt_ = 0.0;                         // s; 0: there is none
   int last_ = 0, fresh_ = -1, excess_ = 0;  // of the last solve, of the first, and beyond that
 };
 
@@ -56,17 +65,14 @@ class StaleFactor {
   explicit StaleFactor(const Numbering& numbering);
   StaleFactor(const StaleFactor&) = delete;
 
-  const Factor& view() const { return view_; }
+  FactorAge age;
 
-  // Whether it is for steps of this length.
-  bool fits(double dt) const;
+  const Factor& view() const { return view_; }
   // Makes it anew if it never was made or has cost more GMRES iterations than a new one would; where it is of other
   // contacts, those parts that hold them. Returns the share that was made.
   double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
                const ClothSettings& settings);
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
-  void spent(int iterations) { cost_.spent(iterations); }
-  void forget() { made_ = false; }
 
  private:
   void refresh(const Assembly& assembly, const ContactState& contact);
@@ -79,9 +85,6 @@ class StaleFactor {
   Buffer<float> added_;
   std::vector<int> modes_;     // that it was made for
   std::vector<char> touched_;  // nodes whose modes are others now
-  bool made_ = false;
-  double dt_ = 0.0;
-  FactorCost cost_;
 };
 
 // Factors for the lengths of step of late: a length that recurs is not factored again.
@@ -98,6 +101,60 @@ class FactorPool {
   std::vector<std::unique_ptr<StaleFactor>> factors_;  // the latest first
   const Numbering& numbering_;
   std::size_t size_;
+};
+
+// The preconditioner while pairs are active: a factor with an order of its own, by nested dissection in the space where
+// the cloth is. In the plane at rest, layers of a fold would couple everywhere. Nodes that stick to bodies couple
+// nothing: sheets that lie on a floor do not hang together through it.
+class PairFactor {
+ public:
+  explicit PairFactor(const FactorSettings& constants) : constants_(constants) {}
+  PairFactor(const PairFactor&) = delete;
+
+  FactorAge age;
+
+  const Factor& view() const { return view_; }
+
+  // Makes it anew if it is of another length of step or has cost more GMRES iterations than a new one would; where too
+  // many nodes are held otherwise by pairs and bodies, those parts that hold them. Returns the share that was made.
+  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs,
+               double dt, const ClothSettings& settings);
+
+ private:
+  // An active pair: w_a w_b stiffness for each two of its nodes, which are -1 where they are held or pinned.
+  struct Entry {
+    std::array<int, 4> node;
+    std::array<float, 4> weight;
+    Eigen::Matrix3f stiffness;
+  };
+  using Hold = Eigen::Matrix<float, 6, 1>;  // xx xy xz yy yz zz, N/m
+
+  void collect(const ContactSet& pairs, int free_nodes);
+  int compare(const Assembly& assembly, const ContactState& contact);
+  int missing(const ContactState& contact) const;
+  void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs);
+  void enter(bool whole);
+  void read_matrix(Assembly& assembly, const Buffer<double>& x);
+  void make(const Assembly& assembly);
+  static void add_holds(const Entry& entry, std::vector<Hold>& holds);
+  bool has_place(const Entry& entry) const;
+  // Calls with the slot of each two of its nodes, and the product of their weights.
+  template <class Call>
+  void visit(const Entry& entry, const Call& call) const;
+
+  FactorSettings constants_;
+  std::vector<int> order_, place_;  // nodes by place, and back
+  std::vector<char> pinned_;        // nodes that stuck when the order was made
+  Pattern bending_, membrane_;      // in places; both have those of pairs
+  std::unique_ptr<FactorStorage> storage_;
+  Factor view_{};
+  ClothMatrix matrix_{};
+  NeighbourNumbers numbers_;
+  Buffer<float> scalars_, blocks_, diagonal_, added_, ordered_;
+  std::vector<std::array<int, 2>> scalar_slots_, block_slots_;  // of the assembly's entries, and here
+  std::vector<Entry> wanted_, entries_;                         // entries_: those in the factor
+  std::vector<Hold> bodies_, holds_, held_;                     // of nodes, by bodies; with wanted_; in the factor
+  std::vector<char> touched_, due_;
 };
 
 }  // namespace sim_core

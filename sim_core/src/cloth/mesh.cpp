@@ -1,5 +1,6 @@
 #include "cloth/mesh.hpp"
 
+#include <Eigen/Dense>
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
@@ -10,13 +11,14 @@
 #include <utility>
 #include <vector>
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 namespace {
 
 using Eigen::Vector2d;
 using Eigen::Vector3d;
+using Eigen::VectorXd;
 
 // Whether the open segment pq crosses the triangle abc [Möller & Trumbore 1997].
 bool crosses(const Vector3d& p, const Vector3d& q, const Vector3d& a, const Vector3d& b, const Vector3d& c) {
@@ -31,6 +33,78 @@ bool crosses(const Vector3d& p, const Vector3d& q, const Vector3d& a, const Vect
   if (t < 0.0 || s + t > 1.0) return false;
   const double at = v.dot(other) / det;
   return at > 0.0 && at < 1.0;
+}
+
+// A fit is trusted when its singular values, over the largest, stay above this.
+constexpr double rank_min = 0.03;
+
+Vector2d normal_of(const Vector2d& along) { return Vector2d(along.y(), -along.x()) / along.norm(); }
+
+struct SlopeFit {
+  std::vector<int> nodes;
+  VectorXd weights;
+};
+
+// d/dn at the middle of an edge, exact for quadratics: least squares over the nodes of the two triangles and of their
+// neighbours, ring after ring until they determine a quadratic.
+SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& around, const ClothMesh::Edge& edge,
+                   const Vector2d& normal) {
+  const Vector2d a = mesh.rest.row(edge.a), b = mesh.rest.row(edge.b);
+  const Vector2d middle = 0.5 * (a + b), tangent = (b - a).normalized();
+  const double scale = (b - a).norm();
+  std::vector<int> ring{edge.triangle[0], edge.triangle[1]};
+  for (int growth = 0; growth < 4; ++growth) {
+    std::vector<int> wider = ring;
+    for (int t : ring) wider.insert(wider.end(), around[t].begin(), around[t].end());
+    std::sort(wider.begin(), wider.end());
+    wider.erase(std::unique(wider.begin(), wider.end()), wider.end());
+    ring = wider;
+    std::vector<int> nodes;
+    for (int t : ring) {
+      for (int c = 0; c < 3; ++c) nodes.push_back(mesh.triangles(t, c));
+    }
+    std::sort(nodes.begin(), nodes.end());
+    nodes.erase(std::unique(nodes.begin(), nodes.end()), nodes.end());
+    const int count = static_cast<int>(nodes.size());
+    if (count < 6) continue;
+    Eigen::MatrixXd fit(count, 6);
+    VectorXd weight(count);
+    for (int i = 0; i < count; ++i) {
+      const Vector2d offset = (mesh.rest.row(nodes[i]).transpose() - middle) / scale;
+      const double u = tangent.dot(offset), v = normal.dot(offset);
+      weight[i] = 1.0 / (0.25 + offset.squaredNorm());
+      fit.row(i) << 1.0, u, v, u * u, u * v, v * v;
+      fit.row(i) *= weight[i];
+    }
+    const Eigen::JacobiSVD<Eigen::MatrixXd> svd(fit, Eigen::ComputeThinU | Eigen::ComputeThinV);
+    if (svd.singularValues()[5] < rank_min * svd.singularValues()[0]) continue;
+    // Row of the pseudo-inverse that gives the coefficient of v.
+    const VectorXd row =
+        svd.matrixU() * (svd.singularValues().cwiseInverse().asDiagonal() * svd.matrixV().row(2).transpose());
+    return {nodes, row.cwiseProduct(weight) / scale};
+  }
+  refuse(text("triangles: the nodes around edge (", edge.a, ", ", edge.b,
+              ") must determine a quadratic; refine the mesh"));
+}
+
+// d/dn at an edge between the slopes of its two triangles, which hold at their centroids.
+SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Vector2d& normal) {
+  SlopeFit fit{{edge.a, edge.b, -1, -1}, VectorXd::Zero(4)};
+  const double areas = mesh.area[edge.triangle[0]] + mesh.area[edge.triangle[1]];
+  for (int side = 0; side < 2; ++side) {
+    const int t = edge.triangle[side], other = edge.triangle[1 - side];
+    const double share = mesh.area[other] / areas;  // heights over the edge are as the areas
+    fit.nodes[2 + side] = mesh.triangles(t, edge.corner[side]);
+    for (int c = 0; c < 3; ++c) {
+      const Vector2d along =
+          (mesh.rest.row(mesh.triangles(t, (c + 2) % 3)) - mesh.rest.row(mesh.triangles(t, (c + 1) % 3))).transpose();
+      const Vector2d gradient = -normal_of(along) * along.norm() / (2.0 * mesh.area[t]);
+      const int node = mesh.triangles(t, c);
+      const int place = node == edge.a ? 0 : node == edge.b ? 1 : 2 + side;
+      fit.weights[place] += share * normal.dot(gradient);
+    }
+  }
+  return fit;
 }
 
 }  // namespace
@@ -145,6 +219,72 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
     }
   }
   return found;
+}
+
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, bool compact) {
+  const int count = static_cast<int>(mesh.triangles.rows());
+  std::vector<std::vector<int>> around(count);
+  for (const ClothMesh::Edge& edge : mesh.edges) {
+    if (edge.boundary()) continue;
+    around[edge.triangle[0]].push_back(edge.triangle[1]);
+    around[edge.triangle[1]].push_back(edge.triangle[0]);
+  }
+  std::vector<SlopeFit> slopes(mesh.edges.size());
+  for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
+    const ClothMesh::Edge& edge = mesh.edges[e];
+    if (edge.boundary()) continue;
+    const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
+    slopes[e] = compact ? mean_slope(mesh, edge, normal_of(along)) : fit_slope(mesh, around, edge, normal_of(along));
+  }
+  std::vector<Stencil> stencils(count);
+  for (int t = 0; t < count; ++t) {
+    std::map<int, Eigen::Vector3d> entries;
+    const auto add = [&](int node, const Eigen::Vector3d& weight) {
+      const auto [at, fresh] = entries.try_emplace(node, Eigen::Vector3d::Zero());
+      at->second += weight;
+    };
+    Vector2d p[3], normal[3], gradient[3];
+    double length[3];
+    for (int c = 0; c < 3; ++c) p[c] = mesh.rest.row(mesh.triangles(t, c));
+    for (int c = 0; c < 3; ++c) {
+      const Vector2d along = p[(c + 2) % 3] - p[(c + 1) % 3];
+      length[c] = along.norm();
+      normal[c] = normal_of(along);  // outward: the triangle runs counter-clockwise
+      gradient[c] = -normal[c] * length[c] / (2.0 * mesh.area[t]);
+    }
+    std::vector<Eigen::Vector3d> open;
+    for (int c = 0; c < 3; ++c) {
+      const int e = mesh.triangle_edges[t][c];
+      const ClothMesh::Edge& edge = mesh.edges[e];
+      const Eigen::Vector3d direction = length[c] / mesh.area[t] *
+                                        Eigen::Vector3d(normal[c].x() * normal[c].x(), normal[c].y() * normal[c].y(),
+                                                        2.0 * normal[c].x() * normal[c].y());
+      if (edge.boundary()) {
+        open.push_back(direction);
+        continue;
+      }
+      const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
+      const double sign = normal_of(along).dot(normal[c]) > 0.0 ? 1.0 : -1.0;
+      for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
+        add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
+      }
+      for (int i = 0; i < 3; ++i) add(mesh.triangles(t, i), -normal[c].dot(gradient[i]) * direction);
+    }
+    Eigen::Matrix3d project = Eigen::Matrix3d::Identity();
+    if (!open.empty()) {
+      const Rigidity& rigidity = fabrics.at(t).rigidity;
+      Eigen::MatrixXd n(3, open.size());
+      for (std::size_t i = 0; i < open.size(); ++i) n.col(i) = open[i];
+      project -= n * (n.transpose() * rigidity * n).ldlt().solve(n.transpose() * rigidity);
+    }
+    Stencil& stencil = stencils[t];
+    stencil.weights.resize(entries.size(), 3);
+    for (const auto& [node, weight] : entries) {
+      stencil.weights.row(stencil.nodes.size()) = (project * weight).transpose();
+      stencil.nodes.push_back(node);
+    }
+  }
+  return stencils;
 }
 
 }  // namespace sim_core

@@ -1,4 +1,4 @@
-// Cloth at rest: its mesh in the plane, what it is made of, and the plate element (plate.cpp).
+// Cloth at rest: its mesh in the plane, what it is made of, and the plate element.
 #pragma once
 
 #include <Eigen/Core>
@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "cloth/problem.hpp"
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 

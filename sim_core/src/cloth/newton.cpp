@@ -27,7 +27,7 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, St
     StaleFactor& factor = factors.latest();
     report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
     const int iterations = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
-    factor.spent(iterations);
+    factor.age.spent(iterations);
     report.krylov += iterations;
   } else {
     solve_with_pairs(*pairs, x, dt, report);
@@ -50,7 +50,7 @@ void Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, do
                                                  : std::min(settings_.krylov_tolerance, constants_.pairs_tolerance);
   const int iterations = solve_linear(&pairs, pair_factor_.view(), tolerance);
   assembly_.matrix.pairs = nullptr;
-  pair_factor_.spent(iterations);
+  pair_factor_.age.spent(iterations);
   report.krylov += iterations;
 }
 
@@ -156,7 +156,7 @@ void Newton::begin(const StepProblem& problem, Buffer<double>& x, bool from_rest
   predict(problem, x, x, from_rest);
   if (pairs) {
     ends_ = x;
-    pairs->near().cap(problem.start, x);
+    pairs->near.cap(problem.start, x);
   }
   assembly_.set_diagonal(problem.dt, problem.damping);
   correction.factors.of(problem.dt);
@@ -165,7 +165,7 @@ void Newton::begin(const StepProblem& problem, Buffer<double>& x, bool from_rest
   own_stiffness_ = contact.stiffness;
   strained_ = false;
   if (!pairs) return;
-  pairs->smoothing = smoothly ? constants_.smoothing_ratio * pairs->near().thickness : 0.0;
+  pairs->smoothing = smoothly ? constants_.smoothing_ratio * pairs->near.thickness : 0.0;
   Buffer<double> expected = ends_;
   for (int i = 0; i < free_nodes; ++i) {
     at_node(expected, i) = at_node(problem.start, i) + problem.dt * at_node(problem.velocity, i);
@@ -173,7 +173,7 @@ void Newton::begin(const StepProblem& problem, Buffer<double>& x, bool from_rest
   std::vector<Eigen::Matrix3d> own(free_nodes);
   for (int i = 0; i < free_nodes; ++i) own[i] = assembly_.own_block(i);
   std::vector<Eigen::Matrix3d> turns;
-  for (const Bone& bone : pairs->materials().bones) {
+  for (const Bone& bone : pairs->materials.bones) {
     turns.push_back(problem.at_end[bone.body].rotation * problem.at_start[bone.body].rotation.transpose());
   }
   pairs->begin(problem.start, ends_, expected, std::move(own), std::move(turns));
@@ -188,12 +188,12 @@ Norms Newton::move(const StepProblem& problem, const Buffer<double>& x, double s
   if (pairs) {
     std::copy(ends_.begin() + 4L * free_nodes, ends_.end(), trial_.begin() + 4L * free_nodes);
     wanted_ = trial_;
-    if (!pairs->near().cap(x, trial_, hops)) {
+    if (!pairs->near.cap(x, trial_, hops)) {
       strained_ = true;
-      const double common = std::max(pairs->near().common_share(x, wanted_), constants_.common_least);
+      const double common = std::max(pairs->near.common_share(x, wanted_), constants_.common_least);
       if (common < 1.0) {
         for (std::size_t i = 0; i < trial_.size(); ++i) trial_[i] = x[i] + common * (wanted_[i] - x[i]);
-        pairs->near().cap(x, trial_, hops);
+        pairs->near.cap(x, trial_, hops);
       }
     }
   }
@@ -279,7 +279,7 @@ double Newton::reach() const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     farthest = std::max(farthest, at_node(correction.change, i).cast<double>().norm());
   }
-  return std::min(1.0, constants_.smooth_hops * pairs->near().margin() / farthest);
+  return std::min(1.0, constants_.smooth_hops * pairs->near.margin() / farthest);
 }
 
 // Once the smoothed law holds nearly: whether the exact one does, or else makes it sharper. Returns whether it did

@@ -6,7 +6,6 @@
 
 #include "cloth/assembly.hpp"
 #include "cloth/factor.hpp"
-#include "cloth/pair_factor.hpp"
 #include "cloth/settings.hpp"
 #include "contact/contact_set.hpp"
 #include "contact/state.hpp"

@@ -4,7 +4,7 @@
 #include <numeric>
 #include <set>
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 namespace {
@@ -107,18 +107,12 @@ Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points) 
   return dissector.out;
 }
 
-void Pattern::add_row(const std::vector<int>& nodes) {
-  node.insert(node.end(), nodes.begin(), nodes.end());
-  begin.push_back(static_cast<int>(node.size()));
-}
-
 Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place) {
   Pattern out;
   for (int i : order) {
-    std::vector<int> row;
-    for (int j : from[i]) row.push_back(place[j]);
-    std::sort(row.begin(), row.end());
-    out.add_row(row);
+    for (int j : from[i]) out.node.push_back(place[j]);
+    std::sort(out.node.begin() + out.begin.back(), out.node.end());
+    out.begin.push_back(static_cast<int>(out.node.size()));
   }
   return out;
 }
@@ -163,16 +157,9 @@ Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils
 
   bending = renumbered(coupled(stencils, local, free_nodes), dissection.order, place);
   compact_bending = renumbered(compact_graph, dissection.order, place);
-  std::vector<std::set<int>> near(free_nodes);
-  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
-    for (int a = 0; a < 3; ++a) {
-      for (int b = 0; b < 3; ++b) {
-        const int i = node[mesh.triangles(t, a)], j = node[mesh.triangles(t, b)];
-        if (i < free_nodes && j < free_nodes) near[i].insert(j);
-      }
-    }
-  }
-  for (const std::set<int>& row : near) membrane.add_row({row.begin(), row.end()});
+  std::vector<Stencil> corners;
+  for (const auto& t : mesh.triangles.rowwise()) corners.push_back({{t[0], t[1], t[2]}, {}});
+  membrane = renumbered(coupled(corners, local, free_nodes), dissection.order, place);
 }
 
 }  // namespace sim_core

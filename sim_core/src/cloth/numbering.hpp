@@ -24,7 +24,6 @@ Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points);
 struct Pattern {
   std::vector<int> begin{0}, node;
 
-  void add_row(const std::vector<int>& nodes);
   int rows() const { return static_cast<int>(begin.size()) - 1; }
   // Place of (i, j) in `node`; -1 if there is none, as for held nodes.
   int slot(int i, int j) const;

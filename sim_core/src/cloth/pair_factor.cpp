@@ -1,7 +1,6 @@
-#include "cloth/pair_factor.hpp"
-
 #include <algorithm>
-#include <cmath>
+
+#include "cloth/factor.hpp"
 
 namespace sim_core {
 namespace {
@@ -17,9 +16,9 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
   const int changed = compare(assembly, contact);
   const double count = static_cast<double>(wanted_.size());
   // Under a smoothed law all pairs change all the time.
-  bool whole = !made_ || pairs.smoothing > 0.0 || std::abs(dt - dt_) > 1e-9 * dt_ || cost_.too_much(settings);
+  bool whole = pairs.smoothing > 0.0 || !age.fits(dt) || age.too_much(settings);
   if (!whole && !(changed > constants_.changed_share * count)) return 0.0;
-  if (!made_ || missing(contact) > constants_.missing_share * count) {
+  if (!age.exists() || missing(contact) > constants_.missing_share * count) {
     order(assembly, x, contact, pairs);
     compare(assembly, contact);
     whole = true;
@@ -29,9 +28,7 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
   if (whole) {
     read_matrix(assembly, x);
     storage_->mark_all();
-    made_ = true;
-    dt_ = dt;
-    cost_.restart();
+    age.made(dt);
   } else {
     for (std::size_t i = 0; i < touched_.size(); ++i) due_[place_[i]] = touched_[i];
     share = storage_->mark(due_);
@@ -47,7 +44,7 @@ void PairFactor::collect(const ContactSet& pairs, int free_nodes) {
     Entry entry;
     for (int c = 0; c < 4; ++c) {
       const int node = pair.who.node[c];
-      entry.node[c] = node < free_nodes && !(made_ && pinned_[node]) ? node : -1;
+      entry.node[c] = node < free_nodes && (pinned_.empty() || !pinned_[node]) ? node : -1;
       entry.weight[c] = static_cast<float>(pair.weights[c]);
     }
     entry.stiffness = pair.row.symmetric.cast<float>();
@@ -122,7 +119,6 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const 
   const int free_nodes = numbering.free_nodes;
   pinned_.resize(free_nodes);
   for (int i = 0; i < free_nodes; ++i) pinned_[i] = contact.mode[i] == contact_stick;
-  made_ = true;
   collect(pairs, free_nodes);
   const auto graph_of = [&](const Pattern& pattern) {
     Graph graph(free_nodes);

@@ -2,25 +2,16 @@
 
 #include <cmath>
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 namespace {
 
 template <class Call>
-void each(Constants& constants, const Call& call) {
-  const auto group = [&](const std::string& name, auto& settings) {
-    settings.each([&](const std::string& field, auto& value) { call(name + "." + field, value); });
-  };
-  group("contact", constants.contact);
-  group("node", constants.node);
-  group("path", constants.path);
-  group("smooth", constants.smooth);
-  group("skeleton", constants.skeleton);
-  group("newton", constants.newton);
-  group("stepping", constants.stepping);
-  group("control", constants.control);
-  group("factor", constants.factor);
+void each_constant(Constants& constants, const Call& call) {
+  constants.each([&](const std::string& group, auto& settings) {
+    settings.each([&](const std::string& field, auto& value) { call(group + "." + field, value); });
+  });
 }
 
 void assign(double& to, const std::string&, double value) { to = value; }
@@ -33,7 +24,7 @@ void assign(int& to, const std::string& name, double value) {
 
 Constants::Constants(const std::map<std::string, double>& changed) {
   std::size_t known = 0;
-  each(*this, [&](const std::string& name, auto& to) {
+  each_constant(*this, [&](const std::string& name, auto& to) {
     const auto found = changed.find(name);
     if (found == changed.end()) return;
     if (!(found->second > 0.0) || !std::isfinite(found->second)) {
@@ -52,7 +43,7 @@ Constants::Constants(const std::map<std::string, double>& changed) {
 std::map<std::string, double> Constants::by_name() const {
   Constants own = *this;
   std::map<std::string, double> out;
-  each(own, [&](const std::string& name, auto& value) { out[name] = value; });
+  each_constant(own, [&](const std::string& name, auto& value) { out[name] = value; });
   return out;
 }
 

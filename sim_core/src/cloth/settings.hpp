@@ -7,7 +7,6 @@
 #include <string>
 
 #include "contact/settings.hpp"
-#include "math/named.hpp"
 
 namespace sim_core {
 
@@ -223,6 +222,8 @@ struct Constants {
   SteppingSettings stepping;
   ControlSettings control;
   FactorSettings factor;
+
+  SIM_CORE_NAMED(contact, node, path, smooth, skeleton, newton, stepping, control, factor)
 
   Constants() = default;
   // Replaces those named "group.name". Throws std::invalid_argument if there is none of that name, or where a value

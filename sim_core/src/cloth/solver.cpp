@@ -4,9 +4,9 @@
 #include <cmath>
 
 #include "cloth/mesh.hpp"
-#include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
 #include "kernel_levels.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 
@@ -149,7 +149,7 @@ template <class Call>
 void ClothSolver::each_bone_contact(const Call& call) const {
   if (!impl_->newton.pairs) return;
   for (const Pair& pair : impl_->newton.pairs->list()) {
-    const Bone* bone = impl_->newton.pairs->bone_of(pair);
+    const Bone* bone = impl_->newton.pairs->bone_of(pair.who);
     if (!bone || !pair.active()) continue;
     for (int c = 0; c < 4; ++c) {
       const int vertex = impl_->numbering.vertex[pair.who.node[c]];
@@ -210,7 +210,7 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     out.forces.row(p) = some[p]->at.force.transpose();
     out.distance[p] = some[p]->at.gap + some[p]->thickness;
     out.sliding[p] = some[p]->row.mode == contact_slip;
-    const Bone* bone = impl_->newton.pairs->bone_of(*some[p]);
+    const Bone* bone = impl_->newton.pairs->bone_of(some[p]->who);
     out.body[p] = bone ? bone->body : -1;
   }
   return out;

@@ -16,7 +16,7 @@
 #include "cloth/settings.hpp"
 #include "contact/bodies.hpp"
 #include "contact/contact_set.hpp"
-#include "contact/smooth.hpp"
+#include "contact/state.hpp"
 #include "contact/surface.hpp"
 
 namespace sim_core {

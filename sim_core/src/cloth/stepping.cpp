@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cloth/refusal.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 

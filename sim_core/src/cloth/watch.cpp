@@ -3,8 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cloth/refusal.hpp"
 #include "cloth/stepping.hpp"
+#include "math/refusal.hpp"
 
 namespace sim_core {
 
@@ -162,7 +162,7 @@ void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& ou
   }
   if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts is what cloth gets
     for (const Pair& pair : newton.pairs->list()) {
-      if (!newton.pairs->bone_of(pair)) continue;
+      if (!newton.pairs->bone_of(pair.who)) continue;
       Vector3d way = Vector3d::Zero();
       for (int c = 0; c < 4; ++c) {
         if (pair.who.node[c] < numbering.nodes - numbering.bones) way += pair.weights[c] * way_of(pair.who.node[c]);

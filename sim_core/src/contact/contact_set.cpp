@@ -96,21 +96,9 @@ double violation(const PairKinematics& at, int mode) {
   return std::hypot(at.gap, mode == contact_stick ? at.slip.norm() : 0.0);
 }
 
-ContactSet::ContactSet(Surface surface, const ContactMaterials& materials, const ContactSettings& settings,
-                       const PathSettings& path, double margin, int free_nodes)
-    : settings_(settings),
-      free_nodes_(free_nodes),
-      detection_(std::move(surface), materials, settings, path, margin, free_nodes) {}
-
 void ContactSet::restart() {
   kept_.clear();
   pairs_.clear();
-}
-
-void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                       std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
-  detection_.begin(start, ends, expected, std::move(own), std::move(bone_turns));
-  base_ = kept_;
 }
 
 void ContactSet::keep() {
@@ -124,7 +112,7 @@ void ContactSet::keep() {
 }
 
 void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& residual) {
-  detection_.find(x, smoothing, stiff, pairs_);
+  find(x);
   transfer(share);
   merge();
   linearize_at(x);
@@ -154,18 +142,18 @@ void ContactSet::count_errors(double stiffness, Norms& norms) const {
 }
 
 bool ContactSet::relevant() const {
-  const std::vector<int>& sheet_of_node = detection_.near.surface.sheet_of_node;
+  const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   return std::any_of(pairs_.begin(), pairs_.end(), [&](const Pair& pair) {
     const int last = std::max(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
-    return pair.active() || last < detection_.materials.sheets;
+    return pair.active() || last < materials.sheets;
   });
 }
 
 double ContactSet::sharpest() const {
   double out = std::numeric_limits<double>::infinity();
   for (const Pair& pair : pairs_) {
-    const Bone* bone = bone_of(pair);
-    if (bone && pair.active()) out = std::min(out, bone->radius / materials().cell);
+    const Bone* bone = bone_of(pair.who);
+    if (bone && pair.active()) out = std::min(out, bone->radius / materials.cell);
   }
   return out;
 }

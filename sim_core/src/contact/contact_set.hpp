@@ -62,44 +62,6 @@ struct PairPast {
 // Length by which an active pair violates its row: gap and, where it sticks, slip, m.
 double violation(const PairKinematics& at, int mode);
 
-// Finds closest points of cloth with itself, other cloth and surfaces, and how they have moved.
-class PairDetection {
- public:
-  PairDetection(Surface surface, const ContactMaterials& materials, const ContactSettings& settings,
-                const PathSettings& path, double margin, int free_nodes);
-
-  Neighbourhood near;
-  const ContactMaterials materials;
-
-  // See ContactSet::begin.
-  void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-             std::vector<Eigen::Matrix3d> own, std::vector<Eigen::Matrix3d> bone_turns);
-  // Replaces `pairs` by those at x, sorted by kind, first and feature, without forces. `smoothing` [m] and `stiff`: see
-  // ContactSet.
-  void find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs);
-  // The skeleton of a pair, or null.
-  const Bone* bone_of(const Candidate& pair) const;
-  // Least distance of any two pieces without a common node at the last search, m; infinite where none is near.
-  double least_distance() const { return least_distance_; }
-
- private:
-  void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
-                     std::vector<Pair>& pairs);
-  void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x, std::vector<Pair>& pairs);
-  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x,
-           std::vector<Pair>& pairs);
-  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights, const Eigen::Vector3d& rho);
-
-  ContactSettings settings_;
-  int free_nodes_;
-  double least_distance_, smoothing_ = 0.0;
-  bool stiff_ = false;
-  const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
-  Turns turns_;
-  std::vector<Eigen::Matrix3d> bone_turns_;
-  std::vector<Eigen::Matrix3d> own_;  // stiffness of the free nodes, N/m
-};
-
 class ContactSet {
  public:
   // `margin`: distance that nodes move before candidates are searched again, m.
@@ -109,7 +71,8 @@ class ContactSet {
   double smoothing = 0.0;  // length over which the law is smoothed, m; 0: the exact law
   bool stiff = false;      // along the normals, too
 
-  Neighbourhood& near() { return detection_.near; }
+  Neighbourhood near;
+  const ContactMaterials materials;
   const std::vector<Pair>& list() const { return pairs_; }
 
   // Forgets all forces.
@@ -148,25 +111,34 @@ class ContactSet {
 
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
-  const ContactMaterials& materials() const { return detection_.materials; }
   // The skeleton of a pair, or null.
-  const Bone* bone_of(const Pair& pair) const { return detection_.bone_of(pair.who); }
+  const Bone* bone_of(const Candidate& pair) const;
   // Least radius over the side of a cell of a skeleton that bears; infinite where none does.
   double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
   // Mean error of the forces by smoothing, N.
   double smoothed_force() const;
-  double least_distance() const { return detection_.least_distance(); }
+  // Least distance of any two pieces without a common node at the last search, m; infinite where none is near.
+  double least_distance() const { return least_distance_; }
 
  private:
+  // Replaces the pairs by those at x, without forces.
+  void find(const Buffer<double>& x);
+  void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x);
+  void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x);
+  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
+  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights, const Eigen::Vector3d& rho);
   void transfer(double share);
   void merge();
   void linearize_at(const Buffer<double>& x);
 
   ContactSettings settings_;
   int free_nodes_;
-  PairDetection detection_;
+  double least_distance_;
+  const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
+  Turns turns_;
+  std::vector<Eigen::Matrix3d> own_, bone_turns_;
   std::vector<Pair> pairs_;                   // sorted by kind, first, feature
   std::vector<PairPast> base_, kept_, best_;  // likewise
   std::vector<int> nodes_;                    // of `rows`

@@ -51,8 +51,8 @@ std::vector<double> farther_of(const ContactMaterials& materials) {
 
 }  // namespace
 
-PairDetection::PairDetection(Surface surface, const ContactMaterials& materials_in, const ContactSettings& settings,
-                             const PathSettings& path, double margin, int free_nodes)
+ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, const ContactSettings& settings,
+                       const PathSettings& path, double margin, int free_nodes)
     : near(std::move(surface), materials_in.farthest(), margin, path, farther_of(materials_in)),
       materials(materials_in),
       settings_(settings),
@@ -60,35 +60,33 @@ PairDetection::PairDetection(Surface surface, const ContactMaterials& materials_
       least_distance_(std::numeric_limits<double>::infinity()),
       turns_(settings.turn_max) {}
 
-void PairDetection::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                          std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
+void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
+                       std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
   bone_turns_ = std::move(bone_turns);
+  base_ = kept_;
 }
 
-void PairDetection::find(const Buffer<double>& x, double smoothing, bool stiff, std::vector<Pair>& pairs) {
-  smoothing_ = smoothing;
-  stiff_ = stiff;
+void ContactSet::find(const Buffer<double>& x) {
   std::vector<Candidate>& candidates = near.pairs(x);
   const double reach = (settings_.detection_range - 1.0) * near.thickness + 2.0 * near.moved(*start_, x);
-  pairs.clear();
+  pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
-  find_vertices(candidates, reach, x, pairs);
-  find_edges(candidates, reach, x, pairs);
+  find_vertices(candidates, reach, x);
+  find_edges(candidates, reach, x);
 }
 
-const Bone* PairDetection::bone_of(const Candidate& pair) const {
+const Bone* ContactSet::bone_of(const Candidate& pair) const {
   const std::vector<int>& sheet = near.surface.sheet_of_node;
   return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
 // `reach`: beyond what a pair keeps apart, m. A vertex may be closest to an edge or a corner of a triangle. Such a pair
 // counts once, and only where all triangles around the feature agree: otherwise a point inside one of them is closer.
-void PairDetection::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
-                                  std::vector<Pair>& pairs) {
+void ContactSet::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x) {
   const Surface& surface = near.surface;
   const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
   const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
@@ -134,21 +132,20 @@ void PairDetection::find_vertices(std::vector<Candidate>& candidates, double rea
       if (const Bone* bone = bone_of(who); bone && !bone->whole && feature >= triangles + edges) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
-        const auto first = std::lower_bound(pairs.begin(), pairs.end(), other,
+        const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
                                             [](const Pair& pair, int who) { return pair.who.first < who; });
-        if (std::any_of(first, pairs.end(), [&](const Pair& pair) {
+        if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
               return pair.who.first == other && pair.feature == triangles + edges + vertex;
             })) {
           continue;
         }
       }
-      add(candidates[found[i].candidate], feature, found[i].weights, x, pairs);
+      add(candidates[found[i].candidate], feature, found[i].weights, x);
     }
   }
 }
 
-void PairDetection::find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x,
-                               std::vector<Pair>& pairs) {
+void ContactSet::find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x) {
   for (Candidate& who : candidates) {
     if (who.kind != PairKind::edge_edge || who.distance > near.apart(who) + reach) continue;
     const FourPoints at = points_of(who, x);
@@ -157,14 +154,13 @@ void PairDetection::find_edges(std::vector<Candidate>& candidates, double reach,
     if (who.distance > near.apart(who) + reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
         crossing_squared(at) < settings_.crossing_least)
       continue;
-    add(who, who.second, weights, x, pairs);
+    add(who, who.second, weights, x);
   }
 }
 
 // With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum w_i^2/k_i: its
 // stiffness scales with the inverse of that.
-void PairDetection::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x,
-                        std::vector<Pair>& pairs) {
+void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x) {
   const FourPoints at = points_of(who, x);
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
@@ -183,7 +179,7 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
     given.segment<3>(6) += along_second[c] * way;
   }
   const Vector3d n = rho / distance;
-  const double share = stiff_ ? settings_.stiff_mean_share : settings_.mean_share;
+  const double share = stiff ? settings_.stiff_mean_share : settings_.mean_share;
   double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
   for (int c = 0; c < 4; ++c) {
     if (who.node[c] >= free_nodes_) continue;
@@ -196,29 +192,29 @@ void PairDetection::add(const Candidate& who, int feature, const Vector4d& weigh
   Vector3d slip = this->slip(who, weights, rho);
   slip -= slip.dot(n) * n;
   const double thickness = materials.apart(who.kind, a, b), k = settings_.law_stiffness / softness;
-  const double along = smoothing_ > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
-  const double across = (smoothing_ > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
+  const double along = smoothing > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
+  const double across = (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  pairs.push_back({who,
-                   feature,
-                   weights,
-                   {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
-                    k * smoothing_ * smoothing_},
-                   first - (!bone   ? 0.5
-                            : a > b ? 1.0
-                                    : 0.0) *
-                               rho,
-                   thickness,
-                   bone ? materials.thickness[std::min(a, b)] : thickness,
-                   along_first,
-                   along_second,
-                   given});
+  pairs_.push_back({who,
+                    feature,
+                    weights,
+                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
+                     k * smoothing * smoothing},
+                    first - (!bone   ? 0.5
+                             : a > b ? 1.0
+                                     : 0.0) *
+                                rho,
+                    thickness,
+                    bone ? materials.thickness[std::min(a, b)] : thickness,
+                    along_first,
+                    along_second,
+                    given});
 }
 
 // Motion of the first point over the second, less that by which rho turns: with a body or surface, or half with each
 // sheet.
-Vector3d PairDetection::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
+Vector3d ContactSet::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
   Matrix3d turn = Matrix3d::Zero();

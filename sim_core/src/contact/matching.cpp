@@ -90,8 +90,8 @@ void ContactSet::merge() {
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::vector<std::tuple<bool, bool, double>> rank(count);  // whether it keeps less apart, has no force; its gap
   for (std::size_t i = 0; i < count; ++i) {
-    const auto sheet = [&](int c) { return detection_.near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
-    rank[i] = {pairs_[i].thickness < materials().apart(sheet(0), sheet(3)), pairs_[i].at.force.isZero(0.0),
+    const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
+    rank[i] = {pairs_[i].thickness < materials.apart(sheet(0), sheet(3)), pairs_[i].at.force.isZero(0.0),
                pairs_[i].at.gap};
   }
   std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
@@ -100,7 +100,7 @@ void ContactSet::merge() {
     if (gone[i]) continue;
     const double radius = settings_.merge_radius * pairs_[i].scale;
     const auto take = [&](std::size_t j) {
-      if (gone[j] || bone_of(pairs_[j]) != bone_of(pairs_[i]) ||
+      if (gone[j] || bone_of(pairs_[j].who) != bone_of(pairs_[i].who) ||
           (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
         return;
       const Vector3d& force = pairs_[j].at.force;

@@ -6,9 +6,29 @@
 // constants.json): percentages are iterations of Newton's method.
 #pragma once
 
-#include "math/named.hpp"
+#include <algorithm>
+#include <string>
+#include <string_view>
 
 namespace sim_core {
+
+// Calls with each of the `names`, which are separated by commas, and its value.
+template <class Call, class... Values>
+void each_named(std::string_view names, const Call& call, Values&... values) {
+  const auto next = [&] {
+    const std::string name(names.substr(0, names.find(',')));
+    names.remove_prefix(std::min(name.size() + 2, names.size()));
+    return name;
+  };
+  (call(next(), values), ...);
+}
+
+// Within a struct: its members, in this order.
+#define SIM_CORE_NAMED(...)                                \
+  template <class Call>                                    \
+  void each(const Call& call) {                            \
+    sim_core::each_named(#__VA_ARGS__, call, __VA_ARGS__); \
+  }
 
 struct ContactSettings {
   // k/K, of the law of pairs, bodies and surfaces. k = K did not solve a sheet on an incline within 60 s. Sweep: 0.05

@@ -38,7 +38,7 @@ struct ContactMaterials {
     return last < 0 ? nullptr : &bones[last];
   }
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
-  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves (contact/smooth.hpp): pairs only
+  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves (contact/state.hpp): pairs only
   // hold what comes nearer between the nodes.
   double apart(int a, int b) const {
     if (const Bone* bone = bone_of(a, b)) return bone->radius;

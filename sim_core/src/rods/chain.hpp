@@ -10,7 +10,7 @@
 #include <Eigen/Core>
 #include <utility>
 
-#include "math/so3.hpp"
+#include "math/lanes.hpp"
 
 namespace sim_core {
 

@@ -9,7 +9,7 @@
 // R K R^T = I + (C - 1) t t^T, and an element needs world vectors only, no matrix product.
 #pragma once
 
-#include "math/so3.hpp"
+#include "math/lanes.hpp"
 
 namespace sim_core {
 namespace {

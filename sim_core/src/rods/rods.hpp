@@ -70,9 +70,6 @@ int default_start_level(int elements);
 // large.
 void check_settings(const RodSettings& settings, int points, double curvature_max);
 
-// The same for n uniform rods.
-void check_rods(const RodSettings& settings, int points, const double* phi0, const double* phi1, std::int64_t n);
-
 // `points` points of uniform arc length from s = 0 to s = 1, both included.
 std::vector<SamplePoint> sample_points(int points, int elements);
 

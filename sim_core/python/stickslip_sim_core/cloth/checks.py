@@ -43,7 +43,6 @@ class Check:
     formula: str
     """What is measured, in words."""
 
-    unit: str
     value: Callable[[Seen], float]
     limit: float | None
     """Largest value of a valid run; None: the value is recorded and not judged."""
@@ -51,12 +50,13 @@ class Check:
     why: str
     """Where the limit comes from."""
 
+    unit: str = "1"
+
 
 CHECKS = (
     Check(
         "not_finite",
         "coordinates of vertices that are not finite numbers",
-        "1",
         lambda seen: float(np.count_nonzero(~np.isfinite(seen.positions))),
         0.0,
         "no such position is a result",
@@ -64,7 +64,6 @@ CHECKS = (
     Check(
         "jumps",
         "distance of a body, holder or surface from an even motion within a step, over the preset's step error",
-        "1",
         lambda seen: seen.total.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
         1.0,
         "steps are halved until it is 0.25; where the shortest are not enough, something jumps or is shaken by 40 g",
@@ -72,7 +71,6 @@ CHECKS = (
     Check(
         "unconverged",
         "steps that ended above the tolerance, over those that the preset allows",
-        "1",
         lambda seen: _ratio(seen.total.unconverged, seen.cloth.preset.unconverged_share_max * seen.total.steps),
         1.0,
         "the preset allows a share of 0.002",
@@ -80,7 +78,6 @@ CHECKS = (
     Check(
         "budget",
         "most iterations of Newton's method in a second of scene time, over the 50,000 at which the run ends",
-        "1",
         lambda seen: seen.cloth.spent,
         1.0,
         "where holders, bodies and cloth cannot all have their way, steps take ever more",
@@ -88,7 +85,6 @@ CHECKS = (
     Check(
         "crossings",
         "pairs of triangles that cross in a frame, where cloth touches itself",
-        "1",
         lambda seen: float(seen.crossings),
         0.0,
         "contact keeps cloth apart",
@@ -97,7 +93,6 @@ CHECKS = (
         "contact_gain",
         "sum over steps and vertices of max(0, R_n (g_1 - g_0) + R_t . u) over the flow of energy: work that bodies do "
         "on the motion against them, with the force R, the gap g at the start and end of the step, and the slip u",
-        "1",
         lambda seen: _ratio(seen.total.seen.contact_work, seen.total.seen.flow),
         1e-3,
         "contact takes energy from the motion against a body and never gives any; a body that pushes out what is in it "
@@ -106,7 +101,6 @@ CHECKS = (
     Check(
         "energy_gain",
         "largest energy gained beyond the work of gravity, holders and bodies, over the flow of energy",
-        "1",
         lambda seen: _ratio(seen.total.seen.gain, seen.total.seen.flow),
         None,
         "recorded: good runs reach 0.9 %, and bad ones begin at 1 %",
@@ -115,16 +109,15 @@ CHECKS = (
         "penetration",
         "largest depth in a body at the end of a step, beyond the sagitta of flat triangles on its round face, over "
         "the side of a cell",
-        "cells",
         lambda seen: seen.total.seen.depth,
         0.1,
         "contact keeps vertices out of bodies; held vertices and blunt triangles can be driven in",
+        "cells",
     ),
     Check(
         "passages",
         "triangles that pass the core of a body in a step: the centre of a ball, the axis of a rod, the middle plane "
         "of a box",
-        "1",
         lambda seen: float(seen.total.seen.passages),
         0.0,
         "cloth that passed a core went through the body",
@@ -132,7 +125,6 @@ CHECKS = (
     Check(
         "stretch",
         "largest principal stretch of a triangle at the end of a step",
-        "1",
         lambda seen: seen.total.seen.stretch,
         1.25,
         "the fabrics were measured up to 1 + 1/6; drops reach 1.09 and heaps 1.17",
@@ -140,7 +132,6 @@ CHECKS = (
     Check(
         "sharpness",
         "side of a cell over the radius of the sharpest edge, ball or rod that bore cloth",
-        "1",
         lambda seen: 1.0 / seen.total.sharpest,
         2.0,
         "cells catch on what has less than half their side as radius",
@@ -148,7 +139,6 @@ CHECKS = (
     Check(
         "missed",
         "shortest steps that are further off than twice the preset's step error, over those that fit the scene",
-        "1",
         lambda seen: _ratio(
             seen.total.missed * seen.cloth.preset.longest_step, seen.cloth.preset.finest * seen.cloth.time
         ),

@@ -84,11 +84,7 @@ class Body:
 
 
 def check_friction(mu: ArrayLike) -> None:
-    """Check a coefficient of friction, or those with several sheets.
-
-    Raises:
-        ValueError: One is out of range.
-    """
+    """Raise ValueError unless a coefficient of friction, or those with several sheets, are in range."""
     values = np.asarray(mu, float)
     if values.ndim > 1 or not values.size or not ((values >= 0.0) & (values <= MU_MAX)).all():
         raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {values.tolist()}")

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, check_mesh, kernels, sheet_count
+from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, Body, BodyTuple, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric
@@ -16,6 +16,9 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that sets the level of the kernels."""
+
+PASSED_ON = ("newton_max", "krylov_max", "krylov_tolerance", "refactor_after", "patience", "halvings_max", "finest")
+"""Settings that the C++ solver takes as they are."""
 
 RESIDUAL_PATCH = 0.005**2
 """Area whose weight residuals are measured in, whatever the mesh [m^2]."""
@@ -32,11 +35,6 @@ Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 
 Path = Callable[[Floats], tuple[ArrayLike, ArrayLike]]
 """From times (T,) [s] to positions of the held vertices (T, K, 3) [m], and poses of the bodies (T, B, 3, 4) [m]."""
-
-
-def kernel_level() -> str:
-    """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
-    return os.environ.get(KERNEL_VARIABLE) or kernels()[-1]
 
 
 class Cloth:
@@ -74,7 +72,7 @@ class Cloth:
         self.fabrics = (fabric,) if isinstance(fabric, Fabric) else tuple(fabric)
         """One, or one for each sheet."""
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
-        check_mesh(mesh.rest, mesh.triangles)
+        sheets = sheet_count(mesh.rest, mesh.triangles)
         extent = float(np.ptp(mesh.rest, axis=0).max())
         if extent > EXTENT_MAX:
             raise ValueError(f"mesh: must be at most {EXTENT_MAX:g} m long and wide, got {extent:g} m")
@@ -84,7 +82,7 @@ class Cloth:
         """[s]"""
         self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
-        mu, thickness = self._touch(sheet_count(mesh.rest, mesh.triangles))
+        mu, thickness = self._touch(sheets)
         edge_share, second_share = BEARING[self_contact.bearing if self_contact else "all"]
         patch_weight = min((fabric.density for fabric in self.fabrics), default=np.nan) * RESIDUAL_PATCH * GRAVITY
         self.force_scale = patch_weight if force_scale is None else force_scale
@@ -95,15 +93,9 @@ class Cloth:
             mesh.triangles,
             [(fabric.density, fabric.stretching, fabric.rigidity, fabric.damping) for fabric in self.fabrics],
             tolerance=preset.tolerance * self.force_scale,
-            newton_max=preset.newton_max,
-            krylov_max=preset.krylov_max,
-            krylov_tolerance=preset.krylov_tolerance,
-            refactor_after=preset.refactor_after,
-            patience=preset.patience,
-            halvings_max=preset.halvings_max,
+            **{name: getattr(preset, name) for name in PASSED_ON},
             step_error=preset.step_error or np.inf,
             longest_step=preset.longest_step if preset.step_error else preset.time_step,
-            finest=preset.finest,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
             thickness=thickness.tolist(),
             mu=mu,

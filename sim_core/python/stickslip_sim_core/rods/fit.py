@@ -343,13 +343,12 @@ def _fit_constant(model: _Model, data: Floats, known_gamma: float | None, compon
     """Fit a uniform rod from the nearest rods of the library."""
     if known_gamma is not None and not (np.isfinite(known_gamma) and known_gamma > 0):
         raise ValueError(f"gamma: must be > 0, got {known_gamma}")
-    library = _library(len(data), tuple(model.stiffness), known_gamma)
-    distance = np.linalg.norm(library.centerline - data, axis=(1, 2))
+    gammas, natural, centerlines, curvature = _library(len(data), tuple(model.stiffness), known_gamma)
+    distance = np.linalg.norm(centerlines - data, axis=(1, 2))
     free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
     best: _State | None = None
     for i in np.argsort(distance)[:CANDIDATES]:
-        gamma, coefficients = library.gamma[i], library.natural[i]
-        state = model.hang(float(gamma), coefficients[None], library.curvature[i])
+        state = model.hang(float(gammas[i]), natural[i][None], curvature[i])
         if state is None:
             continue
         state = _minimise(model, state, data, free, np.zeros((4, 4)), STEP_TOLERANCE)
@@ -360,19 +359,12 @@ def _fit_constant(model: _Model, data: Floats, known_gamma: float | None, compon
     return best
 
 
-@dataclass(frozen=True, eq=False)
-class _Library:
-    """Hung rods: gamma (n,), natural (n, 3), and their centreline and curvature (n, P, 3)."""
-
-    gamma: Floats
-    natural: Floats
-    centerline: Floats
-    curvature: Floats
-
-
 @lru_cache(maxsize=8)
-def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | None) -> _Library:
-    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known."""
+def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | None) -> tuple[Floats, ...]:
+    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known.
+
+    Returns gamma (n,), natural curvature (n, 3), and centreline and curvature (n, P, 3) of the stable ones.
+    """
     per_axis = 8 if known_gamma is None else 16
     axes = (
         np.geomspace(*RANGES[0], 10) if known_gamma is None else np.array([float(known_gamma)]),
@@ -383,7 +375,7 @@ def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | Non
     natural = np.stack([phi0, 0.0 * phi0, phi1], axis=1)
     rods = solve_general_rods(natural[:, None], gamma, stiffness=stiffness, elements=96, points=points)
     good = rods.stable
-    return _Library(gamma[good], natural[good], rods.centerline[good], rods.curvature[good])
+    return gamma[good], natural[good], rods.centerline[good], rods.curvature[good]
 
 
 def _centerline(centerline: ArrayLike) -> Floats:

@@ -12,10 +12,10 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import Body, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
-from stickslip_sim_core.cloth.solver import Cloth, kernel_level
+from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
-from stickslip_sim_core.scenes.scene import ClothRun, Scene, fabric_labels
+from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
 
 UPRIGHT = 1.0
 """Time in which gravity is set upright over a hung sheet once its bias ends [s]."""
@@ -230,5 +230,5 @@ def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> O
 KIND = Kind(
     lambda simulations, on_frame: [_simulated(one, on_frame) for one in simulations],
     "stickslip_sim_core.cloth",
-    kernel=kernel_level,
+    kernel=cloth_kernel,
 )

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import self_intersections
+from stickslip_sim_core._sim_core import build_info, self_intersections
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
 from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
-from stickslip_sim_core.cloth.solver import Cloth, kernel_level
+from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Array, Kind, OnFrame, Outcome, Record
 
@@ -249,13 +249,18 @@ def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
     }
 
 
+def cloth_kernel() -> str:
+    """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
+    return build_info().cloth_kernel
+
+
 def cloth_kind(scene: Callable[..., Scene]) -> Kind:
     """Return the kind whose simulations are the scenes that `scene` makes of their physics."""
 
     def simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
         return [scene(**_of_materials(physics)).outcome(on_frame) for physics in simulations]
 
-    return Kind(simulate, "stickslip_sim_core.cloth", kernel=kernel_level)
+    return Kind(simulate, "stickslip_sim_core.cloth", kernel=cloth_kernel)
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-// How cloth refuses what it is given: std::invalid_argument, which Python sees as ValueError.
+// How the core refuses what it is given: std::invalid_argument, which Python sees as ValueError.
 #pragma once
 
 #include <sstream>
