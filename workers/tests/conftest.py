@@ -152,7 +152,8 @@ class Connected(Place):
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     """A Ray of two CPUs for all tests, with `fake_renderer` in reach of its processes."""
     directory = own_directory(tmp_path_factory.mktemp("ray"))
-    command = f"from pathlib import Path; from stickslip_workers.cluster import main; main(Path('{directory}'), 2)"
+    command = "from pathlib import Path; from stickslip_workers.cluster import run_head; "
+    command += f"run_head(Path('{directory}'), 2)"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", HERE, prepend=os.pathsep)
         with subprocess.Popen([sys.executable, "-c", command], stdout=subprocess.DEVNULL) as head:
