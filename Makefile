@@ -72,8 +72,9 @@ test-fast: setup
 test: setup
 	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender check
 
+# Tests wait a quarter of their time: one more runs than there are cores.
 test-main:
-	$(PYTEST)
+	$(PYTEST) --numprocesses=$$(($$(nproc) + 1))
 
 test-blender:
 	$(BLENDER_PY) -m pytest --quiet workers/blender
