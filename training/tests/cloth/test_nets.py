@@ -1,7 +1,7 @@
 import pytest
 import torch
 from stickslip_training.cloth.crop import HEIGHT, WIDTH
-from stickslip_training.cloth.nets import PosteriorNet
+from stickslip_training.cloth.model import PosteriorNet
 
 
 def test_posterior_net_answers_with_a_joint_histogram_whatever_the_exposure():

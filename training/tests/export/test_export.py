@@ -207,7 +207,7 @@ def test_files_are_of_one_split_and_of_bounded_size(clips: Any, monkeypatch: pyt
         content = Content(reader, Selection())
         monkeypatch.setattr(content_module, "FILE_BYTES", 3 * content.sample_bytes)
         parts = list(content.parts())
-    assert max(len(part.slots) for part in parts) == 3
-    for part in parts:
-        assert {SPLITS[code] for code in clips.arrays["split"][part.slots]} == {part.split}
-    assert sorted(np.concatenate([part.slots for part in parts])) == list(np.flatnonzero(clips.arrays["valid"]))
+    assert max(len(slots) for *_, slots in parts) == 3
+    for split, _, _, slots in parts:
+        assert {SPLITS[code] for code in clips.arrays["split"][slots]} == {split}
+    assert sorted(np.concatenate([slots for *_, slots in parts])) == list(np.flatnonzero(clips.arrays["valid"]))

@@ -71,9 +71,9 @@ def test_the_report_measures_the_model_that_is_saved(trained, rods):
     ]
     assert json.loads((config.out / "report.json").read_text())["test_loss"] == report["test_loss"]
     with DatasetReader(rods.root) as reader:
-        test = load_splits(reader, config.evaluation_rods)[0]["test"]
+        test, slots = load_splits(reader, config.evaluation_rods)[0]["test"], reader.slots("test")
     noisy = with_white_noise(test.centerline, config.noise, (config.seed, TEST))
-    assert np.array_equal(test.centerline, rods.arrays["centerline"][test.slots])
+    assert np.array_equal(test.centerline, rods.arrays["centerline"][slots])
     assert 0.0009 < (noisy - test.centerline).std() < 0.0011
     strains = estimate_strains(load_model(config.out / "model.pt"), noisy)
     assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)

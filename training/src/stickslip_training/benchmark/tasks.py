@@ -220,14 +220,13 @@ def _quantiles(errors: Floats) -> dict[str, Any]:
     """Return median and 95 % quantile, each with its 90 % interval over rods; None if it is infinite."""
     errors = np.where(np.isfinite(errors), errors, np.inf)
     drawn = errors[np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))]
-    found = {}
+    found: dict[str, Any] = {}
     for name, share in (("median", 0.5), ("p95", 0.95)):
         value = float(np.quantile(errors, share, method="higher"))
         low, high = np.quantile(np.quantile(drawn, share, axis=1, method="higher"), (0.05, 0.95), method="nearest")
-        finite = {"value": value, "low": float(low), "high": float(high)}
-        found[name] = {key: number if np.isfinite(number) else None for key, number in finite.items()}
-        if found[name]["value"] is None:
-            found[name] = None  # type: ignore[assignment]
+        numbers = {"value": value, "low": float(low), "high": float(high)}
+        told = {key: number if np.isfinite(number) else None for key, number in numbers.items()}
+        found[name] = told if np.isfinite(value) else None
     return found
 
 

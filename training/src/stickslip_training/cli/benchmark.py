@@ -13,8 +13,6 @@ from stickslip_schemas.store import write_durably
 from stickslip_training.cli.commands import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
-SECRET_BYTES = 32
-
 benchmark = typer.Typer(no_args_is_help=True, help="Named test sets: enter yours, and compare.")
 
 SetArgument = Annotated[str, typer.Argument(metavar="SET", help="name of a test set: see `benchmark list`")]
@@ -71,7 +69,7 @@ def inputs(
         chosen = load_set(name)
         slots = chosen.check(reader)[0]
         if not secret.exists():
-            write_durably(secret, token_bytes(SECRET_BYTES))
+            write_durably(secret, token_bytes(32))
         given = chosen.task.inputs(reader, slots, secret.read_bytes())
         with out.open("wb") as file:
             np.savez(file, **given)  # type: ignore[arg-type]  # its stub takes no dictionary

@@ -134,25 +134,21 @@ def predictions(
     median: mu may be larger. Elsewhere it is None.
     """
     found = estimates(posterior.mu, posterior.bins, SHARE)
-    at_end = posterior.mu[:, -1] >= (1.0 - SHARE) / 2
+    above = [posterior.bins.high if ends else None for ends in posterior.mu[:, -1] >= (1.0 - SHARE) / 2]
+    columns = (part.tolist() for part in (found.median, found.low, found.high))
+    told = [
+        {"median": round(median, 6), "low": round(low, 6), "high": round(high, 6), "above": end}
+        for median, low, high, end in zip(*columns, above, strict=True)
+    ]
     return [
         {
             "slot": int(slot),
             "material": {name: round(float(p), 6) for name, p in zip(posterior.materials, row, strict=True)},
-            "mu": {
-                "median": round(float(median), 6),
-                "low": round(float(low), 6),
-                "high": round(float(high), 6),
-                "above": posterior.bins.high if ends else None,
-            }
-            if reason is None
-            else None,
+            "mu": mu if reason is None else None,
             "familiarity": round(float(familiarity), 3),
             "no_answer": reason,
         }
-        for slot, row, median, low, high, ends, familiarity, reason in zip(
-            slots, posterior.material, found.median, found.low, found.high, at_end, *judged, strict=True
-        )
+        for slot, row, mu, familiarity, reason in zip(slots, posterior.material, told, *judged, strict=True)
     ]
 
 

@@ -27,8 +27,7 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.crop import Cameras, holder_crops
 from stickslip_training.cloth.familiarity import Familiarity, pooled
-from stickslip_training.cloth.model import FrictionModel, features, log_histograms, silhouettes
-from stickslip_training.cloth.nets import PosteriorNet
+from stickslip_training.cloth.model import FrictionModel, PosteriorNet, features, log_histograms, silhouettes
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between

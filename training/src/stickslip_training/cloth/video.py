@@ -16,9 +16,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
@@ -28,9 +29,6 @@ from stickslip_schemas.spec.cameras import Camera, undistorted
 from stickslip_training.arrays import Array, Floats
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, Clips, frames_at
 from stickslip_training.cloth.crop import PATCH, Cameras, Crops, cut, holder_crops, holder_path
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 PATCH_BELOW = 0.005
 """Their depth below the held edge [m]."""
@@ -160,7 +158,7 @@ def import_video(
 # --- following the holders -------------------------------------------------------------------------------------
 
 
-def _frames(path: str | Path) -> Iterator[tuple[float, "NDArray[np.uint8]"]]:
+def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
     """Yield the time [s] and the grey levels (H, W) of every frame."""
     try:
         import av
@@ -181,11 +179,7 @@ def _frames(path: str | Path) -> Iterator[tuple[float, "NDArray[np.uint8]"]]:
 def holder_points(instants: Array) -> Floats:
     """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2, 3) [m]."""
     x, z = (np.asarray(part, dtype=np.float64) for part in holder_path(instants))
-    points = np.zeros((len(x), 2, 3))
-    points[:, :, 0] = x[:, None]
-    points[:, :, 1] = (-PATCH, PATCH)
-    points[:, :, 2] = z[:, None] - PATCH_BELOW
-    return points
+    return np.stack(np.broadcast_arrays(x[:, None], (-PATCH, PATCH), z[:, None] - PATCH_BELOW), axis=-1)
 
 
 def _follow(

@@ -12,7 +12,6 @@ import tarfile
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +40,6 @@ CHUNK_BYTES = 2**20
 
 GROUP_BYTES = 32 * 2**20
 """Decoded samples that are written to Parquet and read from it together [bytes]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Slots of one split that go into one file."""
-
-    split: str
-    number: int
-    count: int
-    """How many files the split has."""
-    slots: npt.NDArray[np.int64]
 
 
 class Content:
@@ -96,15 +84,15 @@ class Content:
             return self.reader.label(name)[slots]
         return self.reader.read(name, slots)
 
-    def parts(self) -> Iterator[Part]:
-        """Yield what goes into each file, split by split."""
+    def parts(self) -> Iterator[tuple[str, int, int, npt.NDArray[np.int64]]]:
+        """Yield split, number, count of the files of that split, and slots of each file, split by split."""
         size = max(1, FILE_BYTES // self.sample_bytes)
         splits = self.reader.label("split")[self.slots]
         for code, split in enumerate(SPLITS):
             slots = self.slots[splits == code]
             count = -(-len(slots) // size)
             for number in range(count):
-                yield Part(split, number, count, slots[number * size : (number + 1) * size])
+                yield split, number, count, slots[number * size : (number + 1) * size]
 
     def manifest(self) -> bytes:
         """Return the bytes of the version's manifest."""
@@ -217,16 +205,16 @@ def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> No
     Categories are codes, as in the version; `dataset.json` names them. Infinity and NaN are written as Python's json
     reads them.
     """
-    for part in content.parts():
-        with tarfile.open(directory / f"{part.split}-{part.number:06d}.tar", "x", format=tarfile.USTAR_FORMAT) as tar:
-            labels = {array.name: content.read(array.name, part.slots).tolist() for array in content.labels}
-            for place, slot in enumerate(part.slots):
+    for split, number, _, slots in content.parts():
+        with tarfile.open(directory / f"{split}-{number:06d}.tar", "x", format=tarfile.USTAR_FORMAT) as tar:
+            labels = {array.name: content.read(array.name, slots).tolist() for array in content.labels}
+            for place, slot in enumerate(slots):
                 sample = {name: values[place] for name, values in labels.items()}
                 _add(tar, f"{slot:08d}.json", json.dumps(sample).encode())
                 for array in content.arrays:
                     if not array.is_label:
                         buffer = io.BytesIO()
-                        np.save(buffer, content.read(array.name, part.slots[[place]])[0], allow_pickle=False)
+                        np.save(buffer, content.read(array.name, slots[[place]])[0], allow_pickle=False)
                         _add(tar, f"{slot:08d}.{array.name}.npy", buffer.getvalue())
                 on_bytes(content.sample_bytes)
 
@@ -290,17 +278,17 @@ def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> N
     schema = datasets.Features({array.name: _feature(array) for array in content.arrays}).arrow_schema
     rows = max(1, GROUP_BYTES // content.sample_bytes)
     splits = []
-    for part in content.parts():
-        splits += [part.split] if part.number == 0 else []
-        path = directory / "data" / f"{part.split}-{part.number:05d}-of-{part.count:05d}.parquet"
+    for split, number, count, slots in content.parts():
+        splits += [split] if number == 0 else []
+        path = directory / "data" / f"{split}-{number:05d}-of-{count:05d}.parquet"
         with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
-            for first in range(0, len(part.slots), rows):
-                slots = part.slots[first : first + rows]
+            for first in range(0, len(slots), rows):
+                some = slots[first : first + rows]
                 columns = [
-                    _column(content.read(array.name, slots), schema.field(array.name).type) for array in content.arrays
+                    _column(content.read(array.name, some), schema.field(array.name).type) for array in content.arrays
                 ]
                 writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
-                on_bytes(len(slots) * content.sample_bytes)
+                on_bytes(len(some) * content.sample_bytes)
     (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
 
 

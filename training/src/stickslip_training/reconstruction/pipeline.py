@@ -20,7 +20,7 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Floats
 from stickslip_training.reconstruction.refinement import Fit, draw, refine, samples, start
-from stickslip_training.reconstruction.starts import follow, moving_cylinder, visual_hull
+from stickslip_training.reconstruction.starts import APART, follow, moving_cylinder, visual_hull
 from stickslip_training.reconstruction.views import (
     ReconstructionError,
     View,
@@ -35,7 +35,6 @@ from stickslip_training.reconstruction.views import (
 
 CONTROL_POINTS = 44
 STARTS = 4  # ways of the tracking that are refined
-APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
 HOPELESS = 4.0  # a start whose coarse fit costs so many times the best one's is given up
 LARGEST_IMAGE = 1600  # [px]: larger pictures are averaged down
 WIDEST_ROD = 4.0  # half width [px]: of a rod that is wider, pictures are averaged down too

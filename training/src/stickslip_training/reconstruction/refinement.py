@@ -33,6 +33,7 @@ LIGHT_NODES = 24
 BLUR = 0.45  # [px], to start with
 LOG_RADIUS = 0.5  # of a radius that is only estimated
 LOG_BLUR = 0.3
+TOLERANCE = 1e-4  # of the cost: smaller gains end the search
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,6 @@ def refine(
     shading: bool = True,
     fixed_radius: bool = False,
     iterations: int = 30,
-    tolerance: float = 1e-4,
 ) -> Fit:
     """Minimise; `extra_blur` [px] blurs the views first, which makes the curve findable from farther off."""
     if extra_blur > 0.0:
@@ -98,7 +98,7 @@ def refine(
         if tried.cost < system.cost:
             gain = system.cost - tried.cost
             x, system, damping = x + step, tried, max(damping / 5.0, 1e-9)
-            if gain < tolerance * system.cost:
+            if gain < TOLERANCE * system.cost:
                 break
         else:
             damping *= 8.0

@@ -26,6 +26,7 @@ UNEVEN = 1.0  # cost of a change of direction against the even bend [1/rad^2]
 BENT = 0.05  # cost of any change of direction [1/rad^2]
 CELL = 0.006  # [L]: of two ways at one place, in one direction, the better is kept
 TURN = 0.35  # the side of a cell of directions
+APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
 BLUR = 0.6  # deviation of the filter of `_middle`, over the rod's radius
 PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))  # what it leaves in the middle of a straight strip of coverage 1
 
@@ -37,32 +38,33 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
     """
     fields = [_middle(view, radius) for view in views]
     step = 1.0 / STEPS
-    position = np.zeros((1, 3))
+    trail = np.zeros((1, 1, 3))  # (ways, places, 3)
     heading = direction[None] / np.linalg.norm(direction)
     turn = np.zeros((1, 3))  # rotation vector of the last step
     cost = np.zeros(1)
-    parents: list[npt.NDArray[np.int64]] = []
-    trail = [position]
     for _ in range(STEPS):
         ahead = Rotation.from_rotvec(turn).apply(heading)
         candidates = _cone(ahead)  # (n, m, 3)
         n, m = candidates.shape[:2]
         middle = heading[:, None] + candidates
-        places = position[:, None] + step * middle / np.linalg.norm(middle, axis=-1, keepdims=True)
+        places = (trail[:, -1:] + step * middle / np.linalg.norm(middle, axis=-1, keepdims=True)).reshape(-1, 3)
         flat = candidates.reshape(-1, 3)
         parent = np.repeat(np.arange(n), m)
         total = (
             cost[parent]
-            + sum(_outside(view, field, places.reshape(-1, 3)) for view, field in zip(views, fields, strict=True))
+            + sum(_outside(view, field, places) for view, field in zip(views, fields, strict=True))
             + UNEVEN * _squared(flat - ahead[parent])
             + BENT * _squared(flat - heading[parent])
         )
-        kept = _best_of_cells(places.reshape(-1, 3), flat, total)
-        parents.append(parent[kept])
+        kept = _best_of_cells(places, flat, total)
         turn = _rotation(heading[parent[kept]], flat[kept])
-        position, heading, cost = places.reshape(-1, 3)[kept], flat[kept], total[kept]
-        trail.append(position)
-    return _unlike(trail, parents, cost, ways)
+        trail = np.concatenate([trail[parent[kept]], places[kept, None]], axis=1)
+        heading, cost = flat[kept], total[kept]
+    tracks: list[Floats] = []
+    for way in trail[np.argsort(cost, kind="stable")]:
+        if all(np.linalg.norm(way - other, axis=1).max() > APART for other in tracks):
+            tracks.append(way)
+    return tracks[:ways]
 
 
 def _middle(view: View, radius: float) -> Floats:
@@ -114,24 +116,6 @@ def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDAr
         cell = cell * 1024 + side + 512  # a side is a few hundred cells long at most; six of them fit in 60 bits
     _, first = np.unique(cell, return_index=True)
     return order[np.sort(first)[:BEAM]]
-
-
-def _unlike(
-    trail: list[Floats], parents: list[npt.NDArray[np.int64]], cost: Floats, ways: int, apart: float = 0.02
-) -> list[Floats]:
-    tracks: list[Floats] = []
-    for end in np.argsort(cost, kind="stable"):
-        index, points = int(end), []
-        for positions, parent in zip(reversed(trail[1:]), reversed(parents), strict=True):
-            points.append(positions[index])
-            index = int(parent[index])
-        points.append(trail[0][0])
-        way = np.array(points[::-1])
-        if all(np.linalg.norm(way - other, axis=1).max() > apart for other in tracks):
-            tracks.append(way)
-            if len(tracks) == ways:
-                break
-    return tracks
 
 
 ROOM = 1.05  # [L]: the rod cannot reach farther from its clamp

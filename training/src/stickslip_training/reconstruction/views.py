@@ -47,7 +47,9 @@ def silhouette(light: Floats) -> Floats:
     relative to the brightness of the rod around the pixel, and may exceed 1 where the rod shines.
     """
     light = light - _ground(light)
-    signal = _along_color(light)
+    luminance = light.sum(axis=2).clip(0.0)
+    color = np.einsum("yxc,yx->c", light, luminance**2)  # of the rod, whose pixels outweigh the ground's by far
+    signal = light @ (color / max(float(np.linalg.norm(color)), 1e-12))  # the ground's noise counts least along it
     noise = 1.4826 * float(np.median(np.abs(signal - np.median(signal))))
     typical = float(np.sum(signal.clip(0) ** 2) / max(np.sum(signal.clip(0)), 1e-12))  # weighted by itself: the rod's
     floor = max(NOISE_FACTOR * noise, FAINTEST * typical)
@@ -98,13 +100,6 @@ def _ground(light: Floats) -> Floats:
     for (i, j), coefficient in zip(powers, coefficients, strict=True):
         fitted += (y[:, None] ** i * x**j)[..., None] * coefficient
     return fitted
-
-
-def _along_color(light: Floats) -> Floats:
-    """Project light (y, x, channel) on the direction of the rod's colour: the ground's noise counts least there."""
-    luminance = light.sum(axis=2).clip(0.0)
-    color = np.einsum("yxc,yx->c", light, luminance**2)  # the rod's pixels outweigh the ground's by far
-    return np.asarray(light @ (color / max(float(np.linalg.norm(color)), 1e-12)))
 
 
 def _large_parts(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

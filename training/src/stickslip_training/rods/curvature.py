@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from stickslip_training.arrays import Array, Integers, SingleFloats
+from stickslip_training.arrays import Array, SingleFloats
 from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine import fit as engine
 from stickslip_training.rods.evaluation import estimate_strains, evaluate, rms, with_white_noise
-
-KIND = "rod_hang"
 
 POINTS = 150
 """Of a centreline that the network takes."""
@@ -28,17 +26,16 @@ TRAINING, VALIDATION, TEST, ORDER = range(4)
 
 @dataclass(frozen=True)
 class Rods:
-    """Rods in memory: centrelines over L and strains times L, float32 (rods, 150, 3), and their slots."""
+    """Rods in memory: centrelines over L and strains times L, float32 (rods, 150, 3)."""
 
-    slots: Integers
     centerline: SingleFloats
     strains: SingleFloats
 
     def __len__(self) -> int:
-        return len(self.slots)
+        return len(self.strains)
 
     def __getitem__(self, chosen: slice | Array) -> "Rods":
-        return Rods(self.slots[chosen], self.centerline[chosen], self.strains[chosen])
+        return Rods(self.centerline[chosen], self.strains[chosen])
 
 
 def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, Rods], list[str]]:
@@ -46,8 +43,8 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
 
     Where a split is empty, another one takes its place, with a note.
     """
-    if reader.kind != KIND:
-        raise ValueError(f"kind of the dataset must be {KIND} to train on curvature: it is {reader.kind}")
+    if reader.kind != "rod_hang":
+        raise ValueError(f"kind of the dataset must be rod_hang to train on curvature: it is {reader.kind}")
     points = reader.arrays["centerline"].shape[0]
     if points != POINTS:
         raise ValueError(f"centrelines must have {POINTS} points for this network, and have {points}")
@@ -75,7 +72,7 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
     if len(slots["test"]) < FEW_RODS:
         notes.append(f"There are only {len(slots['test'])} test rods: take medians and percentiles as a hint.")
     arrays = ("centerline", "curvature")
-    return {split: Rods(some, *(reader.read(name, some) for name in arrays)) for split, some in slots.items()}, notes
+    return {split: Rods(*(reader.read(name, some) for name in arrays)) for split, some in slots.items()}, notes
 
 
 class CurvatureNet(nn.Module):
@@ -207,7 +204,7 @@ def train_curvature(
         "rods": {name: len(part) for name, part in rods.items()},
         **fitted.facts(),
         "test_loss": test_loss,
-        "methods": [asdict(method) for method in methods],
+        "methods": methods,
         "notes": notes,
     }
     content = {"net": fitted.net.state_dict(), "noise": config.noise, "manifest": digest}

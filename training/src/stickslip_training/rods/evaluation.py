@@ -10,8 +10,8 @@ see. So errors that compare methods are errors of |kappa|.
 """
 
 import time
-from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -125,20 +125,6 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
 # --- errors ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class MethodReport:
-    """How well one method finds the curvature of the test rods. Errors are of |kappa|."""
-
-    method: str
-    rms: float
-    """RMS error of |kappa| L over all points of all rods [rad]."""
-    relative_median: float
-    """Median over the rods of the RMS relative error."""
-    relative_p90: float
-    """90th percentile over the rods of the RMS relative error."""
-    seconds_per_rod: float
-
-
 def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFloats:
     """Return the strains (twist, bend1, bend2) times L of centrelines over L, both (rods, 150, 3)."""
     device = next(net.parameters()).device
@@ -150,7 +136,7 @@ def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFl
     return np.concatenate(parts)
 
 
-def evaluate(net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats) -> tuple[tuple[MethodReport, ...], float]:
+def evaluate(net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats) -> tuple[list[dict[str, Any]], float]:
     """Let every method see noisy centrelines of rods of true strains; return how each did, and the network's loss
     [rad]."""
     truth = bending(true)
@@ -167,19 +153,17 @@ def evaluate(net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats) -> t
         method(noisy[:1])  # the splines' basis is made once, whatever the number of rods
         started = time.perf_counter()
         reports.append(_method(name, method(noisy), truth, started))
-    return tuple(reports), rms(strains - true)
+    return reports, rms(strains - true)
 
 
-def _method(name: str, estimate: Floats, truth: Floats, started: float) -> MethodReport:
+def _method(name: str, estimate: Floats, truth: Floats, started: float) -> dict[str, Any]:
+    """Return how well a method finds |kappa| L: the RMS error over all points of all rods [rad], and the median and
+    90th percentile over the rods of the RMS relative error."""
     seconds = (time.perf_counter() - started) / len(truth)
     errors = relative_rms_error(estimate, truth)
-    return MethodReport(
-        method=name,
-        rms=rms(estimate - truth),
-        relative_median=float(np.median(errors)),
-        relative_p90=float(np.quantile(errors, 0.9)),
-        seconds_per_rod=seconds,
-    )
+    median, p90 = np.quantile(errors, (0.5, 0.9)).tolist()
+    found = {"method": name, "rms": rms(estimate - truth), "relative_median": median, "relative_p90": p90}
+    return found | {"seconds_per_rod": seconds}
 
 
 def bending(strains: AnyFloats) -> Floats:
