@@ -63,7 +63,7 @@ class CoordinatorClient:
 
     def __init__(self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None) -> None:
         # trust_env=False: the coordinator is not reached through a proxy of the environment.
-        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        headers = {"Content-Type": "application/json"} | ({} if key is None else {"Authorization": f"Bearer {key}"})
         verify = True if tls_certificate is None else pinned(tls_certificate)
         self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
         self._urls = deque(url.rstrip("/") for url in urls)
@@ -87,12 +87,7 @@ class CoordinatorClient:
     def _post(self, path: str, document: BaseModel, answer: type[Answer], *, timeout: httpx.Timeout = PROMPT) -> Answer:
         url = self._urls[0]
         try:
-            response = self._http.post(
-                url + path,
-                content=document.model_dump_json(),
-                headers={"Content-Type": "application/json"},
-                timeout=timeout,
-            )
+            response = self._http.post(url + path, content=document.model_dump_json(), timeout=timeout)
         except httpx.TransportError as error:
             if self._urls[0] == url:  # no other thread has turned from it
                 self._urls.rotate(-1)

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, field_validator, mo
 
 from stickslip_schemas.base import ARTIFACT, Bool, Document, Float, Int, is_sha256
 from stickslip_schemas.spec.arrays import CLIP_SIZE
-from stickslip_schemas.spec.cameras import Camera, rig_names
+from stickslip_schemas.spec.cameras import Camera, rig_names, square
 from stickslip_schemas.spec.names import (
     FARTHEST,
     LOWEST,
@@ -378,18 +378,7 @@ class View(Document):
         level = math.hypot(x, y)
         rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
         a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
-        focal, middle = self.focal_length / FILM * CLIP_SIZE, (CLIP_SIZE - 1) / 2
-        return Camera(
-            name=name,
-            width=CLIP_SIZE,
-            height=CLIP_SIZE,
-            fx=focal,
-            fy=focal,
-            cx=middle,
-            cy=middle,
-            rotation=rotation,
-            translation=(a, b, c),
-        )
+        return square(name, CLIP_SIZE, self.focal_length / FILM * CLIP_SIZE, rotation, (a, b, c))
 
 
 class SheetLook(Document):

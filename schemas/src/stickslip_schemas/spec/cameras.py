@@ -184,6 +184,12 @@ class Camera(Document):
         return float(max((low - (pixels - disc)).max(), (pixels + disc - high).max()))
 
 
+def square(name: str, size: int, focal: float, rotation: Any, translation: Vector3) -> Camera:
+    """Return a camera with a square frame of a size, and a focal length [px], whose axis meets the middle."""
+    middle, at = (size - 1) / 2, {"rotation": rotation, "translation": translation}
+    return Camera(name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at)
+
+
 FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
 """Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames [degree]."""
 
@@ -215,9 +221,7 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
     k = (size / 2.0 - 0.5 - _FRAMED_MARGIN * scale) / focal
     (left, right_), (top, bottom) = (((-w - k * z).max(), (w - k * z).max()) for w in (x, y))
     t = ((left - right_) / 2.0, (top - bottom) / 2.0, max(left + right_, top + bottom) / (2.0 * k))
-    middle = (size - 1) / 2.0
-    at: dict[str, Any] = {"rotation": R.tolist(), "translation": t}
-    return Camera(name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at)
+    return square(name, size, focal, R.tolist(), t)
 
 
 class _Rig(Document):

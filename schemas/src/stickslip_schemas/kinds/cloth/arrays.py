@@ -1,6 +1,6 @@
 """Arrays of the datasets of cloth: those of all its kinds, and those of scenes, which follow from the document."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -35,55 +35,34 @@ def over_time(
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
+    light = "azimuth and elevation of the lamp [degree], its power over the nominal"
+    floor = "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)"
     return (
         array("video", "sRGB clip", "uint8", pixels | {"rgb": 3}, per_sample=True, is_clip=True, attributes=instants),
         *_ground_truth_arrays(spec, pixels),
         *(codes(axis, spec.names(axis)) for axis in ("texture", "viewpoint", "lighting", "substrate")),
         array("light_seed", "seed of the lamp, the floor and the noise", "int32"),
-        array(
-            "light", "azimuth and elevation of the lamp [degree], its power over the nominal", "float32", {"light": 3}
-        ),
-        array(
-            "floor",
-            "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)",
-            "float32",
-            {"floor": 8},
-        ),
+        array("light", light, "float32", {"light": 3}),
+        array("floor", floor, "float32", {"floor": 8}),
         array("creases", "strength of the creases that the renderer added", "float32"),
         array("frame_share", "share of the frame that is cloth, mean of the clip", "float32"),
         array("visible_share", "share of the cloth in sight, mean of the clip", "float32"),
-        *(
-            array(f"psnr_{name}", f"PSNR over {text} [dB], NaN: not measured", "float32")
-            for name, text in REGIONS.items()
-        ),
+        *(array(f"psnr_{name}", f"PSNR over {of} [dB], NaN: not measured", "float32") for name, of in REGIONS.items()),
         array("psnr_deviation", "standard deviations of the three PSNR [dB]", "float32", {"region": len(REGIONS)}),
     )
 
 
 def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayLayout, ...]:
     """Return the arrays per pixel that the spec asks for. Textures share them, and each of their samples has them."""
+    segments = {"categories": list(spec.segments)}
+    normals = "normals towards the camera, in its axes (right, down, forward); 0 where nothing is"
+    flow = "motion of the visible point until the next frame of the clip [px], 0 in the last"
     arrays = (
         array("depth", "depth along the optical axis [m], infinite where nothing is", "float32", pixels),
-        array(
-            "segmentation",
-            "code of the visible object",
-            "uint8",
-            pixels,
-            attributes={"categories": list(spec.segments)},
-        ),
-        array(
-            "normals",
-            "normals towards the camera, in its axes (right, down, forward); 0 where nothing is",
-            "float16",
-            pixels | {"xyz": 3},
-        ),
+        array("segmentation", "code of the visible object", "uint8", pixels, attributes=segments),
+        array("normals", normals, "float16", pixels | {"xyz": 3}),
         array("uv", "place on the cloth, 0 to 1 along warp and weft, else NaN", "float16", pixels | {"uv": 2}),
-        array(
-            "flow",
-            "motion of the visible point until the next frame of the clip [px], 0 in the last",
-            "float16",
-            pixels | {"xy": 2},
-        ),
+        array("flow", flow, "float16", pixels | {"xy": 2}),
     )
     return tuple(replace(each, per_sample=True) for each in arrays if GroundTruth(each.name) in spec.ground_truth)
 
@@ -118,20 +97,19 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
 """Checks of the solver by name: what is measured, at its worst, and the limit of valid samples; None: not judged."""
 
 
+def _check(name: str, text: str, limit: float | None) -> ArrayLayout:
+    if limit is None:
+        return array(name, text)
+    return array(name, f"{text}; at most {limit:g} if valid", attributes={"limit": limit})
+
+
 def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     return (
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),
         array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
         array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
-        *(
-            array(
-                name,
-                text if limit is None else f"{text}; at most {limit:g} if valid",
-                attributes={} if limit is None else {"limit": limit},
-            )
-            for name, (text, limit) in CHECKS.items()
-        ),
+        *(_check(name, text, limit) for name, (text, limit) in CHECKS.items()),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
     )
 
@@ -169,49 +147,30 @@ def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
     return codes(parameter, (*Material, *scene.materials))
 
 
-def _tracks(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
-    """Return forces and poses, in the order of names that their attributes give."""
+def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
+    """Yield forces and poses, in the order of names that their attributes give."""
     sheets, bodies, holders = list(scene.sheets), list(scene.bodies), [f"{a}.{b}" for a, b in scene.holders]
-    others = [*bodies, *sheets]
-    by = {"sheet": len(sheets), "other": len(others), "xyz": 3}
-    held, pose = {"holder": len(holders)}, {"row": 3, "column": 4}
-    on = {"sheets": sheets, "others": others}
-    of_bodies = over_time(
-        spec,
-        "body_pose",
-        "x -> A x + b from a body's axes [m]",
-        of={"body": len(bodies), **pose},
-        attributes={"names": bodies},
-    )
-    said: dict[str, Any] = {"attributes": {"names": holders}}
-    of_holders = (
-        over_time(spec, "holder_force", "force of each holder on its sheet [N]", of={**held, "xyz": 3}, **said),
-        over_time(spec, "holder_pose", "x -> A x + b from a holder's axes [m]", of={**held, **pose}, **said),
-        over_time(spec, "grasped", "1 while a holder holds", "uint8", held, **said),
-    )
-    return (
-        over_time(spec, "contact_force", "force of bodies, then sheets, on each sheet [N]", of=by, attributes=on),
-        *((of_bodies,) if bodies else ()),
-        *(of_holders if holders else ()),
-    )
+    on, pose = {"sheets": sheets, "others": [*bodies, *sheets]}, {"row": 3, "column": 4}
+    by = {"sheet": len(sheets), "other": len(on["others"]), "xyz": 3}
+    yield over_time(spec, "contact_force", "force of bodies, then sheets, on each sheet [N]", of=by, attributes=on)
+    if bodies:
+        of, names = {"body": len(bodies), **pose}, {"names": bodies}
+        yield over_time(spec, "body_pose", "x -> A x + b from a body's axes [m]", of=of, attributes=names)
+    if holders:
+        held, said = {"holder": len(holders)}, {"attributes": {"names": holders}}
+        force, placed = "force of each holder on its sheet [N]", "x -> A x + b from a holder's axes [m]"
+        yield over_time(spec, "holder_force", force, "float32", {**held, "xyz": 3}, **said)
+        yield over_time(spec, "holder_pose", placed, "float32", {**held, **pose}, **said)
+        yield over_time(spec, "grasped", "1 while a holder holds", "uint8", held, **said)
 
 
 def _mesh(spec: ClipSpec, scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
     vertices, triangles = scene.sheets[sheet].mesh.shape
-    vertex = {f"{sheet}.vertex": vertices}
-    corners = {f"{sheet}.triangle": triangles, "corner": 3}
+    vertex, corners = {f"{sheet}.vertex": vertices}, {f"{sheet}.triangle": triangles, "corner": 3}
+    positions, states = {"per_sample": True, "is_trajectory": True}, {"categories": STATES}
     return (
-        over_time(
-            spec,
-            f"{sheet}.positions",
-            "positions of the vertices [m]",
-            of={**vertex, "xyz": 3},
-            per_sample=True,
-            is_trajectory=True,
-        ),
-        over_time(
-            spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes={"categories": STATES}
-        ),
+        over_time(spec, f"{sheet}.positions", "positions of the vertices [m]", of={**vertex, "xyz": 3}, **positions),
+        over_time(spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes=states),
         array(f"{sheet}.rest", "the flat sheet (warp, weft) [m]", "float32", {**vertex, "uv": 2}, is_recorded=True),
         array(f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
     )

@@ -172,13 +172,8 @@ class ClipSpec(JobSpec):
         return not self.allow_uncertified
 
     def render_settings(self) -> dict[str, Any] | None:
-        return {
-            "quality": self.quality,
-            "instants": self.shown_instants,
-            "creases": self.creases,
-            "ground_truth": self.ground_truth,
-            "measured": self.measured,
-        }
+        own = {name: getattr(self, name) for name in ("quality", "creases", "ground_truth", "measured")}
+        return own | {"instants": self.shown_instants}
 
     def clip_costs(self, simulate: float, unsure: float) -> Costs:
         """Return usual CPU times; measuring the clips of eight textures costs the share `measured` of their shading."""

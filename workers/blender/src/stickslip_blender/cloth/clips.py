@@ -74,14 +74,8 @@ class ClothRenderer:
         )
         area = sum(self.scene.window(shot).area for shot in shots) / len(shots)
         chosen = sampling or CLOTH_SAMPLING[look.quality].over(area)
-        labels = {
-            "light_seed": look.light_seed,
-            "light": light.numbers,
-            "floor": substrate.numbers,
-            "lighting": look.lighting,
-            "substrate": look.substrate,
-            "creases": look.creases,
-        }
+        of_look = {name: getattr(look, name) for name in ("light_seed", "lighting", "substrate", "creases")}
+        labels = of_look | {"light": light.numbers, "floor": substrate.numbers}
         return ClipRenderer(self.scene, camera, pinhole, shots, floor, fabric, chosen, look.light_seed, labels)
 
 
