@@ -265,11 +265,7 @@ def models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
         if fields:
             models = [found for field in fields for found in _models_in(field.annotation)]
         else:  # the place in a list, or the tag of a union
-            tagged = [
-                model
-                for model in models
-                if any(part in literals(field.annotation) for field in model.model_fields.values())
-            ]
+            tagged = [m for m in models if any(part in literals(of.annotation) for of in m.model_fields.values())]
             models = tagged or models
     return models
 

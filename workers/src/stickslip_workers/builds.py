@@ -57,11 +57,7 @@ def solver_build(module: str) -> str:
 
 def kind_builds(name: str) -> dict[str, str]:
     """Return the builds of the stages that run in this interpreter."""
-    return {
-        "sim_core": solver_build(kind(name).solver),
-        "simulate": build("simulate", name),
-        "pack": build("pack", name),
-    }
+    return {"sim_core": solver_build(kind(name).solver)} | {stage: build(stage, name) for stage in ("simulate", "pack")}
 
 
 def _core(kernel: str = "") -> str:

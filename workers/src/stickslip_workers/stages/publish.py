@@ -50,16 +50,11 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
     from zarr.storage import MemoryStore
 
     files: dict[str, object] = {}
+    origin = {"format": FORMAT, "dataset": dataset, "version": version}
     group = zarr.create_group(
         MemoryStore(files),  # type: ignore[arg-type]  # the values are zarr's own buffers
         zarr_format=3,
-        attributes={
-            "format": FORMAT,
-            "dataset": dataset,
-            "version": version,
-            "kind": spec.kind,
-            "spec_digest": spec.content_digest,
-        },
+        attributes=origin | {"kind": spec.kind, "spec_digest": spec.content_digest},
     )
     for array in layout(spec):
         create_array(group, array, sample_count=sample_count, samples_per_file=spec.samples_per_file(array))

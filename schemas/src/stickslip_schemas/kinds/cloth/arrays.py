@@ -167,7 +167,7 @@ def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
 def _mesh(spec: ClipSpec, scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
     vertices, triangles = scene.sheets[sheet].mesh.shape
     vertex, corners = {f"{sheet}.vertex": vertices}, {f"{sheet}.triangle": triangles, "corner": 3}
-    positions, states = {"per_sample": True, "is_trajectory": True}, {"categories": STATES}
+    states, positions = {"categories": STATES}, dict[str, Any](per_sample=True, is_trajectory=True)
     return (
         over_time(spec, f"{sheet}.positions", "positions of the vertices [m]", of={**vertex, "xyz": 3}, **positions),
         over_time(spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes=states),

@@ -66,12 +66,7 @@ class ClothRenderer:
         pinhole = camera.pinhole()
         self.scene.set_up(pinhole, light, substrate, fabric, track)
         shots = [self.geometry.points(vertices, at) for vertices, at in zip(track, look.instants, strict=True)]
-        height = self.geometry.surroundings.floor
-        floor = (
-            np.ones((pinhole.height, pinhole.width, 3), dtype=np.float32)
-            if height is None
-            else floor_factor(substrate, pinhole, height)
-        )
+        floor = floor_factor(substrate, pinhole, self.geometry.surroundings.floor)
         area = sum(self.scene.window(shot).area for shot in shots) / len(shots)
         chosen = sampling or CLOTH_SAMPLING[look.quality].over(area)
         of_look = {name: getattr(look, name) for name in ("light_seed", "lighting", "substrate", "creases")}

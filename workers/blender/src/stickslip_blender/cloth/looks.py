@@ -204,23 +204,19 @@ def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) ->
     if finish == "cloth":
         color = 0.15 + 0.85 * random.random(3)
     r, g, b = (color / color.mean()).tolist()
-    return Substrate(
-        name=finish,
-        albedo=float(random.uniform(*ranges["albedo"])),
-        roughness=float(random.uniform(*ranges["roughness"])),
-        metallic=ranges["metallic"],
-        specular=ranges["specular"],
-        grain=ranges["grain"],
-        seed=int(random.integers(2**31)),
-        tint=(r, g, b),
-    )
+    drawn = {number: float(random.uniform(*ranges[number])) for number in ("albedo", "roughness")}
+    fixed = {number: ranges[number] for number in ("metallic", "specular", "grain")}
+    return Substrate(name=finish, **drawn, **fixed, seed=int(random.integers(2**31)), tint=(r, g, b))
 
 
-def floor_factor(substrate: Substrate, camera: Camera, height: float) -> npt.NDArray[np.float32]:
+def floor_factor(substrate: Substrate, camera: Camera, height: float | None) -> npt.NDArray[np.float32]:
     """Return what the floor's marks and colour do to its light in each pixel, shape (height, width, 3).
 
-    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m].
+    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m];
+    None: there is none, and the factor is 1.
     """
+    if height is None:
+        return np.ones((camera.height, camera.width, 3), dtype=np.float32)
     step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
     rows, columns = ((np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width))
     across, down = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)

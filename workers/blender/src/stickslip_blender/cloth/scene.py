@@ -81,12 +81,8 @@ class ClothScene:
         set_curtains(self._scene, light.source.surround)
         if self._floor is not None:
             set_roughness(self._floor, substrate.roughness)
-            set_inputs(
-                self._floor,
-                Base_Color=(*(substrate.albedo,) * 3, 1.0),
-                Metallic=substrate.metallic,
-                Specular_IOR_Level=substrate.specular,
-            )
+            set_inputs(self._floor, Metallic=substrate.metallic, Specular_IOR_Level=substrate.specular)
+            set_inputs(self._floor, Base_Color=(*(substrate.albedo,) * 3, 1.0))
 
     def shading(self, points: Points, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
         """Render one instant for all textures: linear light at three albedos, shape (FINE height, FINE width, 3).

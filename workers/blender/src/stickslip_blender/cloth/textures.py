@@ -114,11 +114,8 @@ def _argyle(u: Field, v: Field) -> Field:
     column = np.mod(np.floor(u * 4), 2) == 1
     diamond = _mix(column, (152, 60, 70), (40, 70, 80))
     picture = _mix(x + y < 0.5, diamond, (222, 214, 196))
-    return _mix(
-        np.minimum(np.abs(_phase(u * 4 + v * 3, 1) - 0.5), np.abs(_phase(u * 4 - v * 3, 1) - 0.5)) < 0.03,
-        (250, 248, 240),
-        picture,
-    )
+    rising, falling = np.abs(_phase(u * 4 - v * 3, 1) - 0.5), np.abs(_phase(u * 4 + v * 3, 1) - 0.5)
+    return _mix(np.minimum(falling, rising) < 0.03, (250, 248, 240), picture)
 
 
 def _camouflage(u: Field, v: Field) -> Field:

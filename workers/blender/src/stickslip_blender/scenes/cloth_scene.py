@@ -19,13 +19,8 @@ if TYPE_CHECKING:
 
 def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> TaskResult:
     sheet = look.scene.textured
-    stage = Stage(
-        look.scene.model_dump(mode="json"),
-        sheet,
-        look.segments,
-        workshop.record(task.record),
-        lambda name: picture(name, workshop),
-    )
+    scene, record = look.scene.model_dump(mode="json"), workshop.record(task.record)
+    stage = Stage(scene, sheet, look.segments, record, lambda name: picture(name, workshop))
 
     def frame(geometry: Geometry) -> Camera:
         return stage.camera(look.viewpoint, geometry, CLIP_SIZE) if look.rig is None else rig_camera(look)
