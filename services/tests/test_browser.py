@@ -16,7 +16,7 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds.cloth.spec import GroundTruth
 from stickslip_schemas.scene.files import with_arrays
 from stickslip_services.app import make_app
-from stickslip_services.catalog.certificates import register_certificate
+from stickslip_services.catalog.inputs import register_certificate
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings

@@ -12,7 +12,7 @@ from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS
 from stickslip_services.app import make_app
-from stickslip_services.catalog.certificates import register_certificate
+from stickslip_services.catalog.inputs import register_certificate
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.context import Context

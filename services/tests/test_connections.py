@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_services.api import connections
+from stickslip_services.api import middleware
 from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
@@ -63,7 +63,7 @@ def test_600_half_open_requests_are_closed_within_20_seconds(server: ServerProce
 @pytest.fixture
 def quick(tmp_path: object, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A server that gives a client half a second."""
-    monkeypatch.setattr(connections, "TURN_SECONDS", 0.5)
+    monkeypatch.setattr(middleware, "TURN_SECONDS", 0.5)
     with serving(make_app(settings)) as url:
         yield url
 
@@ -99,7 +99,7 @@ def test_drop_by_drop_is_too_slow_as_well(quick: str, opening: bytes) -> None:
 
 
 def test_a_steady_body_may_take_its_time(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "LEAST_RATE", 100)
+    monkeypatch.setattr(middleware, "LEAST_RATE", 100)
     body = json.dumps(rods()).encode()
     with connect(quick, HEADERS + f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()) as connection:
         begin = time.monotonic()
@@ -128,8 +128,8 @@ def test_a_kept_connection_serves_request_after_request(quick: str) -> None:
 
 
 def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
-    monkeypatch.setattr(connections, "TURN_SECONDS", 5.0)
+    monkeypatch.setattr(middleware, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(middleware, "TURN_SECONDS", 5.0)
     held = [connect(quick, HALF_BODY) for _ in range(3)]
     time.sleep(0.2)
     with connect(quick, b"") as connection:
@@ -142,8 +142,8 @@ def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.Monkey
 
 def test_idle_connections_are_kept_longer_than_clients_keep_them(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With equal times, a request now and then meets a connection that is being closed, and fails."""
-    assert connections.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
-    monkeypatch.setattr(connections, "IDLE_SECONDS", 0.3)
+    assert middleware.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
+    monkeypatch.setattr(middleware, "IDLE_SECONDS", 0.3)
     begin = time.monotonic()
     with connect(quick, b"GET /readyz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as connection:
         assert answer(connection).startswith(b"HTTP/1.1 200")  # and then the end

@@ -8,11 +8,10 @@ from stickslip_schemas.documents.worker_api import Heartbeat, Lease, LeaseReques
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, prioritise_job
+from stickslip_services.queue.control import cancel_job, prioritise_job, sweep
 from stickslip_services.queue.eta import KEPT_RUNS, MEASURED, TIMES, Cost, StageTimings, limit_seconds
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import sweep
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import PretendWorker, failure, heartbeat, rejection

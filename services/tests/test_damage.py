@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 from sqlalchemy import Table, select, text
-from stickslip_schemas.base import JobState, TaskState
-from stickslip_services.database.paging import PageRequest
+from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import jobs, samples, tasks
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import start, sweep
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods

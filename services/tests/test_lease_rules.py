@@ -10,16 +10,15 @@ from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, LeaseState
 from stickslip_services.access.asker import Asker, asking
-from stickslip_services.access.projects import check_quota, find_project, set_quota
+from stickslip_services.access.keys import check_quota, find_project, set_quota
 from stickslip_services.api.routes.workers import Gathering
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job
+from stickslip_services.queue.control import cancel_job, start, sweep
 from stickslip_services.queue.ids import task_key
 from stickslip_services.queue.lease import lease_tasks, renew_leases, sort_out
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start, sweep
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 

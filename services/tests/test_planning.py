@@ -14,12 +14,10 @@ from stickslip_services.cli import wording
 from stickslip_services.cli.main import app
 from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job, start, sweep
 from stickslip_services.queue.plan import Terms, expand
-from stickslip_services.queue.planner import Planner, release_claims
 from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start, sweep
+from stickslip_services.queue.submit import Planner, release_claims, submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
@@ -265,7 +263,7 @@ def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
     def broken(*_: Any, **__: Any) -> Any:
         raise ValueError("the axis bends")
 
-    monkeypatch.setattr("stickslip_services.queue.planner.pieces", broken)
+    monkeypatch.setattr("stickslip_services.queue.submit.pieces", broken)
     planner = Planner(context)
     with context.database.write() as connection:
         release_claims(connection)

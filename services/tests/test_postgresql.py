@@ -28,9 +28,8 @@ from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.planner import Planner
-from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start
+from stickslip_services.queue.control import start
+from stickslip_services.queue.submit import Planner, submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job

@@ -7,10 +7,9 @@ from typing import Any
 import httpx
 import pytest
 from click.testing import CliRunner
-from stickslip_schemas.base import JobState
-from stickslip_services.access.asker import Asker, asking
-from stickslip_services.access.audit_log import read_audit_log
-from stickslip_services.access.projects import find_project, list_projects, set_quota
+from stickslip_schemas.base.states import JobState
+from stickslip_services.access.asker import Asker, asking, read_audit_log
+from stickslip_services.access.keys import find_project, list_projects, set_quota
 from stickslip_services.app import make_app
 from stickslip_services.cli.main import app
 from stickslip_services.errors import QuotaExceededError

@@ -9,18 +9,17 @@ from stickslip_schemas.documents.responses import Dataset
 from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishSection, PublishTask, RenderTask
 from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_schemas.plan.builds import Builds
-from stickslip_services.catalog.datasets import find_dataset
-from stickslip_services.database.paging import PageRequest
+from stickslip_services.catalog.versions import find_dataset
+from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job
+from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job, start, sweep
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.ledger import LIVE, holds_alone
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start, sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_jobs, parsed, rods, show_job

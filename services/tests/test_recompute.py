@@ -12,9 +12,9 @@ from stickslip_schemas.store import DirectoryStore
 from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import sweep
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import sweep
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import PretendWorker

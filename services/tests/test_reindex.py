@@ -10,15 +10,14 @@ from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import main
 from stickslip_services.cli import app
-from stickslip_services.database.database import Role
+from stickslip_services.database.database import Role, SqliteDatabase
 from stickslip_services.database.opening import check, opened
-from stickslip_services.database.sqlite import SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
-from stickslip_services.local.process import locked
+from stickslip_services.local.supervisor import locked
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.control import start
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start
+from stickslip_services.queue.upkeep import reindex
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job

@@ -12,15 +12,13 @@ from stickslip_schemas.base import JobState, Reason, sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 from stickslip_services.app import make_app
-from stickslip_services.client.errors import ForeignFilesError
-from stickslip_services.client.http import Client
+from stickslip_services.client.http import Client, ForeignFilesError
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
-from stickslip_services.queue.cleanup import unused
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.reindex import reindex
+from stickslip_services.queue.control import start
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import start
+from stickslip_services.queue.upkeep import reindex, unused
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods

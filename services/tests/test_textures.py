@@ -15,11 +15,11 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app
 from stickslip_services.client import Client
-from stickslip_services.client.errors import ProblemError
+from stickslip_services.client.http import ProblemError
 from stickslip_services.errors import UnknownFileError
-from stickslip_services.queue.cleanup import unused
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.upkeep import unused
 from stickslip_testing.jobs import parsed
 from stickslip_testing.servers import RunningServer
 from stickslip_testing.worker import DirectApi, PretendWorker

@@ -18,14 +18,12 @@ from stickslip_services.cli import app
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
 from stickslip_services.database.tables import dataset_versions
-from stickslip_services.local.process import locked
-from stickslip_services.queue.cleanup import unused
+from stickslip_services.local.supervisor import locked
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.control import EVERY_SECONDS, scrub, scrub_when_idle, start, sweep
 from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.reindex import reindex
-from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.sweep import EVERY_SECONDS, scrub, scrub_when_idle, start, sweep
+from stickslip_services.queue.submit import Planner, submit_job
+from stickslip_services.queue.upkeep import reindex, unused
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job

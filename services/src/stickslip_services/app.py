@@ -29,28 +29,32 @@ from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
 from stickslip_services.api import problems
-from stickslip_services.api.auth import KeyMiddleware, OriginMiddleware
-from stickslip_services.api.connections import PatientProtocol, allow_many_files
-from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.middleware import BodyLimitMiddleware, RequestMiddleware
+from stickslip_services.api.middleware import (
+    BodyLimitMiddleware,
+    KeyMiddleware,
+    OriginMiddleware,
+    PatientProtocol,
+    RequestMiddleware,
+    allow_many_files,
+)
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import certificates, datasets, health, jobs, pages, uploads, workers
+from stickslip_services.api.routes import catalog, health, jobs, pages, workers
+from stickslip_services.api.routes.health import Metrics
 from stickslip_services.api.sse import Feeds
-from stickslip_services.client.errors import ClientError
-from stickslip_services.client.signing import sign
+from stickslip_services.client.http import ClientError
+from stickslip_services.client.verifying import sign
 from stickslip_services.clock import Clock
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import CommandError
-from stickslip_services.local.process import configure_logging, limit_arenas, listen, locked
+from stickslip_services.local.supervisor import configure_logging, limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import give_up_waiting
+from stickslip_services.queue.control import give_up_waiting, scrub_when_idle, start, sweep
 from stickslip_services.queue.lease import renew_leases
-from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.sweep import scrub_when_idle, start, sweep
+from stickslip_services.queue.submit import Planner
 from stickslip_services.settings import SERVER, Settings, options
 
 logger = logging.getLogger(__name__)
@@ -116,7 +120,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.renewals = workers.Gathering(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
-    modules = (workers, jobs, uploads, datasets, certificates, health, pages)
+    modules = (workers, jobs, catalog, health, pages)
     app.state.routes = [route for module in modules for route in module.router.routes]
     app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

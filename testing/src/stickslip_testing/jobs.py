@@ -4,8 +4,8 @@ from typing import Any
 
 from stickslip_schemas.documents.responses import Dataset, Job, JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_services.catalog import datasets
-from stickslip_services.database.paging import PageRequest
+from stickslip_services.catalog import versions
+from stickslip_services.database.database import PageRequest
 from stickslip_services.queue import jobs
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import find_job
@@ -52,4 +52,4 @@ def list_jobs(context: Context) -> tuple[Job, ...]:
 def list_datasets(context: Context) -> tuple[Dataset, ...]:
     """Return all datasets, newest first."""
     with context.database.read() as connection:
-        return datasets.list_datasets(connection, PageRequest(1000, None)).items
+        return versions.list_datasets(connection, PageRequest(1000, None)).items

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import httpx
-from stickslip_services.local.process import listen
+from stickslip_services.local.supervisor import listen
 
 COORDINATOR = "import sys; from stickslip_services.app import main; sys.exit(main())"
 WORKER = """

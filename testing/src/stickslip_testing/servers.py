@@ -26,9 +26,9 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.api.connections import PatientProtocol
+from stickslip_services.api.middleware import PatientProtocol
 from stickslip_services.app import make_app
-from stickslip_services.local.process import listen
+from stickslip_services.local.supervisor import listen
 from stickslip_services.settings import Settings
 
 from stickslip_testing.worker import PretendWorker

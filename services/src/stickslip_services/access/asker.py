@@ -1,22 +1,32 @@
-"""Who asks, and what they may do and see: the one place that answers for a scope and a project.
+"""Who asks, and what they may do and see: the one place that answers for a scope and a project; and the audit log.
 
 Every query for something that belongs to a project has one of the conditions `own_...`. What belongs to another project
 is thus not found. The coordinator itself, and commands on its machine, see everything, and so do keys of the scope
 `admin`.
+
+The audit log says who changed what, and when. It is append-only: the database refuses to change or delete an entry. An
+entry is written in the transaction of the change itself, so that neither exists without the other.
 """
 
 import getpass
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
+from typing import Any
 
-from sqlalchemy import ColumnElement, exists, or_, true
+from sqlalchemy import ColumnElement, Connection, exists, insert, or_, select, true
+from stickslip_schemas.base.document import Document
 
-from stickslip_services.database.tables import dataset_versions, job_tasks, jobs
+from stickslip_services.database.database import Role, document_of
+from stickslip_services.database.opening import opened
+from stickslip_services.database.tables import audit_log, dataset_versions, job_tasks, jobs
 from stickslip_services.errors import CommandError, NotFoundError
+from stickslip_services.settings import Settings
 
 
 class Scope(StrEnum):
@@ -124,3 +134,42 @@ def refuse_projects(what: str) -> None:
     """Raise NotFoundError where the asker belongs to a project, for something that tells about all of them."""
     if this_asker().project and not this_asker().sees_all:
         raise NotFoundError(f"{what} are of all projects: ask with a key without a project")
+
+
+class Entry(Document):
+    """An entry of the audit log."""
+
+    at: datetime
+    actor: str
+    """Name of the asker."""
+    action: str
+    """What was done, for example `job.cancel`."""
+    subject: str
+    """The id of the job, version, key, webhook or certificate that was changed."""
+    details: dict[str, Any]
+
+
+def note(connection: Connection, action: str, subject: str, now: float, **details: Any) -> None:
+    connection.execute(
+        insert(audit_log).values(
+            at=now, actor=this_asker().name, action=action, subject=subject, details=json.dumps(details)
+        )
+    )
+
+
+def read_audit_log(connection: Connection, *, subject: str | None = None, limit: int = 100) -> list[Entry]:
+    """Return the last `limit` entries, newest first; with `subject`, only those about it."""
+    query = select(audit_log).order_by(audit_log.c.seq.desc()).limit(limit)
+    if subject is not None:
+        query = query.where(audit_log.c.subject == subject)
+    return [document_of(Entry, row, details=json.loads(row.details)) for row in connection.execute(query)]
+
+
+@contextmanager
+def visited(settings: Settings) -> Iterator[Connection]:
+    """Open a write transaction on a database for a command on this machine; raise DatabaseRefusedError.
+
+    A coordinator may run meanwhile.
+    """
+    with asking(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+        yield connection

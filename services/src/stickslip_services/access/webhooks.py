@@ -21,12 +21,10 @@ from standardwebhooks import Webhook as Signer
 from stickslip_schemas.base import Document
 from stickslip_schemas.documents.responses import EventName
 
-from stickslip_services.access.asker import check_project
-from stickslip_services.access.audit_log import note
+from stickslip_services.access.asker import check_project, note
 from stickslip_services.addresses import is_loopback
 from stickslip_services.clock import Clock, as_datetime
-from stickslip_services.database.database import Database
-from stickslip_services.database.paging import document_of
+from stickslip_services.database.database import Database, document_of
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
 

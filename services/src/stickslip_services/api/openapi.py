@@ -15,7 +15,8 @@ from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, Repo
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 
-from stickslip_services.api.bodies import body_components
+from stickslip_services.access.asker import Scope
+from stickslip_services.api.middleware import needed_scope
 
 _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "JobSpec": job_spec_adapter,
@@ -29,10 +30,12 @@ _DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
     "Manifest": Manifest,
     "Problem": Problem,
 }
+_TAGS = {"previews": "jobs", "textures": "uploads", "files": "uploads", "worker": "workers", "": "health"}
+"""Tags of paths whose first word is another."""
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document of `app`, with the request documents that bodies.py reads."""
+    """Return the OpenAPI document of `app`, with the documents of requests."""
     if not app.openapi_schema:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = document.setdefault("components", {}).setdefault("schemas", {})
@@ -44,9 +47,13 @@ def describe(app: FastAPI) -> dict[str, Any]:
             }
         }
         # Requests allow more forms than answers (short forms of axes), so their schema holds for both.
-        components.update(body_components(_DOCUMENTS))
-        for operation in (each for methods in document["paths"].values() for each in methods.values()):
-            _tidy(operation)
+        components.update(_body_components(_DOCUMENTS))
+        for path, methods in document["paths"].items():
+            for method, operation in methods.items():
+                operation["tags"] = [_TAGS.get(word := re.split(r"[/:]", path.removeprefix("/v1/"))[0], word)]
+                if needed_scope(method.upper(), path) is Scope.work:
+                    operation["security"] = [{"key": []}]
+                _tidy(operation)
         _name_by_title(document)
         _require_tags(document)
         for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
@@ -96,3 +103,17 @@ def _name_by_title(document: dict[str, Any]) -> None:
                 for key, value in node.items():
                     if value == f"#/components/schemas/{name}":
                         node[key] = f"#/components/schemas/{title}"
+
+
+def _body_components(models: dict[str, TypeAdapter[Any] | type[BaseModel]]) -> dict[str, Any]:
+    """Return the OpenAPI components of request documents by name."""
+    adapters = [
+        (name, "validation", model if isinstance(model, TypeAdapter) else TypeAdapter(model))
+        for name, model in models.items()
+    ]
+    schemas, shared = TypeAdapter.json_schemas(adapters, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]
+    components: dict[str, Any] = dict(shared.get("$defs", {}))
+    for (name, _), schema in schemas.items():
+        if schema != {"$ref": f"#/components/schemas/{name}"}:
+            components[str(name)] = schema
+    return components

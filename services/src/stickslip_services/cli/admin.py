@@ -12,11 +12,9 @@ from typing import Any
 import click
 from sqlalchemy import Connection
 
-from stickslip_services.access import audit_log as audit
 from stickslip_services.access import keys as stored_keys
-from stickslip_services.access import projects as stored_projects
 from stickslip_services.access import webhooks as stored_webhooks
-from stickslip_services.access.asker import Scope
+from stickslip_services.access.asker import Scope, read_audit_log, visited
 from stickslip_services.cli.common import print_table, say, shows_errors
 from stickslip_services.settings import Settings, options
 
@@ -28,7 +26,7 @@ def administers(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(settings: Settings, **given: Any) -> None:
-        with audit.visited(settings) as connection:
+        with visited(settings) as connection:
             command(connection, **given)
 
     return shows_errors(options("data", "database")(run))
@@ -97,7 +95,7 @@ def projects() -> None:
 def list_projects(connection: Connection) -> None:
     """List projects with their quotas, and the jobs and samples in progress that count against them."""
     rows = []
-    for project in stored_projects.list_projects(connection):
+    for project in stored_keys.list_projects(connection):
         limits = _limit(project.max_jobs), _limit(project.max_samples)
         rows.append((project.name or "(none)", f"{project.jobs:,}", limits[0], f"{project.samples:,}", limits[1]))
     print_table(("project", "jobs", "at most", "samples", "at most"), rows)
@@ -110,7 +108,7 @@ def list_projects(connection: Connection) -> None:
 @administers
 def set_quota(connection: Connection, name: str, samples: int | None, jobs: int | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
-    stored_projects.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
+    stored_keys.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
     click.echo(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
 
@@ -131,7 +129,7 @@ def webhooks() -> None:
 @options("data", "database")
 def create_webhook(settings: Settings, url: str, project: str) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
-    with audit.visited(settings) as connection:
+    with visited(settings) as connection:
         sealing = stored_keys.sealer(settings)
         webhook_id, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
     click.echo(secret)
@@ -175,7 +173,7 @@ def delete_webhook(connection: Connection, webhook: str) -> None:
 @administers
 def audit_log(connection: Connection, subject: str | None, limit: int, as_json: bool) -> None:
     """Show who changed what and when, newest first."""
-    entries = audit.read_audit_log(connection, subject=subject, limit=limit)
+    entries = read_audit_log(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
             click.echo(entry.model_dump_json())

@@ -18,8 +18,7 @@ from pydantic import BaseModel
 
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.specs import field_line
-from stickslip_services.client.errors import ClientError, MissingExtraError, ProblemError, UnreachableError
-from stickslip_services.client.http import Client
+from stickslip_services.client.http import Client, ClientError, MissingExtraError, ProblemError, UnreachableError
 from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")

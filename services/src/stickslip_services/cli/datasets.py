@@ -14,11 +14,9 @@ from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table, say, shows_errors
-from stickslip_services.client.errors import ClientError
-from stickslip_services.client.http import Client
+from stickslip_services.client.http import Client, ClientError
 from stickslip_services.client.pulling import pull
-from stickslip_services.client.signing import sign_directory, signer_of
-from stickslip_services.client.verifying import READS_ARRAYS
+from stickslip_services.client.verifying import READS_ARRAYS, sign_directory, signer_of
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
 

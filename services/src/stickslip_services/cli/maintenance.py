@@ -11,15 +11,15 @@ from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.asker import asking, this_user
 from stickslip_services.cli.common import amount, say, shows_errors
-from stickslip_services.client.errors import ClientError
+from stickslip_services.client.http import ClientError
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError
-from stickslip_services.local.process import locked
-from stickslip_services.queue.cleanup import remove, unused
+from stickslip_services.local.supervisor import locked
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.reindex import reindex as reindexed
-from stickslip_services.queue.sweep import scrub as scrubbed
+from stickslip_services.queue.control import scrub as scrubbed
+from stickslip_services.queue.upkeep import reindex as reindexed
+from stickslip_services.queue.upkeep import remove, unused
 from stickslip_services.settings import Settings, options
 
 

@@ -15,7 +15,7 @@ from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
 from stickslip_services.cli.common import FILE, json_option, print_table, say, shows_errors
 from stickslip_services.cli.specs import read_scene
-from stickslip_services.client.errors import ClientError
+from stickslip_services.client.http import ClientError
 from stickslip_services.local import making
 from stickslip_services.units import size
 

@@ -30,21 +30,22 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_schemas.store import sync, write_durably
 
-from stickslip_services.client.errors import (
+from stickslip_services.client.http import (
+    Client,
     DamagedError,
     ForeignFilesError,
     ProblemError,
     SelectionError,
     UnreachableError,
+    parsed,
     raise_for_problem,
 )
-from stickslip_services.client.http import Client, parsed
-from stickslip_services.client.signing import check_signature
 from stickslip_services.client.verifying import (
     CONNECTIONS,
     EVERYTHING,
     OWN_NAMES,
     PART,
+    check_signature,
     file_digest,
     files_below,
     read_label,

@@ -1,19 +1,25 @@
-"""Transactions on the database: SQLite in the data directory, or PostgreSQL at a URL.
+"""Transactions on the database (SQLite in the data directory, or PostgreSQL at a URL), and rows as documents and pages.
 
 A write transaction excludes other writers from its first statement on, so it never conflicts at its end, and needs no
 retries.
 """
 
+import os
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from enum import Enum, auto
+from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Column, Connection, Engine, Select, Table, event
+from pydantic import BaseModel
+from sqlalchemy import URL, Column, Connection, Engine, Row, Select, Table, create_engine, event
+from stickslip_schemas.documents.responses import Page
 
 T = TypeVar("T")
 
@@ -104,3 +110,96 @@ def insert_rows(connection: Connection, table: Table, columns: Sequence[str], ro
     statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({', '.join([mark] * len(columns))})"
     for batch in batches(rows, 20 * BATCH):
         connection.exec_driver_sql(statement, batch)
+
+
+MAX_PAGE_SIZE = 1000
+
+TOKEN_PATTERN = r"^[0-9]{1,18}$"
+"""Pattern of page tokens; every number is a valid position in a list."""
+M = TypeVar("M", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class PageRequest:
+    """The requested page: at most `size` items beyond the position `after`."""
+
+    size: int
+    after: int | None
+
+
+def document_of(model: type[M], row: Any, **more: Any) -> M:
+    """Return a document with the values of a row, or of an object, for its fields, and with `more`.
+
+    Times, in seconds since 1970, become dates in UTC.
+    """
+    found = {name: getattr(row, name) for name in model.model_fields if name not in more and hasattr(row, name)}
+    return model.model_validate(found | more)
+
+
+def read_page(
+    connection: Connection,
+    query: Select[Any],
+    page: PageRequest,
+    position: Column[Any],
+    items: Callable[[Sequence[Row[Any]]], Iterable[T]],
+    *,
+    newest_first: bool = True,
+) -> Page[T]:
+    """Return a page of the rows of `query`, ordered by the column `position`; `items` converts rows."""
+    query = query.order_by(position.desc() if newest_first else position).limit(page.size + 1)
+    if page.after is not None:
+        query = query.where(position < page.after if newest_first else position > page.after)
+    rows = connection.execute(query).all()
+    shown = rows[: page.size]
+    token = str(getattr(shown[-1], position.key)) if len(rows) > page.size else None  # one row more than a page
+    return Page[T](items=tuple(items(shown)), next_page_token=token)
+
+
+_PRAGMAS = (
+    "journal_mode=WAL",  # readers and the writer do not wait for each other
+    "busy_timeout=30000",  # another process may look at the database (a backup, a person)
+    "foreign_keys=ON",
+    "journal_size_limit=67108864",  # the log of a big plan does not stay that big
+)
+
+
+class SqliteDatabase(Database):
+    """Transactions on one file. A write takes SQLite's write lock with its first statement (`BEGIN IMMEDIATE`)."""
+
+    def __init__(self, path: Path, *, durable: bool = True) -> None:
+        _close_to_others(path)
+        # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync; leases and reports
+        # come in batches, so there are only a few a second.
+        pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
+        url = URL.create("sqlite+pysqlite", database=str(path))
+        reader = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
+        writer = create_engine(url, connect_args={"timeout": 30}, pool_size=1, max_overflow=0)
+        for engine, begin in ((reader, "BEGIN"), (writer, "BEGIN IMMEDIATE")):
+            event.listen(engine, "connect", partial(_prepare, pragmas))
+            event.listen(engine, "begin", lambda connection, begin=begin: connection.exec_driver_sql(begin))
+        super().__init__(reader, writer)
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        with self._writing, self._writer.begin() as connection:
+            yield connection
+
+
+def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:
+    connection.isolation_level = None  # the listeners begin transactions, not the driver
+    connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
+    for pragma in pragmas:
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _close_to_others(path: Path) -> None:
+    """Let nobody but the owner read the data directory and the database.
+
+    SQLite gives its log the permissions of the database.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for place, mode in ((path.parent, 0o700), (path, 0o600)):
+        if place == path:
+            place.touch(mode=mode)
+        if place.stat().st_uid == os.geteuid():
+            place.chmod(mode)

@@ -14,8 +14,7 @@ from sqlalchemy.exc import DBAPIError
 from stickslip_schemas.format.manifest import MANIFEST_NAME
 from stickslip_schemas.store import open_store
 
-from stickslip_services.database.database import Database, Role
-from stickslip_services.database.sqlite import SqliteDatabase
+from stickslip_services.database.database import Database, Role, SqliteDatabase
 from stickslip_services.errors import DatabaseRefusedError
 from stickslip_services.settings import Settings
 

@@ -1,19 +1,23 @@
-"""`stickslip up`: a coordinator, a Ray and a dispatcher on this machine, restarted until the supervisor stops.
+"""The processes on a machine: their memory, lock, socket and log, and `stickslip up`.
 
-All files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and `lock` (against a
-second supervisor). Children that die are restarted with growing delays. A child that dies repeatedly at its start ends
-the supervisor, which prints the end of its log.
+`stickslip up` runs a coordinator, a Ray and a dispatcher, restarted until the supervisor stops. All files are below one
+directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and `lock` (against a second supervisor).
+Children that die are restarted with growing delays. A child that dies repeatedly at its start ends the supervisor,
+which prints the end of its log.
 """
 
 import ctypes
+import fcntl
+import logging
 import os
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -21,9 +25,69 @@ from types import FrameType
 import httpx
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.errors import SupervisorError
-from stickslip_services.local.process import listen, locked
+from stickslip_services.errors import DatabaseRefusedError, ListeningError, SupervisorError
 from stickslip_services.settings import Settings
+
+_M_ARENA_MAX = -8  # of glibc's malloc.h
+
+
+def limit_arenas() -> None:
+    """Let all threads allocate from two arenas of glibc. With one for each, every arena keeps memory that it freed."""
+    with suppress(AttributeError):  # another C library
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
+
+
+@contextmanager
+def locked(data: Path) -> Iterator[int]:
+    """Hold the lock of a data directory, which one coordinator or one `stickslip up` may use at a time.
+
+    Yield the file descriptor of the lock. A process that inherits it holds the lock, too, until it ends.
+    Raise DatabaseRefusedError if another process holds it.
+    """
+    data.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = data / "lock"
+    with path.open("a+") as file:
+        deadline = time.monotonic() + 10
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                holder = path.read_text(encoding="utf-8").strip()
+                # After a kill of `stickslip up`, its coordinator holds the lock for another moment.
+                if Path("/proc", holder or "nobody").exists() or time.monotonic() > deadline:
+                    message = f"{path.parent} is in use by another `stickslip up` or coordinator (pid {holder})"
+                    raise DatabaseRefusedError(message) from None
+                time.sleep(0.1)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield file.fileno()
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that is bound to a port, but does not accept connections yet; raise ListeningError."""
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    listener = socket.socket(family, kind, protocol)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+    except OSError as error:
+        listener.close()
+        rule = f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
+        raise ListeningError(rule) from error
+    return listener
+
+
+def configure_logging() -> None:
+    """Log to standard error, one event a line: `time level logger: message`, in UTC."""
+    formatter = logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
+    formatter.converter = time.gmtime
+    handler = logging.StreamHandler()
+    handler.setFormatter(formatter)
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+
 
 START_SECONDS = 180.0
 """Time limit for the coordinator's first answer [s]; migrations may be slow while simulations use all cores."""

@@ -19,7 +19,7 @@ from stickslip_schemas.documents.responses import (
 )
 
 from stickslip_services.access.asker import own, own_task
-from stickslip_services.database.paging import PageRequest, document_of, read_page
+from stickslip_services.database.database import PageRequest, document_of, read_page
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import events, job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError

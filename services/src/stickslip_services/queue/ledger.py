@@ -31,8 +31,7 @@ from stickslip_schemas.documents.responses import (
 )
 from stickslip_schemas.documents.tasks import TaskResult
 
-from stickslip_services.database.database import batches
-from stickslip_services.database.paging import document_of
+from stickslip_services.database.database import batches, document_of
 from stickslip_services.database.prepared import Counters, Prepared
 from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import add_costs

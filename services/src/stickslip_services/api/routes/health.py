@@ -1,16 +1,112 @@
-"""Routes of health checks and metrics."""
+"""Health checks, and Prometheus metrics: the queue and the store, read at each scrape, and counters since the start."""
+
+from collections import Counter as Counts
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST
-from sqlalchemy import text
-from stickslip_schemas.base import Document
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Histogram, Info, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from sqlalchemy import func, select, text
+from stickslip_schemas.base.document import Document
+from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
 from stickslip_services.access.asker import refuse_projects
-from stickslip_services.api.metrics import Metrics
 from stickslip_services.api.routes.common import ContextDep, problem_responses
+from stickslip_services.database.tables import dataset_versions, jobs, task_counts
+from stickslip_services.database.tables import tasks as tasks_
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.ledger import HELD
+from stickslip_services.queue.workers import alive_workers
 
-router = APIRouter(tags=["health"])
+
+class _QueueCollector(Collector):
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def collect(self) -> Iterable[Metric]:
+        own = dataset_versions.c
+        sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
+        with self._context.database.read() as connection:
+            alive = alive_workers(self._context, connection)
+            tasks = connection.execute(select(task_counts)).all()
+            by_state = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
+            held = Counts(connection.scalars(select(tasks_.c.owner).where(HELD)).all())
+            count, size, bad, read_at = connection.execute(select(*sums).where(own.manifest.is_not(None))).one()
+        age, room = self._context.clock() - read_at if count else 0.0, self._context.store.room()
+        disk = () if room is None else (("free", room.free), ("used", room.used))
+        return [
+            _gauge("tasks", "Tasks by stage and state", tasks, "stage", "state"),
+            _gauge("jobs", "Jobs by state", by_state, "state"),
+            _gauge("leases", "Tasks on lease by worker", [(one.name, held[one.id]) for one in alive], "worker"),
+            _gauge("workers", "Workers with a recent message", [(len(alive),)]),
+            _gauge(
+                "worker_slots", "Slots of workers with a recent message", [(sum(w.condition.slots for w in alive),)]
+            ),
+            _gauge("dataset_versions", "Dataset versions", [(count,)]),
+            _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),
+            _gauge("damaged_files", "Files that scrubbing found damaged", [(bad or 0,)]),
+            _gauge("unread_seconds", "Age of the oldest scrub of a version [s]", [(age,)]),
+            _gauge("store_disk_bytes", "Disk of the store", disk, "state"),
+        ]
+
+
+def _gauge(name: str, text: str, rows: Iterable[Sequence[Any]], *labels: str) -> Metric:
+    """Return a gauge from rows of the values of its labels and its own."""
+    made = GaugeMetricFamily(f"stickslip_{name}", text, labels=labels)
+    for *of_labels, value in rows:
+        made.add_metric(of_labels, value)
+    return made
+
+
+class Metrics:
+    """The metrics of one coordinator."""
+
+    def __init__(self, context: Context) -> None:
+        self._registry = CollectorRegistry()
+        self._registry.register(_QueueCollector(context))
+        Info("stickslip", "The coordinator", registry=self._registry).info({"version": __version__})
+        self._task_seconds = Histogram(
+            "stickslip_task_seconds",
+            "Time that a try of a task took, by how it ended [s]",
+            ["stage", "outcome"],
+            registry=self._registry,
+            buckets=(0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000, 10000),
+        )
+        self._failures = Counter(
+            "stickslip_task_failures",
+            "Tries that failed and samples that were rejected, by reason",
+            ["stage", "outcome", "reason"],
+            registry=self._registry,
+        )
+        self._requests = Histogram(
+            "stickslip_request_seconds",
+            "Time to answer a request [s]",
+            ["method", "route", "status"],
+            registry=self._registry,
+        )
+
+    def observe(self, method: str, route: str, status: int, seconds: float) -> None:
+        self._requests.labels(method, route, str(status)).observe(seconds)
+
+    def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
+        """Count the outcomes of accepted reports."""
+        for report, verdict in zip(batch.reports, answer.verdicts, strict=True):
+            result = report.result
+            if verdict.verdict != "accepted" or result is None:
+                continue
+            stage = report.task_id.partition("-")[0]
+            self._task_seconds.labels(stage, result.outcome).observe(result.wall_seconds)
+            if result.reason is not None:
+                self._failures.labels(stage, result.outcome, result.reason).inc()
+
+    def text(self) -> bytes:
+        return generate_latest(self._registry)
+
+
+router = APIRouter()
 
 
 class Health(Document):

@@ -8,23 +8,19 @@ from stickslip_schemas.documents.responses import Job, JobDetail, JobPatch, Page
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.routes.common import BODY_PROBLEMS, ContextDep, PageDep, problem_responses
+from stickslip_services.api.routes.common import ContextDep, JsonBody, PageDep, Responses, problem_responses, reads
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
 from stickslip_services.queue import control
 from stickslip_services.queue.jobs import find_job, list_jobs, list_previews, list_samples, show_job
 from stickslip_services.queue.submit import Replay, submit_job, validate_spec
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter()
 
 SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
-_CHANGED: dict[int | str, dict[str, Any]] = {
-    202: {"description": "The job after the change"},
-    **problem_responses(404, 409),
-}
+_CHANGED: Responses = {202: {"description": "The job after the change"}, **problem_responses(404, 409)}
 _REPLAYED: dict[str, Any] = {
     "description": "The answer that this Idempotency-Key got the first time",
     "model": JobDetail,
@@ -36,12 +32,11 @@ _REPLAYED: dict[str, Any] = {
     "/v1/jobs",
     status_code=202,
     response_model=JobDetail,
-    responses={
-        200: _REPLAYED,
-        202: {"description": "The job is in the queue", "headers": _LOCATION},
-        **problem_responses(409, 429, *BODY_PROBLEMS),
-    },
-    openapi_extra=body_schema("JobSpec"),
+    **reads(
+        "JobSpec",
+        *(409, 429),
+        answers={200: _REPLAYED, 202: {"description": "The job is in the queue", "headers": _LOCATION}},
+    ),
 )
 def post_job(
     spec: SpecBody,
@@ -68,7 +63,7 @@ def post_job(
     return Response(job.model_dump_json(), 202, {"Location": f"/v1/jobs/{job.id}"}, "application/json")
 
 
-@router.post("/v1/jobs:validate", responses=problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobSpec"))
+@router.post("/v1/jobs:validate", **reads("JobSpec"))
 def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
     """Return counts and sizes of a job, and why it would be refused, without making it."""
     return validate_spec(context, spec)
@@ -94,9 +89,7 @@ def get_job(job_id: str, context: ContextDep) -> JobDetail:
         return show_job(context, connection, int(find_job(connection, job_id).seq))
 
 
-@router.patch(
-    "/v1/jobs/{job_id}", responses=_CHANGED | problem_responses(*BODY_PROBLEMS), openapi_extra=body_schema("JobPatch")
-)
+@router.patch("/v1/jobs/{job_id}", **reads("JobPatch", answers=_CHANGED))
 def patch_job(job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep) -> JobDetail:
     """Set the priority of a job, from its next task on. 409: it has ended."""
     return control.prioritise_job(context, job_id, patch.priority)

@@ -20,9 +20,8 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 
-from stickslip_services.api.bodies import JsonBody, body_schema
-from stickslip_services.api.metrics import Metrics
-from stickslip_services.api.routes.common import BODY_PROBLEMS, KEYED, ContextDep, problem_responses
+from stickslip_services.api.routes.common import ContextDep, JsonBody, json_content, problem_responses, reads
+from stickslip_services.api.routes.health import Metrics
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.lease import lease_tasks, register_worker, sort_out
@@ -31,7 +30,6 @@ from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")
 U = TypeVar("U")
-_Route = TypeVar("_Route", bound=Callable[..., Any])
 
 MOST_ON_LOOP = 64 * 2**10
 """Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread."""
@@ -53,31 +51,14 @@ class _Plain(APIRoute):
 router = APIRouter(route_class=_Plain)
 
 
-def _verb(name: str, document: type[BaseModel], answer: type[BaseModel], *refusals: int) -> Callable[[_Route], _Route]:
-    """Return the decorator of a route that workers post a document to."""
-    return router.post(
-        f"/v1/worker/{name}",
-        tags=["workers"],
-        response_model=answer,
-        responses=problem_responses(*refusals, *BODY_PROBLEMS),
-        openapi_extra=body_schema(document.__name__) | KEYED,
-    )
-
-
-@router.get("/v1/workers", tags=["workers"], responses=problem_responses())
+@router.get("/v1/workers", responses=problem_responses())
 def get_workers(context: ContextDep) -> list[WorkerEntry]:
     """List the workers that have registered, the newest session of each name, newest first."""
     with context.database.read() as connection:
         return show_workers(context, connection)
 
 
-@router.post(
-    "/v1/workers",
-    tags=["workers"],
-    status_code=201,
-    responses=problem_responses(*BODY_PROBLEMS),
-    openapi_extra=body_schema("WorkerRegistration") | KEYED,
-)
+@router.post("/v1/workers", status_code=201, **reads("WorkerRegistration"))
 def post_worker(
     registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], context: ContextDep
 ) -> WorkerSession:
@@ -85,13 +66,13 @@ def post_worker(
     return register_worker(context, registration)
 
 
-@_verb("lease", LeaseRequest, LeaseBatch, 404, 409)
+@router.post("/v1/worker/lease", response_model=LeaseBatch, **reads("LeaseRequest", 404, 409))
 async def post_lease(request: Request) -> Response:
     """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
     return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
 
-@_verb("heartbeat", Heartbeat, HeartbeatAnswer, 404)
+@router.post("/v1/worker/heartbeat", response_model=HeartbeatAnswer, **reads("Heartbeat", 404))
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
     body = await _HEARTBEAT.received(request)
@@ -136,7 +117,7 @@ class Gathering(Generic[T, U]):
         self._task = None
 
 
-@_verb("report", ReportBatch, ReportAnswer, 404)
+@router.post("/v1/worker/report", response_model=ReportAnswer, **reads("ReportBatch", 404))
 async def post_report(request: Request) -> Response:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
     metrics: Metrics = request.app.state.metrics
@@ -151,15 +132,8 @@ async def post_report(request: Request) -> Response:
 
 @router.get(
     "/v1/tasks/{task_id}",
-    tags=["tasks"],
     response_class=Response,
-    responses={
-        200: {
-            "description": "The task",
-            "content": {"application/json": {"schema": {"$ref": "#/components/schemas/Task"}}},
-        },
-        **problem_responses(404, 409),
-    },
+    responses={200: {"description": "The task", "content": json_content("Task")}, **problem_responses(404, 409)},
 )
 def get_task(task_id: str, context: ContextDep) -> Response:
     """Return a task as a worker gets it. 409: one of its dependencies has not ended yet."""

@@ -13,10 +13,9 @@ from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
-from stickslip_services.api.files import matches
-from stickslip_services.api.routes.common import ContextDep, Version
-from stickslip_services.catalog.datasets import find_dataset, find_version, list_datasets, read_contents
-from stickslip_services.database.paging import PageRequest
+from stickslip_services.api.routes.common import ContextDep, Version, matches
+from stickslip_services.catalog.versions import find_dataset, find_version, list_datasets, read_contents
+from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import coloured, histograms, losses, mp4, sample_view, sliders, thumbs
 from stickslip_services.pages.motion import motion

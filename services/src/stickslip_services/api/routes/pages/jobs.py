@@ -15,7 +15,7 @@ from stickslip_schemas.plan.points import count, estimated
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
-from stickslip_services.database.paging import PageRequest
+from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.grid_map import grid_maps
 from stickslip_services.pages.rendering import html_page, spec_text
@@ -31,7 +31,7 @@ from stickslip_services.queue.jobs import (
     slowest_tasks,
     stage_durations,
 )
-from stickslip_services.queue.retries import failed_tasks
+from stickslip_services.queue.report import failed_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.workers import alive_workers
 

@@ -9,10 +9,9 @@ from sqlalchemy import Connection, func, select
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.catalog.certificates import find_certificate, list_certificates
-from stickslip_services.catalog.scenes import known_scenes
+from stickslip_services.catalog.inputs import find_certificate, known_scenes, list_certificates
 from stickslip_services.clock import as_datetime
-from stickslip_services.database.paging import PageRequest
+from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.rendering import html_page, plot, table

@@ -1,0 +1,184 @@
+"""Datasets, their versions and their files; certificates; and uploads of textures and of files of scenes.
+
+`.../versions/N/files/` is the root of a Zarr store: any Zarr reader opens it at its URL.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, TypeVar
+
+from fastapi import APIRouter, Depends, Request, Response
+from starlette.concurrency import run_in_threadpool
+from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.documents.certificate import Certificate
+from stickslip_schemas.documents.problems import FieldError, ProblemCode
+from stickslip_schemas.documents.responses import (
+    CertificateEntry,
+    Dataset,
+    DatasetVersion,
+    FileUpload,
+    Page,
+    TextureEntry,
+)
+from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
+from stickslip_schemas.format.pictures import UnfitPictureError
+from stickslip_schemas.scene.files import UnfitFileError
+from stickslip_schemas.store import Store
+
+from stickslip_services.api.problems import ProblemError
+from stickslip_services.api.routes.common import (
+    BODY_PROBLEMS,
+    ContextDep,
+    JsonBody,
+    PageDep,
+    Version,
+    json_content,
+    picture_format,
+    problem_responses,
+    reads,
+    serve,
+    serves,
+    whole_body,
+)
+from stickslip_services.catalog.inputs import (
+    find_certificate,
+    list_certificates,
+    register_certificate,
+    store_file,
+    store_texture,
+)
+from stickslip_services.catalog.versions import find_dataset, find_file, find_version, list_datasets
+from stickslip_services.database.database import Database
+from stickslip_services.errors import NotFoundError
+from stickslip_services.queue.jobs import is_preview
+
+T = TypeVar("T")
+
+router = APIRouter()
+
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_PICTURES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
+"""Accepted media types of textures, and the first bytes of such files."""
+_PICTURE_BODY = {"requestBody": {"required": True, "content": dict.fromkeys(_PICTURES, _BINARY)}}
+_FILE_BODY = {"requestBody": {"required": True, "content": {"application/octet-stream": _BINARY}}}
+
+
+@router.get("/v1/datasets", responses=problem_responses(422))
+def get_datasets(page: PageDep, context: ContextDep) -> Page[Dataset]:
+    """List datasets, newest first."""
+    with context.database.read() as connection:
+        return list_datasets(connection, page)
+
+
+@router.get("/v1/datasets/{dataset}", responses=problem_responses(404))
+def get_dataset(dataset: str, context: ContextDep) -> Dataset:
+    """Return a dataset with its versions."""
+    with context.database.read() as connection:
+        return find_dataset(connection, dataset)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
+def get_version(dataset: str, version: Version, context: ContextDep) -> DatasetVersion:
+    """Return a version."""
+    with context.database.read() as connection:
+        return find_version(connection, dataset, version)
+
+
+@router.get("/v1/datasets/{dataset}/versions/{version}/manifest", **serves(json_content("Manifest"), 422))
+@router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
+def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
+    """Return the manifest: every file of the version with its digest, the spec and the builds."""
+    return _serve(request, context, dataset, version, MANIFEST_NAME)
+
+
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/files/{path:path}", **serves({"application/octet-stream": _BINARY}, 422)
+)
+@router.head("/v1/datasets/{dataset}/versions/{version}/files/{path:path}", include_in_schema=False)
+def get_file(dataset: str, version: Version, path: str, request: Request, context: ContextDep) -> Response:
+    """Return a file of the version, or a range of it."""
+    return _serve(request, context, dataset, version, path)
+
+
+@router.get("/v1/previews/{digest}", **serves({"image/png": _BINARY, "image/webp": _BINARY}, 422))
+def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
+    """Return the picture of a sample."""
+    with context.database.read() as connection:
+        if not (is_sha256(digest) and is_preview(connection, digest)):
+            raise NotFoundError(f"there is no preview {digest[:100]!r}")
+    name = f"preview.{picture_format(context.store, digest)}"
+    return serve(request, context.store, digest, name=name)
+
+
+def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
+    with context.database.read() as connection:
+        found = find_version(connection, dataset, version)
+    if path == SIGNATURE_NAME:  # it may be made, and replaced, at any time
+        try:
+            signature = context.store.read_shown(dataset, version, path)
+        except FileNotFoundError:
+            raise NotFoundError(f"version {version} is not signed") from None
+        return Response(signature, headers={"Cache-Control": "no-store"}, media_type="application/octet-stream")
+    file = find_file(context.store, found, path)
+    return serve(request, context.store, file.sha256, name=path, size=file.size)
+
+
+@router.post("/v1/certificates", status_code=201, **reads("Certificate"))
+def post_certificate(
+    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))], context: ContextDep, response: Response
+) -> CertificateEntry:
+    """Register a certificate; it may be sent twice. The newest full certificate of a preset and build counts."""
+    entry = register_certificate(context.database, context.store, certificate, context.clock())
+    response.headers["Location"] = entry.href
+    return entry
+
+
+@router.get("/v1/certificates", responses=problem_responses(422))
+def get_certificates(page: PageDep, context: ContextDep) -> Page[CertificateEntry]:
+    """List certificates, newest first."""
+    with context.database.read() as connection:
+        return list_certificates(connection, page)
+
+
+@router.get("/v1/certificates/{digest}", **serves(json_content("Certificate")))
+def get_certificate(digest: str, request: Request, context: ContextDep) -> Response:
+    """Return a certificate."""
+    with context.database.read() as connection:
+        artifact = find_certificate(connection, digest).artifact
+    return serve(request, context.store, artifact, name="certificate.json")
+
+
+@router.post("/v1/textures", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_PICTURE_BODY)
+async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
+    """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side. It may be sent twice.
+
+    A picture that no job names is deleted by `stickslip gc` after a day.
+    """
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type not in _PICTURES:
+        detail = f"Content-Type must be {' or '.join(_PICTURES)}, and it is {media_type[:100]!r}"
+        raise ProblemError(415, ProblemCode.malformed_body, detail)
+    data = await whole_body(request)
+    if not data.startswith(_PICTURES[media_type]):
+        raise _refused(f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}", data)
+    return await _stored(store_texture, context, data)
+
+
+@router.post("/v1/files", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_FILE_BODY)
+async def post_file(request: Request, context: ContextDep) -> FileUpload:
+    """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ), of at most 16 MiB.
+
+    A file that no job names is deleted by `stickslip gc` after a day.
+    """
+    return await _stored(store_file, context, await whole_body(request))
+
+
+async def _stored(store: Callable[[Database, Store, bytes], T], context: ContextDep, data: bytes) -> T:
+    try:
+        return await run_in_threadpool(store, context.database, context.store, data)
+    except (UnfitPictureError, UnfitFileError) as error:
+        raise _refused(str(error), data) from error
+
+
+def _refused(rule: str, data: bytes) -> ProblemError:
+    field = FieldError(pointer="", rule=rule, value=f'"{len(data)} bytes"')
+    return ProblemError(422, ProblemCode.validation_failed, rule, fields=[field])
