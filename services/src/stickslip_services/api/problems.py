@@ -91,7 +91,7 @@ def _problem_of(request: Request, error: Exception) -> ProblemError:
             if status >= 500:
                 logger.error("%s %s: %s", request.method, path, error)
             return ProblemError(status, code, str(error), error.fields)
-        case RequestValidationError():  # parameters of path, query and header; bodies are read in bodies.py
+        case RequestValidationError():  # parameters of path, query and header; `JsonBody` reads bodies
             fields = [
                 FieldError(
                     pointer="".join(f"/{part}" for part in item["loc"]),

@@ -148,7 +148,7 @@ tasks = Table(
 )
 
 # The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
-# write_plan.py, and the tests check that both ends exist.
+# plan.py, and the tests check that both ends exist.
 
 task_dependencies = Table(
     "task_dependencies",
