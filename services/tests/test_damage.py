@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import Table, select, text
-from stickslip_schemas.base.states import JobState, TaskState
+from stickslip_schemas.base import JobState, TaskState
 from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import jobs, samples, tasks
 from stickslip_services.errors import DamagedRowsError

@@ -7,7 +7,7 @@ from typing import Any
 import httpx
 import pytest
 from click.testing import CliRunner
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import JobState
 from stickslip_services.access.asker import Asker, asking, read_audit_log
 from stickslip_services.access.keys import find_project, list_projects, set_quota
 from stickslip_services.app import make_app

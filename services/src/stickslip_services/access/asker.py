@@ -20,7 +20,7 @@ from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, exists, insert, or_, select, true
-from stickslip_schemas.base.document import Document
+from stickslip_schemas.base import Document
 
 from stickslip_services.database.database import Role, document_of
 from stickslip_services.database.opening import opened

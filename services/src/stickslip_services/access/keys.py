@@ -17,9 +17,7 @@ from pathlib import Path
 
 from cryptography.fernet import Fernet
 from sqlalchemy import Connection, delete, func, insert, select, update
-from stickslip_schemas.base.document import Document
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState
+from stickslip_schemas.base import Document, JobState, sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.access.asker import Asker, Scope, check_project, note

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection, Row, insert, select, update
-from stickslip_schemas.base.keys import ARTIFACT, Sha256
+from stickslip_schemas.base import ARTIFACT, Sha256
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import FieldError
 from stickslip_schemas.documents.responses import CertificateEntry, FileUpload, Page, TextureEntry

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
-from stickslip_schemas.base.keys import Sha256, sha256
+from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.documents.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
 from stickslip_schemas.format.manifest import (

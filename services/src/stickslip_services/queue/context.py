@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.store import DirectoryStore, Store, open_store
 
 from stickslip_services.clock import Clock

@@ -14,7 +14,7 @@ from math import inf
 from typing import Any
 
 from sqlalchemy import Row, or_, select, update
-from stickslip_schemas.base.states import JobState, Reason
+from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 

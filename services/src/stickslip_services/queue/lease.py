@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, select, update
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishTask
 from stickslip_schemas.documents.worker_api import (
     Heartbeat,

@@ -13,8 +13,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, func, insert, select, update
-from stickslip_schemas.base.keys import Sha256
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Sha256, Stage, TaskState
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import Shard, publish_key, shards

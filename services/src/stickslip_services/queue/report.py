@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, text, update
-from stickslip_schemas.base.states import JobState, Reason, Stage, TaskState
+from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PublishOutput, RenderOutput, TaskResult
 from stickslip_schemas.documents.worker_api import Report, ReportAnswer, ReportBatch, ReportVerdict
 from stickslip_schemas.format.manifest import Manifest, seal_text

@@ -15,10 +15,9 @@ from itertools import islice
 
 from sqlalchemy import Connection, Row, func, insert, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
-from stickslip_schemas.base.keys import sha256
-from stickslip_schemas.base.states import JobState, Reason, Stage
+from stickslip_schemas.base import JobState, Reason, Stage, sha256
 from stickslip_schemas.documents.responses import JobDetail, Validation
-from stickslip_schemas.format.layout import bytes_estimate
+from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.points import Counts, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec

@@ -15,8 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, select, update
-from stickslip_schemas.base.keys import Sha256, is_sha256, sha256
-from stickslip_schemas.base.states import JobState, Stage, TaskState
+from stickslip_schemas.base import JobState, Sha256, Stage, TaskState, is_sha256, sha256
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.plan.grid import dataset_id

@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
 from starlette.concurrency import run_in_threadpool
-from stickslip_schemas.base.keys import is_sha256
+from stickslip_schemas.base import is_sha256
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
 from stickslip_schemas.documents.responses import (

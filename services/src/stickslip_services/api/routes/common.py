@@ -17,7 +17,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import TypeAdapter, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
-from stickslip_schemas.base.keys import Sha256
+from stickslip_schemas.base import Sha256
 from stickslip_schemas.documents.problems import MEDIA_TYPE, ProblemCode, field_errors
 from stickslip_schemas.store import Store
 
