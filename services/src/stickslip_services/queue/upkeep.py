@@ -18,7 +18,6 @@ from sqlalchemy import Connection, delete, select, update
 from stickslip_schemas.base import JobState, Sha256, Stage, TaskState, is_sha256, sha256
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
-from stickslip_schemas.plan.grid import dataset_id
 from stickslip_schemas.store import ShownVersion, Store, Stored, in_parallel
 
 from stickslip_services.access.asker import note
@@ -176,8 +175,8 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     content, group, seal = (store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))
     check_seal(content, group, seal)
     manifest = Manifest.model_validate_json(content)
-    if (dataset_id(manifest.spec), manifest.version) != place:
-        raise ValueError(f"the manifest is that of {dataset_id(manifest.spec)}, v{manifest.version}")
+    if (manifest.spec.dataset_id, manifest.version) != place:
+        raise ValueError(f"the manifest is that of {manifest.spec.dataset_id}, v{manifest.version}")
     own = sealed_digests(sha256(content), sha256(group))
     listed = list(Contents(manifest, lambda file: store.read_shown(*place, file.path)).files())
 
