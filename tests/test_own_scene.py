@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from stickslip_schemas.documents.certificate import Certificate, CurveReport, ProtocolReport
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
-from stickslip_services.cli.main import app
+from stickslip_services.cli import app
 from stickslip_services.cli.scenes import spec_of
 from stickslip_services.local.making import why_uncertified
 from stickslip_sim_core import fabric

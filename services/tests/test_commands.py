@@ -8,8 +8,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-from stickslip_services.cli import common
-from stickslip_services.cli.main import _COMMANDS, _Commands, _loaded, app
+from stickslip_services.cli import _COMMANDS, _Commands, _loaded, app, common
 
 SCRIPT = Path(sys.executable).with_name("stickslip")
 

@@ -10,8 +10,8 @@ from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason, Stage
 from stickslip_schemas.documents.responses import Progress
 from stickslip_services.app import make_app
-from stickslip_services.cli import wording
-from stickslip_services.cli.main import app
+from stickslip_services.cli import app
+from stickslip_services.cli.jobs import planned_so_far
 from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job, start, sweep
@@ -376,5 +376,5 @@ def test_people_see_how_far_the_plan_is(
 
 def test_progress_in_words() -> None:
     progress = Progress(done=2, total=9, planned=10_000, stages={}, eta=None)
-    assert wording.planned(progress, 1_000_000) == "10,000 of 1,000,000 samples are planned"
-    assert wording.planned(progress, 10_000) == ""
+    assert planned_so_far(progress, 1_000_000) == "10,000 of 1,000,000 samples are planned"
+    assert planned_so_far(progress, 10_000) == ""

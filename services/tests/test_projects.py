@@ -11,7 +11,7 @@ from stickslip_schemas.base import JobState
 from stickslip_services.access.asker import Asker, asking, read_audit_log
 from stickslip_services.access.keys import find_project, list_projects, set_quota
 from stickslip_services.app import make_app
-from stickslip_services.cli.main import app
+from stickslip_services.cli import app
 from stickslip_services.errors import QuotaExceededError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job

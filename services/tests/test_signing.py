@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest_digest
 from stickslip_services.app import main, make_app
-from stickslip_services.cli.main import app as commands
+from stickslip_services.cli import app as commands
 from stickslip_services.client import Client, pull, signer_of, verify
 from stickslip_services.client.http import ChangedError, ClientError, DamagedError, UnknownSignerError, UnsignedError
 from stickslip_services.client.verifying import sign

@@ -1,5 +1,5 @@
 """`python -m stickslip_services.cli`."""
 
-from stickslip_services.cli.main import app
+from stickslip_services.cli import app
 
 app()

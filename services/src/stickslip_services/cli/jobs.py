@@ -12,20 +12,23 @@ from click.exceptions import Exit
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetPublishedEvent,
+    DatasetRef,
+    Eta,
     FileUpload,
     JobDetail,
     JobProgressEvent,
     JobStateEvent,
+    Progress,
+    StageProgress,
     TaskStateEvent,
     TextureEntry,
     Validation,
 )
-from stickslip_schemas.documents.responses import Progress as JobProgress
 from stickslip_schemas.format.manifest import bytes_estimate
-from stickslip_schemas.plan.points import Counts, Estimate, count, estimated
+from stickslip_schemas.plan.costs import Estimate, Interval, estimated
+from stickslip_schemas.plan.grid import Counts, count
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.cli import wording
 from stickslip_services.cli.common import (
     FILE,
     asks,
@@ -44,6 +47,19 @@ from stickslip_services.units import duration, size
 
 SHOWN_REJECTS = 50
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
+
+_COLORS = {
+    JobState.planning: "yellow",
+    JobState.queued: "yellow",
+    JobState.running: "cyan",
+    JobState.cancelling: "yellow",
+    JobState.cancelled: "yellow",
+    JobState.succeeded: "green",
+    JobState.succeeded_with_rejects: "green",
+    JobState.failed: "red",
+}
+
+_NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
 
 PRIORITY = click.IntRange(-100, 100)
 PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of one number share evenly"
@@ -92,9 +108,9 @@ def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
 def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     for stage, interval in costs.stages.items():
         source = "measured by this service" if stage in costs.measured else "by the package's records"
-        yield f"CPU time, {stage}", f"{wording.interval(interval)}, {source}"
-    yield "CPU time, all", wording.interval(costs.cpu_seconds)
-    wall = "unknown: no worker is there" if costs.wall_seconds is None else wording.interval(costs.wall_seconds)
+        yield f"CPU time, {stage}", f"{_interval(interval)}, {source}"
+    yield "CPU time, all", _interval(costs.cpu_seconds)
+    wall = "unknown: no worker is there" if costs.wall_seconds is None else _interval(costs.wall_seconds)
     yield f"wall time, {costs.slots} at once", wall
 
 
@@ -141,10 +157,10 @@ def jobs(client: Client, as_json: bool, limit: int, search: str, state: JobState
     rows = (
         (
             job.id,
-            wording.state(job.state),
+            _coloured(job.state),
             f"{job.progress.done}/{job.progress.total}",
             "" if job.progress.eta is None else duration(job.progress.eta.seconds),
-            wording.dataset(job.dataset),
+            _version(job.dataset),
             job.name or "",
             job.kind,
             str(job.sample_count),
@@ -186,16 +202,16 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
 
 def _fields(job: JobDetail) -> Iterator[tuple[str, str]]:
     yield "job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}"
-    yield "state", wording.state(job.state)
+    yield "state", _coloured(job.state)
     if job.message:
         yield "", job.message
     if job.priority:
         yield "priority", str(job.priority)
-    yield "tasks", wording.stages(job.progress)
-    if planned := wording.planned(job.progress, job.sample_count):
+    yield "tasks", _stages(job.progress)
+    if planned := planned_so_far(job.progress, job.sample_count):
         yield "", planned
     if job.state.is_open:
-        yield "time left", wording.eta(job.progress.eta)
+        yield "time left", _left(job.progress.eta)
     yield "CPU time", duration(sum(stage.cpu_seconds for stage in job.progress.stages.values()))
     if job.state in GOOD:
         rate = 1 - job.rejected_count / job.sample_count
@@ -203,7 +219,7 @@ def _fields(job: JobDetail) -> Iterator[tuple[str, str]]:
     else:
         yield "samples", f"{job.sample_count}, {job.rejected_count} rejected so far"
     if job.dataset is not None:
-        yield "dataset", wording.dataset(job.dataset)
+        yield "dataset", _version(job.dataset)
         yield "manifest", job.dataset.manifest
 
 
@@ -226,11 +242,11 @@ def watch(client: Client, job_id: str) -> JobState:
                     view.progress(event.progress)
                 case JobStateEvent():
                     state = event.state
-                    view.line(f"{job_id}: {wording.state(state)}{_because(event.message)}")
+                    view.line(f"{job_id}: {_coloured(state)}{_because(event.message)}")
                 case TaskStateEvent():
                     view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
                 case DatasetPublishedEvent():
-                    name = wording.dataset(event.dataset)
+                    name = _version(event.dataset)
                     view.line(f"published {click.style(name, bold=True)}")
                     view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
                     view.line(f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}")
@@ -255,10 +271,10 @@ class _Lines:
     def line(self, text: str) -> None:
         click.echo(f"{self._clear}{text}")
 
-    def progress(self, progress: JobProgress) -> None:
-        text = ", ".join(filter(None, [wording.planned(progress, self._sample_count), wording.stages(progress)]))
+    def progress(self, progress: Progress) -> None:
+        text = ", ".join(filter(None, [planned_so_far(progress, self._sample_count), _stages(progress)]))
         if progress.eta is not None:
-            text += f"; {wording.eta(progress.eta)} left"
+            text += f"; {_left(progress.eta)} left"
         if text != self._last:
             click.echo(f"{self._clear}{text[: room() - 1]}" if self._clear else text, nl=not self._clear)
         self._last = text
@@ -270,7 +286,7 @@ class _Lines:
 def cancel(client: Client, job_id: str) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     job = client.cancel(job_id)
-    click.echo(f"{job.id} is {wording.state(job.state)}. To run it again, submit its spec: results are cached")
+    click.echo(f"{job.id} is {_coloured(job.state)}. To run it again, submit its spec: results are cached")
 
 
 @click.command()
@@ -279,7 +295,7 @@ def cancel(client: Client, job_id: str) -> None:
 def pause(client: Client, job_id: str) -> None:
     """Pause a job: no further task is started, and running tasks finish."""
     job = client.pause(job_id)
-    click.echo(f"{job.id} is {wording.state(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
+    click.echo(f"{job.id} is {_coloured(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
 
 
 @click.command()
@@ -288,7 +304,7 @@ def pause(client: Client, job_id: str) -> None:
 def resume(client: Client, job_id: str) -> None:
     """Resume a paused job."""
     job = client.resume(job_id)
-    click.echo(f"{job.id} is {wording.state(job.state)}. To watch it: stickslip watch {job.id}")
+    click.echo(f"{job.id} is {_coloured(job.state)}. To watch it: stickslip watch {job.id}")
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -1 is a priority
@@ -343,3 +359,43 @@ def _name(file: Path) -> str:
     """Return the name of a texture, from the name of its file."""
     word = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower())
     return word.strip("-")[:60] or "custom"
+
+
+def _left(value: Eta | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
+
+
+def _interval(value: Interval) -> str:
+    return f"about {duration(value.median)} ({duration(value.low)} to {duration(value.high)})"
+
+
+def _coloured(value: JobState) -> str:
+    return click.style(str(value), fg=_COLORS.get(value))
+
+
+def _version(value: DatasetRef | None) -> str:
+    """Return a dataset version as `stickslip pull` reads it."""
+    return "" if value is None else f"{value.dataset}:v{value.version}"
+
+
+def planned_so_far(progress: Progress, sample_count: int) -> str:
+    """Return the number of planned samples; empty when all are planned."""
+    return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"
+
+
+def _stages(progress: Progress) -> str:
+    """Return a line of counts: `simulate 12/40 (3 cached, 1 rejected), render 0/40`."""
+    shown = [
+        f"{stage} {counted.done}/{counted.total}" + (f" ({', '.join(found)})" if (found := _notes(counted)) else "")
+        for stage, counted in progress.stages.items()
+        if counted.total
+    ]
+    return ", ".join(shown) or "not planned yet"
+
+
+def _notes(counted: StageProgress) -> list[str]:
+    """Return counts of tasks of a stage that need a word: `3 cached`, `1 rejected`."""
+    cached = [f"{counted.cached} cached"] if counted.cached else []
+    return cached + [f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)]

@@ -39,10 +39,22 @@ def _partial(condition: str) -> dict[str, Any]:
 _Wide = BigInteger().with_variant(Integer, "sqlite")
 """64 bits: SQLite's INTEGER has them, and it must be called so to be a rowid."""
 
-workers = Table(
+
+def _table(name: str, *columns: Column[Any] | Index, **options: Any) -> Table:
+    return Table(name, metadata, *columns, **options)
+
+
+def _numbered(name: str, *columns: Column[Any] | Index) -> Table:
+    """Return a table whose rows have numbers, `seq`, none of which is given again."""
+    return _table(name, Column("seq", _Wide, primary_key=True), *columns, sqlite_autoincrement=True)
+
+
+def _key(name: str) -> Column[Any]:
+    return Column(name, _Wide, primary_key=True, autoincrement=False)
+
+
+workers = _numbered(
     "workers",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False, index=True),
     Column("builds", Text, nullable=False),  # JSON: by kind
@@ -51,13 +63,10 @@ workers = Table(
     Column("registered_at", Float, nullable=False),
     Column("last_seen_at", Float, nullable=False),
     Column("superseded", Boolean, nullable=False),
-    sqlite_autoincrement=True,
 )
 
-jobs = Table(
+jobs = _numbered(
     "jobs",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
     Column("project", String, nullable=False, server_default=""),  # of the key that it was submitted with
@@ -88,12 +97,10 @@ jobs = Table(
         "seq",
         **_partial("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
     ),
-    sqlite_autoincrement=True,
 )
 
-idempotency_keys = Table(
+idempotency_keys = _table(
     "idempotency_keys",
-    metadata,
     Column("project", String, primary_key=True),
     Column("key", String, primary_key=True),
     Column("fingerprint", String, nullable=False),
@@ -102,9 +109,8 @@ idempotency_keys = Table(
     Column("created_at", Float, nullable=False),
 )
 
-tasks = Table(
+tasks = _table(
     "tasks",
-    metadata,
     Column("seq", _Wide, primary_key=True),
     Column("key", LargeBinary(32), nullable=False, unique=True),
     Column("stage", String, nullable=False),
@@ -150,28 +156,25 @@ tasks = Table(
 # The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
 # plan.py, and the tests check that both ends exist.
 
-task_dependencies = Table(
+task_dependencies = _table(
     "task_dependencies",
-    metadata,
-    Column("task", _Wide, primary_key=True, autoincrement=False),
+    _key("task"),
     Column("depends_on", _Wide, primary_key=True, autoincrement=False, index=True),
     sqlite_with_rowid=False,
 )
 
-job_tasks = Table(
+job_tasks = _table(
     "job_tasks",
-    metadata,
-    Column("job", _Wide, primary_key=True, autoincrement=False),
+    _key("job"),
     Column("task", _Wide, primary_key=True, autoincrement=False, index=True),
     Column("cached", Boolean, nullable=False),  # it was settled before the job was submitted
     sqlite_with_rowid=False,
 )
 
-samples = Table(
+samples = _table(
     "samples",
-    metadata,
-    Column("job", _Wide, primary_key=True, autoincrement=False),
-    Column("slot", _Wide, primary_key=True, autoincrement=False),
+    _key("job"),
+    _key("slot"),
     Column("key", LargeBinary(32), nullable=False),
     Column("simulate_task", _Wide, nullable=False),
     Column("render_task", _Wide),
@@ -181,27 +184,20 @@ samples = Table(
     sqlite_with_rowid=False,
 )
 
-previews = Table(
-    "previews",
-    metadata,
-    Column("task", _Wide, primary_key=True, autoincrement=False),
-    Column("digest", String, nullable=False, index=True),
-)
+previews = _table("previews", _key("task"), Column("digest", String, nullable=False, index=True))
 
 # Counters, updated by the ledger in the transaction that moves the tasks, so that showing progress counts no rows.
 
-job_counts = Table(
+job_counts = _table(
     "job_counts",
-    metadata,
     Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("state", String, primary_key=True),
     Column("count", Integer, nullable=False),
 )
 
-job_stages = Table(
+job_stages = _table(
     "job_stages",
-    metadata,
     Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("cached", Integer, nullable=False),
@@ -211,26 +207,23 @@ job_stages = Table(
     Column("wall_squares", Float, nullable=False, server_default="0"),
 )
 
-task_counts = Table(
+task_counts = _table(
     "task_counts",
-    metadata,
     Column("stage", String, primary_key=True),
     Column("state", String, primary_key=True),
     Column("count", Integer, nullable=False),
 )
 
-job_groups = Table(
+job_groups = _table(
     "job_groups",
-    metadata,
     Column("job", _Wide, ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     Column("stage", String, primary_key=True),
     Column("cost_group", String, primary_key=True),
     Column("left", Integer, nullable=False),  # tasks of the group that are not over
 )
 
-cost_groups = Table(
+cost_groups = _table(
     "cost_groups",
-    metadata,
     Column("stage", String, primary_key=True),
     Column("kind", String, primary_key=True),
     Column("cost_group", String, primary_key=True),
@@ -241,20 +234,16 @@ cost_groups = Table(
     Column("call_squares", Float, nullable=False),
 )
 
-datasets = Table(
+datasets = _numbered(
     "datasets",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String),
     Column("kind", String, nullable=False),
     Column("spec_digest", String, nullable=False),
-    sqlite_autoincrement=True,
 )
 
-dataset_versions = Table(
+dataset_versions = _table(
     "dataset_versions",
-    metadata,
     Column("dataset", String, primary_key=True),
     Column("version", Integer, primary_key=True, autoincrement=False),
     Column("publish_task", _Wide, nullable=False, unique=True),
@@ -268,10 +257,8 @@ dataset_versions = Table(
     Column("damaged", Integer, nullable=False, server_default="0"),  # files that were damaged then
 )
 
-certificates = Table(
+certificates = _numbered(
     "certificates",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("digest", String, nullable=False, unique=True),
     Column("artifact", String, nullable=False),  # the document
     Column("preset", String, nullable=False),
@@ -281,17 +268,14 @@ certificates = Table(
     Column("protocols", String, nullable=False, server_default=""),  # names, with spaces between
     Column("created_at", Float, nullable=False),
     Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
-    sqlite_autoincrement=True,
 )
 
-uploads = Table(  # who has uploaded which artifact
+uploads = _table(  # who has uploaded which artifact
     "uploads", metadata, Column("project", String, primary_key=True), Column("digest", String, primary_key=True)
 )
 
-api_keys = Table(
+api_keys = _numbered(
     "api_keys",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("name", String, nullable=False),
     Column("digest", String, nullable=False, unique=True),  # SHA-256 of the secret, which is nowhere
@@ -299,33 +283,26 @@ api_keys = Table(
     Column("project", String, nullable=False, server_default=""),
     Column("created_at", Float, nullable=False),
     Column("revoked_at", Float),
-    sqlite_autoincrement=True,
 )
 
-projects = Table(  # those with a quota; the others exist by being named
+projects = _table(  # those with a quota; the others exist by being named
     "projects",
-    metadata,
     Column("name", String, primary_key=True),
     Column("max_samples", _Wide),  # null: any number
     Column("max_jobs", Integer),  # null: any number
 )
 
-audit_log = Table(  # triggers of the migration refuse to change or to delete its rows
+audit_log = _numbered(  # triggers of the migration refuse to change or to delete its rows
     "audit_log",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("at", Float, nullable=False),
     Column("actor", String, nullable=False),
     Column("action", String, nullable=False),
     Column("subject", String, nullable=False),
     Column("details", Text, nullable=False),  # JSON
-    sqlite_autoincrement=True,
 )
 
-webhooks = Table(
+webhooks = _numbered(
     "webhooks",
-    metadata,
-    Column("seq", _Wide, primary_key=True),
     Column("id", String, nullable=False, unique=True),
     Column("project", String, nullable=False),
     Column("url", String, nullable=False),
@@ -336,12 +313,10 @@ webhooks = Table(
     Column("failing_since", Float),
     Column("fault", Text, nullable=False),  # of the last try; empty where it went well
     Column("created_at", Float, nullable=False),
-    sqlite_autoincrement=True,
 )
 
-events = Table(
+events = _table(
     "events",
-    metadata,
     Column("id", _Wide, primary_key=True),
     Column("job", _Wide, ForeignKey("jobs.seq"), nullable=False),
     Column("name", String, nullable=False),

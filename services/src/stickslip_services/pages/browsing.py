@@ -13,10 +13,8 @@ from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.pages.grid_map import grid_maps
-from stickslip_services.pages.motion import is_path
-from stickslip_services.pages.rendering import plot, table
-from stickslip_services.pages.sample_data import SampleData
+from stickslip_services.pages.rendering import grid_maps, plot, table
+from stickslip_services.pages.samples import SampleData, is_path
 
 SHOWN_THUMBS = 48
 STOPS = 101

@@ -2,8 +2,8 @@
 
 from fastapi import APIRouter
 
-from stickslip_services.api.routes.pages import datasets, jobs, system
+from stickslip_services.api.routes.pages import datasets, jobs
 
 router = APIRouter(include_in_schema=False)
-for _module in (jobs, datasets, system):
+for _module in (jobs, datasets):
     router.include_router(_module.router)

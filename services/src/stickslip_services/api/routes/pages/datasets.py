@@ -1,6 +1,7 @@
-"""Pages of datasets: the list, one version, and its samples."""
+"""Pages of datasets (the list, one version, its samples), of scenes, and of certificates."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -8,19 +9,23 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
+from sqlalchemy import Connection
+from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.routes.common import ContextDep, Version, matches
+from stickslip_services.catalog.inputs import find_certificate, known_scenes, list_certificates
 from stickslip_services.catalog.versions import find_dataset, find_version, list_datasets, read_contents
 from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import coloured, histograms, losses, mp4, sample_view, sliders, thumbs
-from stickslip_services.pages.motion import motion
-from stickslip_services.pages.rendering import html_page, spec_text
-from stickslip_services.pages.sample_data import SampleData
+from stickslip_services.pages.rendering import html_page, plot, spec_text, table
+from stickslip_services.pages.samples import SampleData, motion
+from stickslip_services.queue.context import Context
+from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter()
 
@@ -173,3 +178,63 @@ def _value(data: SampleData, array: str, slot: int) -> Any:
         return data.read(array, slot)
     except KeyError as error:
         raise NotFoundError(f"sample {slot} has no {array[:50]!r}") from error
+
+
+@router.get("/scenes")
+def get_scenes(context: ContextDep) -> Response:
+    with context.database.read() as connection:
+        scenes = known_scenes(connection)
+    return html_page("scenes.html", here="scenes", scenes=scenes)
+
+
+@router.get("/scenes/{digest}")
+def get_scene(digest: str, context: ContextDep) -> Response:
+    """Show a scene: how it looks, its parameters, and the datasets made of it."""
+    with context.database.read() as connection:
+        known = known_scenes(connection).get(digest)
+    if known is None:
+        raise NotFoundError(f"there is no scene {digest[:64]!r}")
+    return html_page("scene.html", here="scenes", known=known, scene=known.scene)
+
+
+@router.get("/certificates")
+def get_certificates(context: ContextDep) -> Response:
+    with context.database.read() as connection:
+        entries = list_certificates(connection, PageRequest(200, None)).items
+        builds = _builds(context, connection)
+    return html_page("certificates.html", here="certificates", entries=entries, builds=builds)
+
+
+@router.get("/certificates/{digest}")
+def get_certificate(digest: str, context: ContextDep) -> Response:
+    with context.database.read() as connection:
+        stored = find_certificate(connection, digest)
+        builds = _builds(context, connection)
+    certificate = Certificate.model_validate_json(context.store.read(stored.artifact))
+    plots = {protocol.protocol: list(_curves(protocol)) for protocol in certificate.protocols}
+    return html_page(
+        "certificate.html", here="certificates", certificate=certificate, digest=digest, builds=builds, plots=plots
+    )
+
+
+def _builds(context: Context, connection: Connection) -> set[str]:
+    return {builds.sim_core for worker in alive_workers(context, connection) for builds in worker.builds.values()}
+
+
+def _curves(protocol: ProtocolReport) -> Iterator[dict[str, Any]]:
+    for curve in protocol.curves[:6]:
+        dense = curve.dense_x, curve.dense_master
+        line = dense if curve.dense_x else (curve.x, curve.master)  # of a certificate without dense curves
+        name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
+        yield plot(
+            _known("master curve", *line),
+            _known("measured", curve.x, curve.measured, is_dots=True),
+            x_name=protocol.x,
+            y_name=f"{protocol.y}{f' ({name})' if name else ''}",
+            is_log=True,
+        )
+
+
+def _known(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[str, Any]:
+    known = sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
+    return table([a for a, _ in known], {name: [b for _, b in known]}, is_dots=is_dots)

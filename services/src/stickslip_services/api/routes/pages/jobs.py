@@ -1,13 +1,15 @@
-"""Pages of jobs: the list, one job, the map of its grid, and its buttons."""
+"""Pages of jobs (the list, one job, the map of its grid, its buttons), of workers, and of the HTTP interface."""
 
 import asyncio
+import pathlib
 from collections.abc import AsyncIterator
 from typing import Annotated, Literal
 from urllib.parse import urlencode
 
 import numpy as np
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
+from sqlalchemy import func, select
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
@@ -15,10 +17,12 @@ from stickslip_schemas.plan.points import count, estimated
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
+from stickslip_services.catalog.inputs import list_certificates
+from stickslip_services.clock import as_datetime
 from stickslip_services.database.database import PageRequest
+from stickslip_services.database.tables import dataset_versions
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.grid_map import grid_maps
-from stickslip_services.pages.rendering import html_page, spec_text
+from stickslip_services.pages.rendering import grid_maps, html_page, spec_text
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job
 from stickslip_services.queue.jobs import (
@@ -33,7 +37,7 @@ from stickslip_services.queue.jobs import (
 )
 from stickslip_services.queue.report import failed_tasks
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.workers import alive_workers
+from stickslip_services.queue.workers import alive_workers, show_workers
 
 router = APIRouter()
 
@@ -167,3 +171,41 @@ async def _changes(context: Context) -> AsyncIterator[bytes]:
         yield b": still here\n\n" if count == sent else b"event: change\ndata: {}\n\n"
         sent = count
         await asyncio.sleep(CHANGE_SECONDS)
+
+
+@router.get("/workers")
+def get_workers(context: ContextDep) -> Response:
+    with context.database.read() as connection:
+        workers = show_workers(context, connection)
+        certified = {
+            entry.sim_core: entry
+            for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
+            if entry.extent == "full" and entry.passed
+        }
+        own = dataset_versions.c
+        read_at, damaged = connection.execute(select(func.min(own.scrubbed_at), func.sum(own.damaged))).one()
+    return html_page(
+        "workers.html",
+        here="workers",
+        workers=workers,
+        certified=certified,
+        scrub=None if read_at is None else (as_datetime(read_at), int(damaged)),
+        now=as_datetime(context.clock()),
+        disk=context.store.room(),
+        memory=_memory(),
+    )
+
+
+def _memory() -> dict[str, int] | None:
+    """Return the memory of this machine, `MemTotal` and `MemAvailable` [B]; None without Linux's /proc."""
+    try:
+        lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
+    except OSError:
+        return None
+    found = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
+    return found if {"MemTotal", "MemAvailable"} <= found.keys() else None
+
+
+@router.get("/docs")
+def get_docs(request: Request) -> Response:
+    return html_page("docs.html", here="docs", api=request.app.openapi())
