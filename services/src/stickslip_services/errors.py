@@ -90,11 +90,3 @@ class DatabaseRefusedError(CommandError):
 
 class SettingsError(CommandError):
     """A setting breaks a rule."""
-
-
-class ListeningError(CommandError):
-    """An address to listen on is taken, or is not one of this machine."""
-
-
-class SupervisorError(CommandError):
-    """`stickslip up` cannot go on."""

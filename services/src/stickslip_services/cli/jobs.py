@@ -10,20 +10,7 @@ from pathlib import Path
 import click
 from click.exceptions import Exit
 from stickslip_schemas.base import JobState, TaskState
-from stickslip_schemas.documents.responses import (
-    DatasetPublishedEvent,
-    DatasetRef,
-    Eta,
-    FileUpload,
-    JobDetail,
-    JobProgressEvent,
-    JobStateEvent,
-    Progress,
-    StageProgress,
-    TaskStateEvent,
-    TextureEntry,
-    Validation,
-)
+from stickslip_schemas.documents import responses
 from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.plan.costs import Estimate, Interval, estimated
 from stickslip_schemas.plan.grid import Counts, count
@@ -114,7 +101,7 @@ def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     yield f"wall time, {costs.slots} at once", wall
 
 
-def _counts(counts: Counts | Validation, spec: JobSpec) -> Iterator[tuple[str, str]]:
+def _counts(counts: Counts | responses.Validation, spec: JobSpec) -> Iterator[tuple[str, str]]:
     shares = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
     yield "samples", f"{counts.sample_count} ({shares}, about)"
     yield "simulations", f"{counts.simulation_count}"
@@ -200,7 +187,7 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
     return None
 
 
-def _fields(job: JobDetail) -> Iterator[tuple[str, str]]:
+def _fields(job: responses.JobDetail) -> Iterator[tuple[str, str]]:
     yield "job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}"
     yield "state", _coloured(job.state)
     if job.message:
@@ -238,14 +225,14 @@ def watch(client: Client, job_id: str) -> JobState:
     try:
         for event in client.events(job_id):
             match event:
-                case JobProgressEvent():
+                case responses.JobProgressEvent():
                     view.progress(event.progress)
-                case JobStateEvent():
+                case responses.JobStateEvent():
                     state = event.state
                     view.line(f"{job_id}: {_coloured(state)}{_because(event.message)}")
-                case TaskStateEvent():
+                case responses.TaskStateEvent():
                     view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
-                case DatasetPublishedEvent():
+                case responses.DatasetPublishedEvent():
                     name = _version(event.dataset)
                     view.line(f"published {click.style(name, bold=True)}")
                     view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
@@ -271,7 +258,7 @@ class _Lines:
     def line(self, text: str) -> None:
         click.echo(f"{self._clear}{text}")
 
-    def progress(self, progress: Progress) -> None:
+    def progress(self, progress: responses.Progress) -> None:
         text = ", ".join(filter(None, [planned_so_far(progress, self._sample_count), _stages(progress)]))
         if progress.eta is not None:
             text += f"; {_left(progress.eta)} left"
@@ -332,7 +319,7 @@ def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
 @asks
 def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
     """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes; print the references that specs use."""
-    found: list[TextureEntry | FileUpload] = []
+    found: list[responses.TextureEntry | responses.FileUpload] = []
     for file in files:
         try:
             data = file.read_bytes()
@@ -346,11 +333,13 @@ def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
     if as_json:
         return print_json(found)
     say("In a spec, under any names:")
-    pictures = [(file, entry) for file, entry in zip(files, found, strict=True) if isinstance(entry, TextureEntry)]
+    pictures = [
+        (file, entry) for file, entry in zip(files, found, strict=True) if isinstance(entry, responses.TextureEntry)
+    ]
     for number, (file, picture) in enumerate(pictures):
         click.echo(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
     for entry in found:
-        if isinstance(entry, FileUpload):
+        if isinstance(entry, responses.FileUpload):
             click.echo(f"file: {entry.file}" + (f"  # counts: {list(entry.counts)}" if entry.counts else ""))
     return None
 
@@ -361,7 +350,7 @@ def _name(file: Path) -> str:
     return word.strip("-")[:60] or "custom"
 
 
-def _left(value: Eta | None) -> str:
+def _left(value: responses.Eta | None) -> str:
     if value is None:
         return "unknown"
     return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
@@ -375,17 +364,17 @@ def _coloured(value: JobState) -> str:
     return click.style(str(value), fg=_COLORS.get(value))
 
 
-def _version(value: DatasetRef | None) -> str:
+def _version(value: responses.DatasetRef | None) -> str:
     """Return a dataset version as `stickslip pull` reads it."""
     return "" if value is None else f"{value.dataset}:v{value.version}"
 
 
-def planned_so_far(progress: Progress, sample_count: int) -> str:
+def planned_so_far(progress: responses.Progress, sample_count: int) -> str:
     """Return the number of planned samples; empty when all are planned."""
     return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"
 
 
-def _stages(progress: Progress) -> str:
+def _stages(progress: responses.Progress) -> str:
     """Return a line of counts: `simulate 12/40 (3 cached, 1 rejected), render 0/40`."""
     shown = [
         f"{stage} {counted.done}/{counted.total}" + (f" ({', '.join(found)})" if (found := _notes(counted)) else "")
@@ -395,7 +384,7 @@ def _stages(progress: Progress) -> str:
     return ", ".join(shown) or "not planned yet"
 
 
-def _notes(counted: StageProgress) -> list[str]:
+def _notes(counted: responses.StageProgress) -> list[str]:
     """Return counts of tasks of a stage that need a word: `3 cached`, `1 rejected`."""
     cached = [f"{counted.cached} cached"] if counted.cached else []
     return cached + [f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)]

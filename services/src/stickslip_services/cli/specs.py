@@ -26,28 +26,24 @@ MAX_VALUES = 10_000_000
 """Of a file."""
 
 
-class SpecFileError(CommandError):
-    """The file holds no valid spec or scene."""
-
-
 def read_spec(path: Path) -> dict[str, Any]:
-    """Return the document of a spec file, which may break rules of specs; raise SpecFileError if it is no document."""
+    """Return the document of a spec file, which may break rules of specs; raise CommandError if it is no document."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        raise SpecFileError(f"there is no file {path}") from error
+        raise CommandError(f"there is no file {path}") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise SpecFileError(f"{path} cannot be read: {error}") from error
+        raise CommandError(f"{path} cannot be read: {error}") from error
     try:
         document = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise SpecFileError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
+        raise CommandError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
     if not isinstance(document, dict):
-        raise SpecFileError(f"{path} must hold a mapping (key: value), and it holds {document!r:.100}")
+        raise CommandError(f"{path} must hold a mapping (key: value), and it holds {document!r:.100}")
     try:
         _check(document, "", path, count())
     except RecursionError as error:
-        raise SpecFileError(f"{path} must not nest so deeply: does an alias name what it is in?") from error
+        raise CommandError(f"{path} must not nest so deeply: does an alias name what it is in?") from error
     return document
 
 
@@ -56,7 +52,7 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
     A scene that is a file, or that names files, becomes a document with references by digest.
 
-    Raises SpecFileError where it is no document, or the scene breaks a rule.
+    Raises CommandError where it is no document, or the scene breaks a rule.
     """
     document = read_spec(path)
     scene = document.get("scene")
@@ -70,13 +66,13 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
-    """Return the scene of a file, with references by digest, and its files by digest; raise SpecFileError."""
+    """Return the scene of a file, with references by digest, and its files by digest; raise CommandError."""
     return _inlined({"name": _name(path), **read_spec(path)}, path)
 
 
 def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
     if (length := len(json.dumps(document))) > MAX_DOCUMENT_BYTES:
-        raise SpecFileError(f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}")
+        raise CommandError(f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}")
     try:
         scene = Scene.model_validate(document)
     except ValidationError as error:
@@ -95,7 +91,7 @@ def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, byt
     try:
         return inlined(scene, read)
     except UnfitFileError as error:
-        raise SpecFileError(f"{path} is not valid\n  {error}") from error
+        raise CommandError(f"{path} is not valid\n  {error}") from error
 
 
 def _name(path: Path) -> str | None:
@@ -103,16 +99,16 @@ def _name(path: Path) -> str | None:
 
 
 def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
-    """Return the spec of a document; raise SpecFileError with all fields that break a rule."""
+    """Return the spec of a document; raise CommandError with all fields that break a rule."""
     try:
         return job_spec_adapter.validate_python(document)
     except ValidationError as error:
         raise _not_valid(error, document, AnyJobSpec, path) from error
 
 
-def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> SpecFileError:
+def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> CommandError:
     lines = [field_line(field) for field in field_errors(error, document, model)]
-    return SpecFileError("\n".join([f"{path} is not valid", *lines]))
+    return CommandError("\n".join([f"{path} is not valid", *lines]))
 
 
 def field_line(field: FieldError) -> str:
@@ -122,9 +118,9 @@ def field_line(field: FieldError) -> str:
 
 
 def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
-    """Raise SpecFileError for values that JSON cannot hold, and for aliases that make too many of them."""
+    """Raise CommandError for values that JSON cannot hold, and for aliases that make too many of them."""
     if next(values) > MAX_VALUES:
-        raise SpecFileError(f"{path} must hold at most {MAX_VALUES} values, with aliases written out")
+        raise CommandError(f"{path} must hold at most {MAX_VALUES} values, with aliases written out")
     if isinstance(value, dict):
         for key, item in value.items():
             _check(item, f"{place}.{key}" if place else str(key), path, values)
@@ -132,6 +128,6 @@ def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
         for position, item in enumerate(value):
             _check(item, f"{place}.{position}", path, values)
     elif isinstance(value, float) and not math.isfinite(value):
-        raise SpecFileError(f"{path}: {place} must be a finite number, and it is {value}")
+        raise CommandError(f"{path}: {place} must be a finite number, and it is {value}")
     elif value is not None and not isinstance(value, str | int | float | bool):
-        raise SpecFileError(f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}")
+        raise CommandError(f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}")

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
+from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.store import Store, open_store
@@ -30,47 +31,45 @@ RESULT_NAME = "scene.json"
 TRAJECTORY_NAME = "trajectory.npz"
 
 
-class MakingError(CommandError):
-    """A certificate or a sample was not made, or is missing or damaged."""
-
-
 def _asked(arguments: list[str], refusal: str) -> str:
-    """Run the workers' program and return what it printed; raise MakingError where it made nothing."""
+    """Run the workers' program and return what it printed; raise CommandError where it made nothing."""
     # The matrices of master curves are too small for the threads of NumPy's linear algebra.
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
     command = [sys.executable, "-m", "stickslip_workers", *arguments]
     try:
         ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
     except OSError as error:
-        raise MakingError(f"the workers' program does not start: {error}") from error
+        raise CommandError(f"the workers' program does not start: {error}") from error
     if ended.returncode not in (0, 1) or not ended.stdout.strip():
-        raise MakingError(f"{refusal}: the workers' program ended with status {ended.returncode}")
+        raise CommandError(f"{refusal}: the workers' program ended with status {ended.returncode}")
     return ended.stdout
 
 
 def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
 
-    Raises MakingError where the program failed, or `out` holds another certificate.
+    Raises CommandError where the program failed, or `out` holds another certificate.
     """
     arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
     digest = _asked(arguments, "no certificate was made").strip()
     certificate = read_certificate(out)
     if certificate.digest != digest:
-        raise MakingError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
+        raise CommandError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
     return certificate
 
 
 def read_certificate(directory: Path) -> Certificate:
-    """Read a certificate from the directory that `measure` wrote; raise MakingError."""
+    """Read a certificate from the directory that `measure` wrote; raise CommandError."""
     try:
         return Certificate.model_validate_json((directory / DOCUMENT_NAME).read_bytes())
     except FileNotFoundError as error:
-        raise MakingError(f"{directory} holds no certificate: there is no {DOCUMENT_NAME}") from error
+        raise CommandError(f"{directory} holds no certificate: there is no {DOCUMENT_NAME}") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the document"
-        raise MakingError(f"{directory / DOCUMENT_NAME} is not a valid certificate: {place}: {first['msg']}") from error
+        raise CommandError(
+            f"{directory / DOCUMENT_NAME} is not a valid certificate: {place}: {first['msg']}"
+        ) from error
 
 
 def simulate(
@@ -79,21 +78,21 @@ def simulate(
     """Simulate the first sample of a spec into a new directory, with progress on standard error.
 
     `files` are those that it names, by digest. `out`, which must not exist, appears when all is written; with `obj`, it
-    has `SHEET/0000.obj` and so on, too. Returns what `scene.json` holds; raises MakingError where it was not run.
+    has `SHEET/0000.obj` and so on, too. Returns what `scene.json` holds; raises CommandError where it was not run.
     """
     import numpy as np  # the extra `arrays`
 
     if out.exists():
-        raise MakingError(f"out: must not exist, and {out} does")
+        raise CommandError(f"out: must not exist, and {out} does")
     build = _workers(["describe"])["builds"][spec.kind]["sim_core"]
     why = why_uncertified(spec, certificate, build)
     if why and spec.needs_certificate:
-        raise MakingError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
-    task = SimulateTask(simulation=spec.simulation(next(iter(spec.grid()))))
+        raise CommandError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
+    task = SimulateTask(simulation=spec.simulation(next(iter(grid(spec)))))
     with _handed_over(task, files) as (given, store):
         result = TaskResult.model_validate(_workers(["replay", *given]))
         if result.outcome == "failed":
-            raise MakingError(f"the scene was not simulated: {result.message}")
+            raise CommandError(f"the scene was not simulated: {result.message}")
         arrays: dict[str, Any] = {}
         if isinstance(result.output, SimulateOutput):
             with np.load(io.BytesIO(store.read(result.output.record.digest)), allow_pickle=False) as record:
@@ -122,7 +121,7 @@ def simulate(
 
 
 def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
-    """Draw the start and the motions of a scene into a directory; return names of pictures, or raise MakingError."""
+    """Draw the start and the motions of a scene into a directory; return names of pictures, or raise CommandError."""
     with _handed_over(scene, files) as (given, _):
         pictures: list[str] = _workers(["preview", *given, "--out", str(out)])["pictures"]
     return pictures

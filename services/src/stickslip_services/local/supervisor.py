@@ -25,7 +25,7 @@ from types import FrameType
 import httpx
 from stickslip_schemas.store import write_durably
 
-from stickslip_services.errors import DatabaseRefusedError, ListeningError, SupervisorError
+from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.settings import Settings
 
 _M_ARENA_MAX = -8  # of glibc's malloc.h
@@ -66,7 +66,7 @@ def locked(data: Path) -> Iterator[int]:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a port, but does not accept connections yet; raise ListeningError."""
+    """Return a socket that is bound to a port, but does not accept connections yet; raise CommandError."""
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -75,7 +75,7 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         rule = f"cannot listen on {host}:{port}: {error.strerror}. `--port 0` takes any free port."
-        raise ListeningError(rule) from error
+        raise CommandError(rule) from error
     return listener
 
 
@@ -132,7 +132,7 @@ class _Child:
         self.started_at = time.monotonic()
 
     def restart_if_dead(self) -> None:
-        """Restart the process if it has died; raise SupervisorError after too many failed starts."""
+        """Restart the process if it has died; raise CommandError after too many failed starts."""
         if self.process is None:
             if time.monotonic() >= self.start_again_at:
                 self.start()
@@ -146,7 +146,7 @@ class _Child:
         self.failed_starts = self.failed_starts + 1 if lived < SOON_SECONDS else 0
         how = f"was killed by signal {-status}" if status < 0 else f"exited with status {status}"
         if self.failed_starts >= MAX_FAILED_STARTS:
-            raise SupervisorError(
+            raise CommandError(
                 f"the {self.name} {how}, for the {self.failed_starts}th time within {SOON_SECONDS:g} s of its start. "
                 f"The end of {self.log}:\n{self.last_words()}"
             )
@@ -188,7 +188,7 @@ class _Child:
 def run(
     settings: Settings, *, name: str, slots: int | None, workers: str | None, on_ready: Callable[[str], None]
 ) -> int:
-    """Run until a signal to stop; return the exit status. Raise SupervisorError.
+    """Run until a signal to stop; return the exit status. Raise CommandError.
 
     `settings` are those of the coordinator, with an absolute path of `data`; `name` is that of the dispatcher among all
     that have the same database. `workers` is another command than `python -m stickslip_workers`, for tests.
@@ -243,21 +243,21 @@ def run(
 
 
 def _wait_until_ready(settings: Settings, coordinator: _Child, signals: list[int]) -> bool:
-    """Return True when the coordinator answers, False after a signal to stop; raise SupervisorError."""
+    """Return True when the coordinator answers, False after a signal to stop; raise CommandError."""
     deadline = time.monotonic() + START_SECONDS
     # The certificate needs no check, because the supervisor owns the listening socket.
     with httpx.Client(base_url=settings.url, timeout=2.0, trust_env=False, verify=False) as client:
         while not signals:
             assert coordinator.process is not None
             if coordinator.process.poll() is not None:
-                raise SupervisorError(f"the coordinator does not start:\n{coordinator.last_words()}")
+                raise CommandError(f"the coordinator does not start:\n{coordinator.last_words()}")
             try:
                 if client.get("/readyz").is_success:
                     return True
             except httpx.TransportError:
                 pass
             if time.monotonic() > deadline:
-                raise SupervisorError(
+                raise CommandError(
                     f"the coordinator does not answer within {START_SECONDS:g} s:\n{coordinator.last_words()}"
                 )
             time.sleep(_TICK / 2)

@@ -16,17 +16,8 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, func, select, update
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
+from stickslip_schemas.documents import worker_api
 from stickslip_schemas.documents.tasks import PublishTask
-from stickslip_schemas.documents.worker_api import (
-    Heartbeat,
-    HeartbeatAnswer,
-    Lease,
-    LeaseBatch,
-    LeaseRequest,
-    LeaseState,
-    WorkerRegistration,
-    WorkerSession,
-)
 
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, tasks, workers
@@ -54,7 +45,7 @@ BUSY_POLL_SECONDS = 0.2
 IDLE_POLL_SECONDS = 1.0
 
 
-def register_worker(context: Context, registration: WorkerRegistration) -> WorkerSession:
+def register_worker(context: Context, registration: worker_api.WorkerRegistration) -> worker_api.WorkerSession:
     """Register a worker; an earlier session of the name loses its leases."""
     with context.ledger() as book:
         old = list(book.connection.scalars(select(workers.c.id).where(workers.c.name == registration.name)))
@@ -65,10 +56,10 @@ def register_worker(context: Context, registration: WorkerRegistration) -> Worke
         context.frames_by_worker.pop(earlier, None)
     plan_waiting_jobs(context)
     note_stranded(context)
-    return WorkerSession(worker_id=worker.id, lease_seconds=context.settings.lease_seconds)
+    return worker_api.WorkerSession(worker_id=worker.id, lease_seconds=context.settings.lease_seconds)
 
 
-def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
+def lease_tasks(context: Context, request: worker_api.LeaseRequest) -> worker_api.LeaseBatch:
     """Lease tasks to a worker; raise UnknownWorkerError, or ConflictError for a superseded session."""
     wanted = {stage: count for stage, count in request.wanted.items() if count > 0}
     with context.database.read() as connection:
@@ -79,9 +70,9 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
     if due:
         take_back(context)
     if context.store_watch.trouble:
-        return LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
+        return worker_api.LeaseBatch(leases=(), retry_after_seconds=IDLE_POLL_SECONDS)
     if not (ready or due):
-        return LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
+        return worker_api.LeaseBatch(leases=(), retry_after_seconds=BUSY_POLL_SECONDS if waiting else IDLE_POLL_SECONDS)
     with context.ledger() as book:
         worker = _unsuperseded(book.connection, worker.id)
         note_heard(book.connection, [worker.id], book.now)
@@ -92,10 +83,12 @@ def lease_tasks(context: Context, request: LeaseRequest) -> LeaseBatch:
     if damaged:
         _mend(context, worker.id, damaged)
     context.sections |= {lease.task_id: lease.task.sections for lease in leases if isinstance(lease.task, PublishTask)}
-    return LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
+    return worker_api.LeaseBatch(leases=leases, retry_after_seconds=0 if leases else BUSY_POLL_SECONDS)
 
 
-def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[LeaseState] | None]:
+def renew_leases(
+    context: Context, messages: Sequence[worker_api.Heartbeat]
+) -> list[list[worker_api.LeaseState] | None]:
     """Renew the leases of workers, with two statements for all; return what `sort_out` must look at, None for nothing.
 
     The time of a worker's last message, also a report, renews all its leases.
@@ -114,7 +107,7 @@ def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[L
                 is_news |= message.condition.state != before.state
     if is_news:
         note_stranded(context)
-    found: list[list[LeaseState] | None] = []
+    found: list[list[worker_api.LeaseState] | None] = []
     for message in messages:
         mine, left, listed = held[message.worker_id], [], set()
         for lease in message.leases:
@@ -132,7 +125,9 @@ def renew_leases(context: Context, messages: Sequence[Heartbeat]) -> list[list[L
     return found
 
 
-def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -> HeartbeatAnswer:
+def sort_out(
+    context: Context, message: worker_api.Heartbeat, left: Sequence[worker_api.LeaseState]
+) -> worker_api.HeartbeatAnswer:
     """Note which tasks of a heartbeat have been started, and return those to drop; raise UnknownWorkerError.
 
     A lease that has had its duration, and that the message does not list, is taken back: its answer was lost.
@@ -151,7 +146,7 @@ def sort_out(context: Context, message: Heartbeat, left: Sequence[LeaseState]) -
         unlisted = [task for task in held.values() if task.key not in listed and task.expires_at <= book.now]
         lose(book, unlisted, context.settings, message=f"worker {worker.name} does not know of it")
     drop = [lease.task_id for lease, name in names if name not in held or held[name].seq in dropped]
-    return HeartbeatAnswer(drop=tuple(drop))
+    return worker_api.HeartbeatAnswer(drop=tuple(drop))
 
 
 _RUNNABLE_JOB = (
@@ -181,13 +176,13 @@ def _unsuperseded(connection: Connection, worker_id: str) -> RegisteredWorker:
 
 def _compose_leases(
     connection: Connection, grants: Sequence[tuple[Any, dict[str, Any]]], publish: Publish
-) -> tuple[tuple[Lease, ...], dict[int, Sequence[int]]]:
+) -> tuple[tuple[worker_api.Lease, ...], dict[int, Sequence[int]]]:
     """Return the leases of granted tasks, and by task the damaged results where rows that it needs are damaged."""
-    leases: list[Lease] = []
+    leases: list[worker_api.Lease] = []
     damaged: dict[int, Sequence[int]] = {}
     for task, terms in grants:
         try:
-            leases.append(Lease(task=compose_task(connection, task, publish), **terms))
+            leases.append(worker_api.Lease(task=compose_task(connection, task, publish), **terms))
         except UNSOUND as error:
             damaged[task.seq] = getattr(error, "results", ())
     return tuple(leases), damaged

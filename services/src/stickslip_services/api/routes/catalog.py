@@ -9,16 +9,9 @@ from typing import Annotated, TypeVar
 from fastapi import APIRouter, Depends, Request, Response
 from starlette.concurrency import run_in_threadpool
 from stickslip_schemas.base import is_sha256
+from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
-from stickslip_schemas.documents.responses import (
-    CertificateEntry,
-    Dataset,
-    DatasetVersion,
-    FileUpload,
-    Page,
-    TextureEntry,
-)
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
 from stickslip_schemas.format.pictures import UnfitPictureError
 from stickslip_schemas.scene.files import UnfitFileError
@@ -63,21 +56,21 @@ _FILE_BODY = {"requestBody": {"required": True, "content": {"application/octet-s
 
 
 @router.get("/v1/datasets", responses=problem_responses(422))
-def get_datasets(page: PageDep, context: ContextDep) -> Page[Dataset]:
+def get_datasets(page: PageDep, context: ContextDep) -> responses.Page[responses.Dataset]:
     """List datasets, newest first."""
     with context.database.read() as connection:
         return list_datasets(connection, page)
 
 
 @router.get("/v1/datasets/{dataset}", responses=problem_responses(404))
-def get_dataset(dataset: str, context: ContextDep) -> Dataset:
+def get_dataset(dataset: str, context: ContextDep) -> responses.Dataset:
     """Return a dataset with its versions."""
     with context.database.read() as connection:
         return find_dataset(connection, dataset)
 
 
 @router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
-def get_version(dataset: str, version: Version, context: ContextDep) -> DatasetVersion:
+def get_version(dataset: str, version: Version, context: ContextDep) -> responses.DatasetVersion:
     """Return a version."""
     with context.database.read() as connection:
         return find_version(connection, dataset, version)
@@ -125,7 +118,7 @@ def _serve(request: Request, context: ContextDep, dataset: str, version: int, pa
 @router.post("/v1/certificates", status_code=201, **reads("Certificate"))
 def post_certificate(
     certificate: Annotated[Certificate, Depends(JsonBody(Certificate))], context: ContextDep, response: Response
-) -> CertificateEntry:
+) -> responses.CertificateEntry:
     """Register a certificate; it may be sent twice. The newest full certificate of a preset and build counts."""
     entry = register_certificate(context.database, context.store, certificate, context.clock())
     response.headers["Location"] = entry.href
@@ -133,7 +126,7 @@ def post_certificate(
 
 
 @router.get("/v1/certificates", responses=problem_responses(422))
-def get_certificates(page: PageDep, context: ContextDep) -> Page[CertificateEntry]:
+def get_certificates(page: PageDep, context: ContextDep) -> responses.Page[responses.CertificateEntry]:
     """List certificates, newest first."""
     with context.database.read() as connection:
         return list_certificates(connection, page)
@@ -148,7 +141,7 @@ def get_certificate(digest: str, request: Request, context: ContextDep) -> Respo
 
 
 @router.post("/v1/textures", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_PICTURE_BODY)
-async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
+async def post_texture(request: Request, context: ContextDep) -> responses.TextureEntry:
     """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side. It may be sent twice.
 
     A picture that no job names is deleted by `stickslip gc` after a day.
@@ -164,7 +157,7 @@ async def post_texture(request: Request, context: ContextDep) -> TextureEntry:
 
 
 @router.post("/v1/files", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_FILE_BODY)
-async def post_file(request: Request, context: ContextDep) -> FileUpload:
+async def post_file(request: Request, context: ContextDep) -> responses.FileUpload:
     """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ), of at most 16 MiB.
 
     A file that no job names is deleted by `stickslip gc` after a day.

@@ -8,17 +8,8 @@ from typing import Annotated, Any, Generic, TypeVar
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from stickslip_schemas.documents import worker_api
 from stickslip_schemas.documents.responses import WorkerEntry
-from stickslip_schemas.documents.worker_api import (
-    Heartbeat,
-    HeartbeatAnswer,
-    LeaseBatch,
-    LeaseRequest,
-    ReportAnswer,
-    ReportBatch,
-    WorkerRegistration,
-    WorkerSession,
-)
 
 from stickslip_services.api.routes.common import ContextDep, JsonBody, json_content, problem_responses, reads
 from stickslip_services.api.routes.health import Metrics
@@ -36,9 +27,9 @@ MOST_ON_LOOP = 64 * 2**10
 MOST_TOGETHER = 64
 """Heartbeats that are answered with one statement: about 5 ms."""
 
-_LEASE_REQUEST: JsonBody[LeaseRequest] = JsonBody(LeaseRequest, from_workers=True)
-_HEARTBEAT: JsonBody[Heartbeat] = JsonBody(Heartbeat, from_workers=True)
-_REPORT_BATCH: JsonBody[ReportBatch] = JsonBody(ReportBatch, from_workers=True)
+_LEASE_REQUEST: JsonBody[worker_api.LeaseRequest] = JsonBody(worker_api.LeaseRequest, from_workers=True)
+_HEARTBEAT: JsonBody[worker_api.Heartbeat] = JsonBody(worker_api.Heartbeat, from_workers=True)
+_REPORT_BATCH: JsonBody[worker_api.ReportBatch] = JsonBody(worker_api.ReportBatch, from_workers=True)
 
 
 class _Plain(APIRoute):
@@ -60,26 +51,27 @@ def get_workers(context: ContextDep) -> list[WorkerEntry]:
 
 @router.post("/v1/workers", status_code=201, **reads("WorkerRegistration"))
 def post_worker(
-    registration: Annotated[WorkerRegistration, Depends(JsonBody(WorkerRegistration))], context: ContextDep
-) -> WorkerSession:
+    registration: Annotated[worker_api.WorkerRegistration, Depends(JsonBody(worker_api.WorkerRegistration))],
+    context: ContextDep,
+) -> worker_api.WorkerSession:
     """Register a worker. An earlier session of the name loses its leases at once."""
     return register_worker(context, registration)
 
 
-@router.post("/v1/worker/lease", response_model=LeaseBatch, **reads("LeaseRequest", 404, 409))
+@router.post("/v1/worker/lease", response_model=worker_api.LeaseBatch, **reads("LeaseRequest", 404, 409))
 async def post_lease(request: Request) -> Response:
     """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
     return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
 
-@router.post("/v1/worker/heartbeat", response_model=HeartbeatAnswer, **reads("Heartbeat", 404))
+@router.post("/v1/worker/heartbeat", response_model=worker_api.HeartbeatAnswer, **reads("Heartbeat", 404))
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
     body = await _HEARTBEAT.received(request)
     is_long = len(body) > MOST_ON_LOOP
     message = await asyncio.to_thread(_HEARTBEAT.read, body) if is_long else _HEARTBEAT.read(body)
     left = await request.app.state.renewals.add(message)
-    answer = HeartbeatAnswer(drop=())
+    answer = worker_api.HeartbeatAnswer(drop=())
     if left is not None:
         answer = await asyncio.to_thread(sort_out, request.app.state.context, message, left)
     return Response(answer.model_dump_json(), media_type="application/json")
@@ -117,12 +109,12 @@ class Gathering(Generic[T, U]):
         self._task = None
 
 
-@router.post("/v1/worker/report", response_model=ReportAnswer, **reads("ReportBatch", 404))
+@router.post("/v1/worker/report", response_model=worker_api.ReportAnswer, **reads("ReportBatch", 404))
 async def post_report(request: Request) -> Response:
     """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
     metrics: Metrics = request.app.state.metrics
 
-    def report(context: Context, batch: ReportBatch) -> ReportAnswer:
+    def report(context: Context, batch: worker_api.ReportBatch) -> worker_api.ReportAnswer:
         answer = report_results(context, batch)
         metrics.count_reports(batch, answer)
         return answer
