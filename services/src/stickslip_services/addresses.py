@@ -1,6 +1,5 @@
 """Addresses of a coordinator, for the server and for its clients."""
 
-import os
 from functools import lru_cache
 from ipaddress import ip_address
 
@@ -28,8 +27,3 @@ def http_url(host: str, port: int, *, tls: bool = False) -> str:
     """Return the URL of a server at `host`, a name or an address of IPv4 or IPv6."""
     scheme = "https" if tls else "http"
     return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
-
-
-def coordinator_url(url: str | None) -> str:
-    """Return the URL of the coordinator: `url`, STICKSLIP_URL, or the default on this machine."""
-    return (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")

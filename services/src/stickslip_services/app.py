@@ -30,7 +30,6 @@ from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
 from stickslip_services.api import problems
 from stickslip_services.api.middleware import (
-    BodyLimitMiddleware,
     KeyMiddleware,
     OriginMiddleware,
     PatientProtocol,
@@ -38,13 +37,14 @@ from stickslip_services.api.middleware import (
     allow_many_files,
 )
 from stickslip_services.api.openapi import describe
-from stickslip_services.api.routes import catalog, health, jobs, pages, workers
+from stickslip_services.api.routes import catalog, health, jobs, workers
 from stickslip_services.api.routes.health import Metrics
+from stickslip_services.api.routes.pages import datasets as dataset_pages
+from stickslip_services.api.routes.pages import jobs as job_pages
 from stickslip_services.api.sse import Feeds
 from stickslip_services.client.http import ClientError
 from stickslip_services.client.verifying import sign
-from stickslip_services.clock import Clock
-from stickslip_services.database.database import Role
+from stickslip_services.database.database import Clock, Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import CommandError
@@ -120,13 +120,12 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.renewals = workers.Gathering(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
-    modules = (workers, jobs, catalog, health, pages)
+    modules = (workers, jobs, catalog, health, job_pages, dataset_pages)
     app.state.routes = [route for module in modules for route in module.router.routes]
     app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
-    app.add_middleware(BodyLimitMiddleware, limit=settings.body_limit)
     app.add_middleware(KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
     app.add_middleware(OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
     app.add_middleware(RequestMiddleware, observe=metrics.observe)

@@ -23,8 +23,7 @@ from stickslip_schemas.documents.responses import EventName
 
 from stickslip_services.access.asker import check_project, note
 from stickslip_services.addresses import is_loopback
-from stickslip_services.clock import Clock, as_datetime
-from stickslip_services.database.database import Database, document_of
+from stickslip_services.database.database import Clock, Database, as_datetime, document_of
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
 

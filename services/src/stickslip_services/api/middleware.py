@@ -1,4 +1,4 @@
-"""What a request passes before its route: limits on connections and bodies, an id, a timing, and authorisation.
+"""What a request passes before its route: limits on connections, an id, a timing, and authorisation.
 
 A request, headers and body, must arrive within `TURN_SECONDS` plus the time that its bytes take at `LEAST_RATE`.
 Answers have no limit: event streams last as long as jobs.
@@ -151,48 +151,6 @@ class RequestMiddleware:
             route = getattr(scope.get("route"), "path", "unknown")
             method = scope["method"] if scope["method"] in _METHODS else "other"
             self.observe(method, route, status, time.perf_counter() - begin)
-
-
-@dataclass(frozen=True, slots=True)
-class BodyLimitMiddleware:
-    """Refuses bodies that are too large, before or while they arrive."""
-
-    app: ASGIApp
-    limit: int
-
-    async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        detail = f"a body may have at most {self.limit} bytes"
-        refusal = ProblemError(413, ProblemCode.body_too_large, detail, headers={"Connection": "close"})
-        declared = Headers(scope=scope).get("content-length", "")
-        if declared.isdecimal() and (len(declared) > 15 or int(declared) > self.limit):
-            await refusal.answer(scope, receive, send)
-            return
-        received = 0
-        refused = started = False
-
-        async def limited_receive() -> Message:
-            nonlocal received, refused
-            message = await receive()
-            if message["type"] == "http.request":
-                received += len(message.get("body", b""))
-                if received > self.limit:
-                    refused = True
-                    return {"type": "http.disconnect"}  # the reader stops; the answer follows below
-            return message
-
-        async def limited_send(message: Message) -> None:
-            nonlocal started
-            if refused and not started:
-                return
-            started = True
-            await send(message)
-
-        await self.app(scope, limited_receive, limited_send)
-        if refused and not started:
-            await refusal.answer(scope, receive, send)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from pydantic import BaseModel, TypeAdapter
+from pydantic import TypeAdapter
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import Problem
 from stickslip_schemas.documents.responses import JobPatch
@@ -18,18 +18,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_services.access.asker import Scope
 from stickslip_services.api.middleware import needed_scope
 
-_DOCUMENTS: dict[str, TypeAdapter[Any] | type[BaseModel]] = {
-    "JobSpec": job_spec_adapter,
-    "Task": task_adapter,
-    "WorkerRegistration": WorkerRegistration,
-    "LeaseRequest": LeaseRequest,
-    "Heartbeat": Heartbeat,
-    "ReportBatch": ReportBatch,
-    "Certificate": Certificate,
-    "JobPatch": JobPatch,
-    "Manifest": Manifest,
-    "Problem": Problem,
-}
+_MODELS = (WorkerRegistration, LeaseRequest, Heartbeat, ReportBatch, Certificate, JobPatch, Manifest, Problem)
+_DOCUMENTS: dict[str, TypeAdapter[Any]] = {model.__name__: TypeAdapter(model) for model in _MODELS}
+_DOCUMENTS |= {"JobSpec": job_spec_adapter, "Task": task_adapter}
 _TAGS = {"previews": "jobs", "textures": "uploads", "files": "uploads", "worker": "workers", "": "health"}
 """Tags of paths whose first word is another."""
 
@@ -47,7 +38,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
             }
         }
         # Requests allow more forms than answers (short forms of axes), so their schema holds for both.
-        components.update(_body_components(_DOCUMENTS))
+        components.update(_body_components())
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
                 operation["tags"] = [_TAGS.get(word := re.split(r"[/:]", path.removeprefix("/v1/"))[0], word)]
@@ -105,12 +96,9 @@ def _name_by_title(document: dict[str, Any]) -> None:
                         node[key] = f"#/components/schemas/{title}"
 
 
-def _body_components(models: dict[str, TypeAdapter[Any] | type[BaseModel]]) -> dict[str, Any]:
+def _body_components() -> dict[str, Any]:
     """Return the OpenAPI components of request documents by name."""
-    adapters = [
-        (name, "validation", model if isinstance(model, TypeAdapter) else TypeAdapter(model))
-        for name, model in models.items()
-    ]
+    adapters = [(name, "validation", adapter) for name, adapter in _DOCUMENTS.items()]
     schemas, shared = TypeAdapter.json_schemas(adapters, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]
     components: dict[str, Any] = dict(shared.get("$defs", {}))
     for (name, _), schema in schemas.items():

@@ -111,7 +111,12 @@ def export(client: Client) -> None:
     if find_spec("stickslip_training") is None:
         raise ClientError("`stickslip export` needs the training package: pip install 'stickslip-training[export]'")
     given = click.get_current_context().args
-    arguments = [_version_url(client, argument) if _ID.match(argument) else argument for argument in given]
+    arguments = []
+    for argument in given:
+        if re.match(r"ds-[0-9a-f]{16}(:|$)", argument):
+            name, version = _resolve(client, argument)
+            argument = f"{client.url}/v1/datasets/{name}/versions/{version}"
+        arguments.append(argument)
     key = os.environ.get("STICKSLIP_KEY")
     ended = subprocess.run(
         [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
@@ -119,14 +124,6 @@ def export(client: Client) -> None:
         check=False,
     )
     raise Exit(ended.returncode)
-
-
-def _version_url(client: Client, dataset: str) -> str:
-    name, version = _resolve(client, dataset)
-    return f"{client.url}/v1/datasets/{name}/versions/{version}"
-
-
-_ID = re.compile(r"ds-[0-9a-f]{16}(:|$)")
 
 
 def _resolve(client: Client, dataset: str) -> tuple[str, int]:

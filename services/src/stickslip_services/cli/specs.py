@@ -67,7 +67,8 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
     """Return the scene of a file, with references by digest, and its files by digest; raise CommandError."""
-    return _inlined({"name": _name(path), **read_spec(path)}, path)
+    name = path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
+    return _inlined({"name": name, **read_spec(path)}, path)
 
 
 def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
@@ -92,10 +93,6 @@ def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, byt
         return inlined(scene, read)
     except UnfitFileError as error:
         raise CommandError(f"{path} is not valid\n  {error}") from error
-
-
-def _name(path: Path) -> str | None:
-    return path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
 
 
 def check_spec(document: dict[str, Any], path: Path) -> JobSpec:

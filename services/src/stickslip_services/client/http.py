@@ -38,7 +38,7 @@ from stickslip_schemas.documents.responses import (
 )
 from stickslip_schemas.format.manifest import Contents, Manifest
 
-from stickslip_services.addresses import coordinator_url
+from stickslip_services.addresses import DEFAULT_URL
 
 if TYPE_CHECKING:
     import zarr
@@ -160,7 +160,7 @@ class Client:
         Raises:
             ClientError: The URL has no scheme.
         """
-        self.url = coordinator_url(url)
+        self.url = (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")
         if not self.url.startswith(("http://", "https://")):
             raise ClientError(f"the URL of the coordinator must begin with http:// or https://: it is {self.url!r}")
         self.patience = patience

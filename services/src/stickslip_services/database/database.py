@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import Enum, auto
 from functools import partial
 from itertools import islice
@@ -20,6 +21,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 from sqlalchemy import URL, Column, Connection, Engine, Row, Select, Table, create_engine, event
 from stickslip_schemas.documents.responses import Page
+
+Clock = Callable[[], float]
+"""Returns seconds since 1970 [s]."""
 
 T = TypeVar("T")
 
@@ -125,6 +129,11 @@ class PageRequest:
 
     size: int
     after: int | None
+
+
+def as_datetime(seconds: float) -> datetime:
+    """Return a time in seconds since 1970 as a UTC datetime."""
+    return datetime.fromtimestamp(seconds, UTC)
 
 
 def document_of(model: type[M], row: Any, **more: Any) -> M:

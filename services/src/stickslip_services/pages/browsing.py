@@ -178,22 +178,12 @@ def coloured(array: ArrayLayout, values: Any, index: int) -> npt.NDArray[np.uint
 
 
 _PALETTE = np.array(
-    [
-        [0, 0, 0],
-        [230, 159, 0],
-        [86, 180, 233],
-        [0, 158, 115],
-        [240, 228, 66],
-        [0, 114, 178],
-        [213, 94, 0],
-        [204, 121, 167],
-    ],
-    dtype=np.uint8,
+    [tuple(bytes.fromhex(c)) for c in ["000000", "e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7"]],
+    np.uint8,
 )
 """Colours of the codes of segments [Okabe and Ito 2008]."""
 
 _COMPONENTS = {"strain": ("twist", "bend 1", "bend 2"), "xyz": ("x", "y", "z")}
-
 
 _CURVES = 4
 """In one plot; of vectors, of which there is a curve of each length, twice as many."""

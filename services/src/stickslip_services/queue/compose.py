@@ -42,7 +42,8 @@ def compose_task(connection: Connection, task: Any, publish: Publish) -> AnyTask
     while: do not call this in a write transaction.
     """
     if task.stage == Stage.simulate:
-        return _simulate_task(task)
+        _check_key(task, content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}))
+        return task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}')
     if task.stage == Stage.render:
         return _render_task(connection, task)
     return _pack_task(connection, task) if task.stage == Stage.pack else _publish_task(connection, task, publish)
@@ -61,11 +62,6 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     if row.waiting_on:
         raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
     return compose_task(connection, row, publish)
-
-
-def _simulate_task(task: Any) -> AnyTask:
-    _check_key(task, content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}))
-    return task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}')
 
 
 def _check_key(task: Any, key: Sha256) -> None:

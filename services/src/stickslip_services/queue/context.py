@@ -14,8 +14,7 @@ from pathlib import Path
 from stickslip_schemas.base import Sha256
 from stickslip_schemas.store import DirectoryStore, Store, open_store
 
-from stickslip_services.clock import Clock
-from stickslip_services.database.database import Database, Role
+from stickslip_services.database.database import Clock, Database, Role
 from stickslip_services.database.opening import connect
 from stickslip_services.queue.ledger import Ledger, ledger
 from stickslip_services.settings import Settings
@@ -53,12 +52,12 @@ class StoreWatch:
         self.trouble = self.trouble or message
 
     def _fault(self) -> str:
-        least = self._min_free_bytes
         for looked_at in self._places:
             try:
                 room = looked_at.room()
-                if room is not None and room.free < least:
-                    return f"{looked_at.place} has {_mib(room.free)} MiB left, and {_mib(least)} MiB must stay free"
+                if room is not None and room.free < self._min_free_bytes:
+                    left, least = room.free / 2**20, self._min_free_bytes / 2**20
+                    return f"{looked_at.place} has {left:.3g} MiB left, and {least:.3g} MiB must stay free"
                 if room is None and not self.trouble:
                     if self._clock() < self._next_probe:
                         continue
@@ -69,26 +68,18 @@ class StoreWatch:
         return ""
 
 
-def _mib(size: int) -> str:
-    return f"{size / 2**20:.3g}"
-
-
 class Notifier:
     """Wakes event streams when the queue has changed; `notify` may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
-        self._count = 0
-
-    @property
-    def count(self) -> int:
+        self.count = 0
         """Number of notifications so far: read it before looking for news, and pass it to `wait`."""
-        return self._count
 
     def notify(self) -> None:
         with self._lock:
-            self._count += 1
+            self.count += 1
             waiting, self._waiting = self._waiting, set()
         for loop, event in waiting:
             with suppress(RuntimeError):  # the loop is closed: nobody waits there any more
@@ -98,7 +89,7 @@ class Notifier:
         """Return when there have been more than `seen` notifications, or after `timeout` seconds."""
         entry = (asyncio.get_running_loop(), asyncio.Event())
         with self._lock:
-            if self._count != seen:
+            if self.count != seen:
                 return
             self._waiting.add(entry)
         try:

@@ -23,12 +23,11 @@ from stickslip_services.access.keys import admit_local_worker
 from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.opening import upgrade
 from stickslip_services.database.prepared import Prepared
-from stickslip_services.database.tables import dataset_versions, jobs
+from stickslip_services.database.tables import dataset_versions, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import find_job, has_runnable_job, show_job
-from stickslip_services.queue.lease import renew_all_leases
-from stickslip_services.queue.ledger import RUNNABLE, Ledger, give_up, reassign_waiting
+from stickslip_services.queue.ledger import HELD, RUNNABLE, Ledger, give_up, reassign_waiting
 from stickslip_services.queue.plan import begin_planning, insert_job
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, fail_damaged_jobs, read_plan
 from stickslip_services.queue.report import take_back
@@ -148,7 +147,11 @@ def start(context: Context) -> None:
         upgrade(connection)
         admit_local_worker(connection, context.settings.worker_key_path, context.clock())
         if context.database.is_alone(connection):  # no other coordinator could have taken a heartbeat
-            renew_all_leases(connection, context.clock(), context.settings.lease_seconds)
+            now = context.clock()
+            expires_at = now + context.settings.lease_seconds
+            connection.execute(update(tasks).where(HELD).values(expires_at=expires_at))
+            ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
+            connection.execute(update(workers).where(ahead).values(last_seen_at=now))
             release_claims(connection)
     plan_waiting_jobs(context)
 

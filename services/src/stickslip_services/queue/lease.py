@@ -199,13 +199,6 @@ def _mend(context: Context, worker_id: str, damaged: dict[int, Sequence[int]]) -
             mend(book, task.seq, damaged[task.seq])
 
 
-def renew_all_leases(connection: Connection, now: float, lease_seconds: float) -> None:
-    """Renew every lease: while the coordinator was down, no heartbeat could arrive."""
-    connection.execute(update(tasks).where(HELD).values(expires_at=now + lease_seconds))
-    ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
-    connection.execute(update(workers).where(ahead).values(last_seen_at=now))
-
-
 def _drop(book: Ledger, held: Sequence[Any], started: set[int]) -> set[int]:
     """Cancel or give back leased tasks that the worker is to drop; return them.
 

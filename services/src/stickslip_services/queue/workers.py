@@ -14,8 +14,7 @@ from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegist
 from stickslip_schemas.plan.builds import Builds
 
 from stickslip_services.access.asker import own
-from stickslip_services.clock import as_datetime
-from stickslip_services.database.database import document_of
+from stickslip_services.database.database import as_datetime, document_of
 from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError

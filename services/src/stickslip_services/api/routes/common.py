@@ -172,11 +172,21 @@ class JsonBody(Generic[T]):
 
 
 async def whole_body(request: Request) -> bytes:
-    """Return the raw body; raise ProblemError where it ends too soon."""
+    """Return the raw body; raise ProblemError where it is too large, or ends too soon."""
+    limit, body = request.app.state.context.settings.body_limit, bytearray()
+    detail = f"a body may have at most {limit} bytes"
+    too_large = ProblemError(413, ProblemCode.body_too_large, detail, headers={"Connection": "close"})
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal() and (len(declared) > 15 or int(declared) > limit):
+        raise too_large
     try:
-        return await request.body()
+        async for block in request.stream():
+            body += block
+            if len(body) > limit:
+                raise too_large
     except ClientDisconnect as error:
         raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+    return bytes(body)
 
 
 def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

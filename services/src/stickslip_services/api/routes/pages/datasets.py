@@ -27,7 +27,7 @@ from stickslip_services.pages.samples import SampleData, motion
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers
 
-router = APIRouter()
+router = APIRouter(include_in_schema=False)
 
 Slot = Annotated[int, Path(ge=0)]
 Step = Annotated[int, Query(ge=1, le=8)]

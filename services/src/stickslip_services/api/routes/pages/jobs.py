@@ -18,8 +18,7 @@ from stickslip_schemas.plan.points import count, estimated
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
 from stickslip_services.catalog.inputs import list_certificates
-from stickslip_services.clock import as_datetime
-from stickslip_services.database.database import PageRequest
+from stickslip_services.database.database import PageRequest, as_datetime
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.rendering import grid_maps, html_page, spec_text
@@ -39,12 +38,10 @@ from stickslip_services.queue.report import failed_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.workers import alive_workers, show_workers
 
-router = APIRouter()
+router = APIRouter(include_in_schema=False)
 
 SHOWN_JOBS = 50
-
 SHOWN_LOST = 50
-
 SHOWN_SLOWEST = 8
 
 MOST_SAMPLES = 20_000
