@@ -15,7 +15,7 @@ from stickslip_schemas.documents.certificate import Certificate, CurveReport, Pr
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
 from stickslip_services.cli import app
-from stickslip_services.cli.scenes import spec_of
+from stickslip_services.cli.specs import spec_of
 from stickslip_services.local.making import why_uncertified
 from stickslip_sim_core import fabric
 from stickslip_sim_core.protocols import SCENE_PROTOCOLS

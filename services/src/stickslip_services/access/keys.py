@@ -10,18 +10,18 @@ project may have a quota. Requests without a key belong to the project with the 
 import secrets
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from cryptography.fernet import Fernet
-from sqlalchemy import Connection, delete, func, insert, select, update
-from stickslip_schemas.base import Document, JobState, sha256
+from sqlalchemy import Connection, Row, delete, func, insert, select, update
+from stickslip_schemas.base import JobState, sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.access.asker import Asker, Scope, check_project, note
-from stickslip_services.database.database import Database, document_of
+from stickslip_services.database.database import Database
 from stickslip_services.database.tables import api_keys, jobs, projects
 from stickslip_services.errors import CommandError, NotFoundError, QuotaExceededError, SettingsError
 from stickslip_services.settings import Settings
@@ -31,17 +31,6 @@ LOCAL_WORKER = "local-worker"
 
 FRESH_SECONDS = 1.0
 """Delay until a new or revoked key takes effect, at most [s]."""
-
-
-class ApiKey(Document):
-    """A key without its secret."""
-
-    id: str
-    name: str
-    scopes: frozenset[Scope]
-    project: str
-    created_at: datetime
-    revoked_at: datetime | None
 
 
 def create_key(
@@ -57,10 +46,9 @@ def create_key(
     return key_id, secret
 
 
-def list_keys(connection: Connection) -> list[ApiKey]:
-    """Return all keys, also the revoked ones, newest first."""
-    rows = connection.execute(select(api_keys).order_by(api_keys.c.seq.desc()))
-    return [document_of(ApiKey, row, scopes=row.scopes.split()) for row in rows]
+def list_keys(connection: Connection) -> Sequence[Row[Any]]:
+    """Return the rows of all keys, also the revoked ones, newest first."""
+    return connection.execute(select(api_keys).order_by(api_keys.c.seq.desc())).all()
 
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:

@@ -20,7 +20,7 @@ from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.asker import Scope, read_audit_log, visited
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import print_table, say, shows_errors
-from stickslip_services.database.database import Role
+from stickslip_services.database.database import Role, as_datetime
 from stickslip_services.database.opening import check
 from stickslip_services.local import supervisor
 from stickslip_services.settings import SERVER, Settings, options
@@ -104,10 +104,10 @@ def list_keys(connection: Connection) -> None:
         (
             key.id,
             key.name,
-            "" if key.revoked_at is None else f"{key.revoked_at:%Y-%m-%d %H:%M}",
-            ", ".join(scope for scope in Scope if scope in key.scopes),
+            "" if key.revoked_at is None else f"{as_datetime(key.revoked_at):%Y-%m-%d %H:%M}",
+            key.scopes.replace(" ", ", "),
             key.project,
-            f"{key.created_at:%Y-%m-%d %H:%M}",
+            f"{as_datetime(key.created_at):%Y-%m-%d %H:%M}",
         )
         for key in stored_keys.list_keys(connection)
     )

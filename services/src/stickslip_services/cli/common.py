@@ -15,9 +15,9 @@ from typing import Any, ParamSpec, TypeVar
 import click
 from click.exceptions import Exit
 from pydantic import BaseModel
+from stickslip_schemas.documents.problems import FieldError
 
 from stickslip_services.addresses import DEFAULT_URL
-from stickslip_services.cli.specs import field_line
 from stickslip_services.client.http import Client, ClientError, MissingExtraError, ProblemError, UnreachableError
 from stickslip_services.errors import CommandError, StickslipError
 
@@ -96,6 +96,12 @@ def print_fields(fields: Iterable[tuple[str, str]]) -> None:
 
 def _width(text: str) -> int:
     return len(click.unstyle(text))
+
+
+def field_line(field: FieldError) -> str:
+    """Return a line that names a field of a document, the rule that it breaks, and its value."""
+    place = field.pointer.lstrip("/").replace("/", ".") or "the document"
+    return f"  {place}: {field.rule}" + (f", and it is {field.value}" if field.value else "")
 
 
 def shows_errors(command: Callable[P, R]) -> Callable[P, R]:

@@ -46,6 +46,7 @@ from stickslip_services.client.verifying import (
     OWN_NAMES,
     PART,
     check_signature,
+    fault_of,
     file_digest,
     files_below,
     read_label,
@@ -112,7 +113,7 @@ def pull(
     target.mkdir(parents=True, exist_ok=True)
     labels_done = (0, 0)
     if not selection.is_everything:
-        labels = [(file, path) for file, path in files if not _is_whole(path, file)]
+        labels = [(file, path) for file, path in files if fault_of(target, file)]
         _download_all(client, root, labels, lambda _: None)
         labels_done = (len(labels), sum(file.size for file, _ in labels))
         with _selecting():
@@ -120,7 +121,7 @@ def pull(
         files = _with_paths(target, wanted)
         document = PartDocument(manifest=sha256(sealed[MANIFEST_NAME]), selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
-    missing = [(file, path) for file, path in files if not _is_whole(path, file)]
+    missing = [(file, path) for file, path in files if fault_of(target, file)]
     changed = {name: content for name, content in sealed.items() if _read(target / name) != content}
     count = len(missing) + len(changed)
     size = sum(file.size for file, _ in missing) + sum(map(len, changed.values()))
@@ -287,9 +288,3 @@ def _fetch(
                 on_bytes(len(block))
                 if stop.is_set():
                     return
-
-
-def _is_whole(path: Path, file: FileEntry) -> bool:
-    with suppress(OSError):
-        return path.stat().st_size == file.size and file_digest(path) == file.sha256
-    return False

@@ -159,7 +159,7 @@ def _found(target: Path) -> list[Fault]:
 
 def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
     with ThreadPoolExecutor(CONNECTIONS) as pool:
-        return [fault for fault in pool.map(lambda file: _fault(target, file), files) if fault is not None]
+        return [fault for fault in pool.map(lambda file: fault_of(target, file), files) if fault is not None]
 
 
 def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int]) -> list[Fault]:
@@ -182,7 +182,8 @@ def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int])
     return faults
 
 
-def _fault(target: Path, file: FileEntry) -> Fault | None:
+def fault_of(target: Path, file: FileEntry) -> Fault | None:
+    """Return what is wrong with a file that a manifest lists; None if it is whole."""
     try:
         path = safe_path(target, file.path)
         size = path.stat().st_size

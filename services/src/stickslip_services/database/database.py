@@ -7,7 +7,6 @@ retries.
 import os
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -40,7 +39,7 @@ class Role(Enum):
     """A command that reads and writes a few rows beside the others."""
 
 
-class Database(ABC):
+class Database:
     """Transactions on one database."""
 
     def __init__(self, reader: Engine, writer: Engine, *others: Engine) -> None:
@@ -64,9 +63,11 @@ class Database(ABC):
         with self._reader.begin() as connection:
             yield connection
 
-    @abstractmethod
-    def write(self) -> AbstractContextManager[Connection]:
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
         """Open a transaction that excludes other writers; it is durable after the block."""
+        with self._writing, self._writer.begin() as connection:
+            yield connection
 
     def touch(self) -> AbstractContextManager[Connection]:
         """Connect for changes that may be lost, beside writers where the database has row locks.
@@ -187,11 +188,6 @@ class SqliteDatabase(Database):
             event.listen(engine, "connect", partial(_prepare, pragmas))
             event.listen(engine, "begin", lambda connection, begin=begin: connection.exec_driver_sql(begin))
         super().__init__(reader, writer)
-
-    @contextmanager
-    def write(self) -> Iterator[Connection]:
-        with self._writing, self._writer.begin() as connection:
-            yield connection
 
 
 def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:

@@ -96,7 +96,7 @@ class PostgresqlDatabase(Database):
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        with self._writing, self._writer.begin() as connection:
+        with super().write() as connection:
             _, _, now = connection.exec_driver_sql(_BEGIN, (self._token,)).one()
             # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
             self._ahead = now - time.monotonic()

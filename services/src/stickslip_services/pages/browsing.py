@@ -177,10 +177,8 @@ def coloured(array: ArrayLayout, values: Any, index: int) -> npt.NDArray[np.uint
     return np.asarray(255 * planes, dtype=np.uint8)
 
 
-_PALETTE = np.array(
-    [tuple(bytes.fromhex(c)) for c in ["000000", "e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7"]],
-    np.uint8,
-)
+_OKABE_ITO = bytes.fromhex("000000 e69f00 56b4e9 009e73 f0e442 0072b2 d55e00 cc79a7")
+_PALETTE = np.frombuffer(_OKABE_ITO, np.uint8).reshape(-1, 3)
 """Colours of the codes of segments [Okabe and Ito 2008]."""
 
 _COMPONENTS = {"strain": ("twist", "bend 1", "bend 2"), "xyz": ("x", "y", "z")}

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, or_, select
@@ -80,14 +81,8 @@ def list_jobs(
         query = query.where(or_(*(place.icontains(search, autoescape=True) for place in places)))
     query = query if state is None else query.where(jobs.c.state == state)
     query = query.where(jobs.c.project == project) if project else query
-    return read_page(
-        connection,
-        query,
-        page,
-        jobs.c.seq,
-        lambda rows: _shown(connection, rows, workers, {}),
-        newest_first=newest_first,
-    )
+    shown = partial(_shown, connection, workers=workers, frames={})
+    return read_page(connection, query, page, jobs.c.seq, shown, newest_first=newest_first)
 
 
 def job_projects(connection: Connection) -> list[str]:
