@@ -178,7 +178,6 @@ def _coordinator(settings: Settings, openapi: bool, migrate: bool, fd: int | Non
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the program; return its exit status."""
     try:
         return int(_coordinator.main(arguments, "python -m stickslip_services.app", standalone_mode=False))
     except click.ClickException as error:

@@ -129,8 +129,6 @@ def refuse_projects(what: str) -> None:
 
 
 class Entry(Document):
-    """An entry of the audit log."""
-
     at: datetime
     actor: str
     """Name of the asker."""

@@ -140,8 +140,6 @@ _OPEN = [state for state in JobState if state.is_open]
 
 @dataclass(frozen=True, slots=True)
 class Project:
-    """A project with its quota and its usage."""
-
     name: str
     max_samples: int | None
     """Samples of jobs that have not ended; None: any number."""

@@ -61,8 +61,6 @@ OWN_NAMES = (*SEALED_NAMES, SIGNATURE_NAME, SELECTION_NAME)
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault of a file of a dataset directory."""
-
     path: str
     fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key", "selection"]
     detail: str
@@ -207,7 +205,6 @@ def files_below(target: Path) -> Iterator[str]:
 
 
 def file_digest(path: Path) -> Sha256:
-    """Return the SHA-256 digest of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

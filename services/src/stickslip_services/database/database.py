@@ -40,8 +40,6 @@ class Role(Enum):
 
 
 class Database:
-    """Transactions on one database."""
-
     def __init__(self, reader: Engine, writer: Engine, *others: Engine) -> None:
         self._reader = reader
         self._writer = writer
@@ -133,7 +131,6 @@ class PageRequest:
 
 
 def as_datetime(seconds: float) -> datetime:
-    """Return a time in seconds since 1970 as a UTC datetime."""
     return datetime.fromtimestamp(seconds, UTC)
 
 

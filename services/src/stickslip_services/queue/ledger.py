@@ -232,7 +232,6 @@ def live_jobs(connection: Connection, task_seqs: Iterable[int], states: Sequence
 
 
 def charge(connection: Connection, job_of: Mapping[int, int]) -> None:
-    """Charge tasks to jobs."""
     charges = [{"b_seq": task, "b_job": job} for task, job in job_of.items()]
     if charges:
         own = update(tasks).where(tasks.c.seq == bindparam("b_seq"))

@@ -75,8 +75,6 @@ def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
 
 
 class PlannedTask(NamedTuple):
-    """A task as a job needs it."""
-
     stage: str  # a plain str: sqlite3 binds it three times as fast as a member of Stage
     build: str
     payload: str
@@ -86,8 +84,6 @@ class PlannedTask(NamedTuple):
 
 
 class PlannedSample(NamedTuple):
-    """A slot of the dataset."""
-
     slot: int
     key: bytes
     simulate_task: bytes

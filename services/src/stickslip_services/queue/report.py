@@ -242,7 +242,6 @@ _FIND_HELD = Prepared(select(*HELD_TASK).where(HELD, tasks.c.owner.in_(bindparam
 
 
 def find_held(connection: Connection, owners: Sequence[str]) -> list[Any]:
-    """Return the leased tasks of workers."""
     return _FIND_HELD.rows(connection, {"b_owners": owners})
 
 

@@ -146,8 +146,6 @@ def _needed(database: Database, store: Store) -> set[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A version in the store."""
-
     name: str
     """Dataset and version, as in `ds-0123456789abcdef:v1`."""
     samples: int

@@ -27,8 +27,6 @@ NO_WORKER = "no worker has told its builds yet; the job is planned when one does
 
 @dataclass(frozen=True, slots=True)
 class RegisteredWorker:
-    """A registered worker."""
-
     id: str
     name: str
     builds: Mapping[str, Builds]

@@ -62,8 +62,6 @@ def _gauge(name: str, text: str, rows: Iterable[Sequence[Any]], *labels: str) ->
 
 
 class Metrics:
-    """The metrics of one coordinator."""
-
     def __init__(self, context: Context) -> None:
         self._registry = CollectorRegistry()
         self._registry.register(_QueueCollector(context))
@@ -92,7 +90,6 @@ class Metrics:
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
-        """Count the outcomes of accepted reports."""
         for report, verdict in zip(batch.reports, answer.verdicts, strict=True):
             result = report.result
             if verdict.verdict != "accepted" or result is None:

@@ -86,7 +86,6 @@ class Gathering(Generic[T, U]):
         self._task: asyncio.Task[None] | None = None
 
     async def add(self, item: T) -> U:
-        """Return the result for an item."""
         future: asyncio.Future[U] = asyncio.get_running_loop().create_future()
         self._waiting.append((item, future))
         if self._task is None:

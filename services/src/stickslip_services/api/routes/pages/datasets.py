@@ -35,8 +35,6 @@ Step = Annotated[int, Query(ge=1, le=8)]
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """The version of a dataset that a path names, with its data."""
-
     dataset: Dataset
     version: DatasetVersion
     data: SampleData
