@@ -271,7 +271,7 @@ certificates = _numbered(
 )
 
 uploads = _table(  # who has uploaded which artifact
-    "uploads", metadata, Column("project", String, primary_key=True), Column("digest", String, primary_key=True)
+    "uploads", Column("project", String, primary_key=True), Column("digest", String, primary_key=True)
 )
 
 api_keys = _numbered(
