@@ -9,8 +9,7 @@ import pytest
 from click.testing import CliRunner
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
-from stickslip_services.access.asker import NOBODY, Asker, Scope, asking, read_audit_log
-from stickslip_services.access.keys import create_key, revoke_key, sealer
+from stickslip_services.access.keys import NOBODY, Asker, Scope, asking, create_key, read_audit_log, revoke_key, sealer
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_services.app import make_app
 from stickslip_services.cli import app

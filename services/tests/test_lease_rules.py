@@ -9,8 +9,7 @@ from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, LeaseState
-from stickslip_services.access.asker import Asker, asking
-from stickslip_services.access.keys import check_quota, find_project, set_quota
+from stickslip_services.access.keys import Asker, asking, check_quota, find_project, set_quota
 from stickslip_services.api.routes.workers import Gathering
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError

@@ -22,9 +22,8 @@ from stickslip_schemas.base import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import main
 from stickslip_services.cli import app
-from stickslip_services.database.database import Role
+from stickslip_services.database.database import Prepared, Role
 from stickslip_services.database.opening import check, connect, opened
-from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
 from stickslip_services.queue.context import Context

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import pytest
 from sqlalchemy import bindparam, insert, select, update
 from sqlalchemy.exc import IntegrityError, OperationalError, ProgrammingError
-from stickslip_services.database.database import Database
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Database, Prepared
 from stickslip_services.database.tables import metadata, previews
 
 SOME = select(previews).where(previews.c.task.in_(bindparam("b_tasks", expanding=True))).order_by(previews.c.task)

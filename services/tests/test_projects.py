@@ -8,8 +8,7 @@ import httpx
 import pytest
 from click.testing import CliRunner
 from stickslip_schemas.base import JobState
-from stickslip_services.access.asker import Asker, asking, read_audit_log
-from stickslip_services.access.keys import find_project, list_projects, set_quota
+from stickslip_services.access.keys import Asker, asking, find_project, list_projects, read_audit_log, set_quota
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
 from stickslip_services.errors import QuotaExceededError

@@ -15,8 +15,7 @@ from fastapi import FastAPI
 from PIL import Image
 from sqlalchemy import select
 from starlette.routing import Route
-from stickslip_services.access.asker import Scope
-from stickslip_services.access.keys import create_key
+from stickslip_services.access.keys import Scope, create_key
 from stickslip_services.app import make_app
 from stickslip_services.database.tables import previews, tasks
 from stickslip_services.queue.context import Context

@@ -28,14 +28,7 @@ from starlette.staticfiles import StaticFiles
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
-from stickslip_services.api import problems
-from stickslip_services.api.middleware import (
-    KeyMiddleware,
-    OriginMiddleware,
-    PatientProtocol,
-    RequestMiddleware,
-    allow_many_files,
-)
+from stickslip_services.api import middleware, problems
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import catalog, health, jobs, workers
 from stickslip_services.api.routes.health import Metrics
@@ -126,9 +119,9 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
-    app.add_middleware(KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
-    app.add_middleware(OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
-    app.add_middleware(RequestMiddleware, observe=metrics.observe)
+    app.add_middleware(middleware.KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
+    app.add_middleware(middleware.OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
+    app.add_middleware(middleware.RequestMiddleware, observe=metrics.observe)
     return app
 
 
@@ -197,11 +190,11 @@ def _serve(settings: Settings, listener: socket.socket) -> int:
         timeout_graceful_shutdown=GRACE_SECONDS,
         lifespan="on",
         proxy_headers=False,
-        http=PatientProtocol,
+        http=middleware.PatientProtocol,
         ssl_certfile=settings.tls_certificate,
         ssl_keyfile=settings.tls_key,
     )
-    allow_many_files()
+    middleware.allow_many_files()
     server = _Server(config, settings.url)
     server.run(sockets=[listener])
     return 0 if server.started else 1

@@ -14,7 +14,7 @@ from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from stickslip_schemas.store import open_store, store_place
 
-from stickslip_services.addresses import DEFAULT_PORT, http_url, is_loopback, reachable
+from stickslip_services.addresses import DEFAULT_PORT, is_loopback
 from stickslip_services.errors import SettingsError
 
 R = TypeVar("R")
@@ -179,7 +179,9 @@ class Settings(BaseSettings):
     @property
     def url(self) -> str:
         """URL of the coordinator on this machine."""
-        return http_url(reachable(self.host), self.port, tls=self.tls_certificate is not None)
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)  # where this machine reaches it
+        scheme = "http" if self.tls_certificate is None else "https"
+        return f"{scheme}://[{host}]:{self.port}" if ":" in host else f"{scheme}://{host}:{self.port}"
 
     @property
     def variables(self) -> dict[str, str]:

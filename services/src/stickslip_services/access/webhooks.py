@@ -12,18 +12,18 @@ import secrets
 import threading
 import time
 from base64 import b64encode
-from datetime import datetime
+from collections.abc import Sequence
+from typing import Any
 
 import httpx
 from cryptography.fernet import Fernet, InvalidToken
-from sqlalchemy import ColumnElement, Connection, and_, delete, func, insert, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Row, and_, delete, func, insert, select, update
 from standardwebhooks import Webhook as Signer
-from stickslip_schemas.base import Document
 from stickslip_schemas.documents.responses import EventName
 
-from stickslip_services.access.asker import check_project, note
+from stickslip_services.access.keys import check_project, note
 from stickslip_services.addresses import is_loopback
-from stickslip_services.database.database import Clock, Database, as_datetime, document_of
+from stickslip_services.database.database import Clock, Database, as_datetime
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError
 
@@ -49,19 +49,6 @@ GIVE_UP_SECONDS = 5 * 24 * 3600.0
 
 TOLD = (EventName.job_state, EventName.dataset_published)
 """Events that are delivered."""
-
-
-class Webhook(Document):
-    """A webhook without its secret."""
-
-    id: str
-    project: str
-    url: str
-    failures: int
-    failing_since: datetime | None
-    fault: str
-    created_at: datetime
-    is_given_up: bool
 
 
 def create_webhook(
@@ -92,10 +79,10 @@ def create_webhook(
     return name, secret
 
 
-def list_webhooks(connection: Connection, now: float) -> list[Webhook]:
-    """Return all webhooks, newest first."""
-    rows = connection.execute(select(webhooks).order_by(webhooks.c.seq.desc())).all()
-    return [document_of(Webhook, row, is_given_up=(row.failing_since or now) < now - GIVE_UP_SECONDS) for row in rows]
+def list_webhooks(connection: Connection, now: float) -> Sequence[Row[Any]]:
+    """Return the rows of all webhooks, newest first, and whether each `is_given_up`."""
+    query = select(webhooks, _is_given_up(now).label("is_given_up"))
+    return connection.execute(query.order_by(webhooks.c.seq.desc())).all()
 
 
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
@@ -192,8 +179,11 @@ class WebhookDelivery:
 
 
 def _is_due(now: float) -> ColumnElement[bool]:
-    given_up = webhooks.c.failing_since < now - GIVE_UP_SECONDS
-    return and_(webhooks.c.next_at <= now, or_(webhooks.c.failing_since.is_(None), ~given_up))
+    return and_(webhooks.c.next_at <= now, ~_is_given_up(now))
+
+
+def _is_given_up(now: float) -> ColumnElement[bool]:
+    return func.coalesce(webhooks.c.failing_since, now) < now - GIVE_UP_SECONDS
 
 
 def _next_message(connection: Connection, seq: int) -> tuple[int, str] | None:

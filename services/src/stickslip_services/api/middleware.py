@@ -27,8 +27,7 @@ from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import MEDIA_TYPE, ProblemCode
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from stickslip_services.access.asker import Asker, Scope, asking
-from stickslip_services.access.keys import KeyRing
+from stickslip_services.access.keys import Asker, KeyRing, Scope, asking
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import ProblemError
 

@@ -15,7 +15,7 @@ from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, Repo
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 
-from stickslip_services.access.asker import Scope
+from stickslip_services.access.keys import Scope
 from stickslip_services.api.middleware import needed_scope
 
 _MODELS = (WorkerRegistration, LeaseRequest, Heartbeat, ReportBatch, Certificate, JobPatch, Manifest, Problem)

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.documents.responses import EventName, JobProgressEvent
 
-from stickslip_services.access.asker import this_asker
+from stickslip_services.access.keys import this_asker
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import StoredEvent, read_events, show_job

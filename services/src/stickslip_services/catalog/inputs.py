@@ -17,7 +17,7 @@ from stickslip_schemas.scene.library import built_in_files, load_scene, scene_na
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 
-from stickslip_services.access.asker import note, own, this_asker
+from stickslip_services.access.keys import note, own, this_asker
 from stickslip_services.database.database import Database, PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates, dataset_versions, jobs, uploads
 from stickslip_services.errors import NotFoundError, UnknownFileError

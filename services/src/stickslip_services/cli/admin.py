@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 
 from stickslip_services.access import keys as stored_keys
 from stickslip_services.access import webhooks as stored_webhooks
-from stickslip_services.access.asker import Scope, read_audit_log, visited
+from stickslip_services.access.keys import Scope, read_audit_log, visited
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import print_table, say, shows_errors
 from stickslip_services.database.database import Role, as_datetime
@@ -181,7 +181,7 @@ def list_webhooks(connection: Connection) -> None:
     rows = []
     for webhook in stored_webhooks.list_webhooks(connection, time.time()):
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
-        made = f"{webhook.created_at:%Y-%m-%d %H:%M}"
+        made = f"{as_datetime(webhook.created_at):%Y-%m-%d %H:%M}"
         rows.append((webhook.id, webhook.url, str(webhook.failures), webhook.project, made, fault))
     print_table(("webhook", "url", "failed tries", "project", "made", "fault"), rows, sentences=True)
 

@@ -36,16 +36,11 @@ SHOWN_REJECTS = 50
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 
 _COLORS = {
-    JobState.planning: "yellow",
-    JobState.queued: "yellow",
+    **dict.fromkeys((JobState.planning, JobState.queued, JobState.cancelling, JobState.cancelled), "yellow"),
+    **dict.fromkeys(GOOD, "green"),
     JobState.running: "cyan",
-    JobState.cancelling: "yellow",
-    JobState.cancelled: "yellow",
-    JobState.succeeded: "green",
-    JobState.succeeded_with_rejects: "green",
     JobState.failed: "red",
 }
-
 _NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
 
 PRIORITY = click.IntRange(-100, 100)
@@ -353,7 +348,7 @@ def _name(file: Path) -> str:
 def _left(value: responses.Eta | None) -> str:
     if value is None:
         return "unknown"
-    return f"about {duration(value.seconds)} ({duration(value.low)} to {duration(value.high)})"
+    return _interval(Interval(median=value.seconds, low=value.low, high=value.high))
 
 
 def _interval(value: Interval) -> str:

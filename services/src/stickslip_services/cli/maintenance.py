@@ -9,7 +9,7 @@ import click
 from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
-from stickslip_services.access.asker import asking, this_user
+from stickslip_services.access.keys import asking, this_user
 from stickslip_services.cli.common import amount, say, shows_errors
 from stickslip_services.client.http import ClientError
 from stickslip_services.database.database import Database, Role

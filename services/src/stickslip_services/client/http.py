@@ -16,26 +16,9 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import httpx
 from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.base import JobState, TaskState
+from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
-from stickslip_schemas.documents.responses import (
-    CertificateEntry,
-    Dataset,
-    DatasetPublishedEvent,
-    DatasetVersion,
-    EventName,
-    FileUpload,
-    Job,
-    JobDetail,
-    JobProgressEvent,
-    JobStateEvent,
-    Page,
-    SampleState,
-    TaskStateEvent,
-    TextureEntry,
-    Validation,
-    WorkerEntry,
-)
 from stickslip_schemas.format.manifest import Contents, Manifest
 
 from stickslip_services.addresses import DEFAULT_URL
@@ -114,13 +97,15 @@ def raise_for_problem(response: httpx.Response) -> None:
 
 T = TypeVar("T")
 
-Event = JobStateEvent | JobProgressEvent | TaskStateEvent | DatasetPublishedEvent
+Event = (
+    responses.JobStateEvent | responses.JobProgressEvent | responses.TaskStateEvent | responses.DatasetPublishedEvent
+)
 
 _EVENTS: Mapping[str, type[Event]] = {
-    EventName.job_state: JobStateEvent,
-    EventName.job_progress: JobProgressEvent,
-    EventName.task_state: TaskStateEvent,
-    EventName.dataset_published: DatasetPublishedEvent,
+    responses.EventName.job_state: responses.JobStateEvent,
+    responses.EventName.job_progress: responses.JobProgressEvent,
+    responses.EventName.task_state: responses.TaskStateEvent,
+    responses.EventName.dataset_published: responses.DatasetPublishedEvent,
 }
 
 PAGE_SIZE = "200"
@@ -188,51 +173,57 @@ class Client:
     def close(self) -> None:
         self._http.close()
 
-    def validate(self, spec: Mapping[str, Any]) -> Validation:
+    def validate(self, spec: Mapping[str, Any]) -> responses.Validation:
         """Validate a spec and count its samples and tasks, without submitting it."""
-        return self._call(Validation, "POST", "/v1/jobs:validate", json=spec)
+        return self._call(responses.Validation, "POST", "/v1/jobs:validate", json=spec)
 
-    def submit(self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0) -> JobDetail:
+    def submit(
+        self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0
+    ) -> responses.JobDetail:
         """Submit a job. Requests with the same idempotency key make one job; by default each call has a new key."""
         headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
         query = {"priority": str(priority)} if priority else {}
-        return self._call(JobDetail, "POST", "/v1/jobs", json=spec, headers=headers, params=query)
+        return self._call(responses.JobDetail, "POST", "/v1/jobs", json=spec, headers=headers, params=query)
 
-    def upload_texture(self, picture: bytes) -> TextureEntry:
+    def upload_texture(self, picture: bytes) -> responses.TextureEntry:
         """Upload a PNG or JPEG file as a texture, which specs name under `textures`."""
         media_type = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
-        return self._call(TextureEntry, "POST", "/v1/textures", content=picture, headers={"Content-Type": media_type})
+        return self._call(
+            responses.TextureEntry, "POST", "/v1/textures", content=picture, headers={"Content-Type": media_type}
+        )
 
-    def upload_file(self, data: bytes) -> FileUpload:
+    def upload_file(self, data: bytes) -> responses.FileUpload:
         """Upload a file that the document of a scene names."""
         octets = {"Content-Type": "application/octet-stream"}
-        return self._call(FileUpload, "POST", "/v1/files", content=data, headers=octets)
+        return self._call(responses.FileUpload, "POST", "/v1/files", content=data, headers=octets)
 
-    def job(self, job_id: str) -> JobDetail:
-        return self._call(JobDetail, "GET", f"/v1/jobs/{job_id}")
+    def job(self, job_id: str) -> responses.JobDetail:
+        return self._call(responses.JobDetail, "GET", f"/v1/jobs/{job_id}")
 
-    def jobs(self, *, search: str = "", state: JobState | None = None, project: str = "") -> Iterator[Job]:
+    def jobs(self, *, search: str = "", state: JobState | None = None, project: str = "") -> Iterator[responses.Job]:
         """Yield jobs, newest first; `search` is a part of the name, kind, id or dataset."""
         query = {"search": search, "state": str(state or ""), "project": project}
-        return self._items(Page[Job], "/v1/jobs", {name: value for name, value in query.items() if value})
+        return self._items(
+            responses.Page[responses.Job], "/v1/jobs", {name: value for name, value in query.items() if value}
+        )
 
-    def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[SampleState]:
+    def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[responses.SampleState]:
         query = {} if state is None else {"state": str(state)}
-        return self._items(Page[SampleState], f"/v1/jobs/{job_id}/samples", query)
+        return self._items(responses.Page[responses.SampleState], f"/v1/jobs/{job_id}/samples", query)
 
-    def prioritise(self, job_id: str, priority: int) -> JobDetail:
+    def prioritise(self, job_id: str, priority: int) -> responses.JobDetail:
         """Set the priority of a job: tasks of the job with the highest number run first."""
-        return self._call(JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
+        return self._call(responses.JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
 
-    def cancel(self, job_id: str) -> JobDetail:
-        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
+    def cancel(self, job_id: str) -> responses.JobDetail:
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
 
-    def pause(self, job_id: str) -> JobDetail:
+    def pause(self, job_id: str) -> responses.JobDetail:
         """Pause a job: running tasks finish, and no further task starts."""
-        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
 
-    def resume(self, job_id: str) -> JobDetail:
-        return self._call(JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
+    def resume(self, job_id: str) -> responses.JobDetail:
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
         """Yield the events of a job until it ends, across lost connections and restarts of the coordinator."""
@@ -246,7 +237,7 @@ class Client:
                     event = _read_event(message)
                     if event is not None:
                         yield event
-                    if isinstance(event, JobStateEvent) and not event.state.is_open:
+                    if isinstance(event, responses.JobStateEvent) and not event.state.is_open:
                         return
                 reason = "the event stream ended before the job"
             except httpx.TransportError as error:
@@ -256,7 +247,7 @@ class Client:
             self._sleep(1.0)
             waited += 1.0
 
-    def wait(self, job_id: str) -> JobDetail:
+    def wait(self, job_id: str) -> responses.JobDetail:
         """Wait until a job has ended, as `events` does, and return it: its `state` says how it ended."""
         for _ in self.events(job_id):
             pass
@@ -278,15 +269,15 @@ class Client:
                     lines = (line.partition(": ") for line in message.split("\n"))
                     yield {name: value for name, _, value in lines}
 
-    def datasets(self) -> Iterator[Dataset]:
+    def datasets(self) -> Iterator[responses.Dataset]:
         """Yield all datasets, newest first."""
-        return self._items(Page[Dataset], "/v1/datasets")
+        return self._items(responses.Page[responses.Dataset], "/v1/datasets")
 
-    def dataset(self, dataset: str) -> Dataset:
-        return self._call(Dataset, "GET", f"/v1/datasets/{dataset}")
+    def dataset(self, dataset: str) -> responses.Dataset:
+        return self._call(responses.Dataset, "GET", f"/v1/datasets/{dataset}")
 
-    def version(self, dataset: str, version: int) -> DatasetVersion:
-        return self._call(DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}")
+    def version(self, dataset: str, version: int) -> responses.DatasetVersion:
+        return self._call(responses.DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}")
 
     def contents(self, dataset: str, version: int) -> Contents:
         """Return what the manifest of a version lists; sections of a large one are fetched on demand."""
@@ -323,18 +314,18 @@ class Client:
         store = HTTPStore(files, client_options={"allow_http": True, "default_headers": key})
         return zarr.open_group(ObjectStore(store, read_only=True), mode="r")
 
-    def workers(self) -> list[WorkerEntry]:
-        return self._call(list[WorkerEntry], "GET", "/v1/workers")
+    def workers(self) -> list[responses.WorkerEntry]:
+        return self._call(list[responses.WorkerEntry], "GET", "/v1/workers")
 
-    def certificates(self) -> Iterator[CertificateEntry]:
+    def certificates(self) -> Iterator[responses.CertificateEntry]:
         """Yield all certificates, newest first."""
-        return self._items(Page[CertificateEntry], "/v1/certificates")
+        return self._items(responses.Page[responses.CertificateEntry], "/v1/certificates")
 
-    def register(self, certificate: Certificate) -> CertificateEntry:
+    def register(self, certificate: Certificate) -> responses.CertificateEntry:
         """Register a certificate. Registering it again changes nothing."""
         headers = {"Content-Type": "application/json"}
         content = certificate.model_dump_json()
-        return self._call(CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
+        return self._call(responses.CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and repeat it while the connection fails or the coordinator is busy.
@@ -366,7 +357,7 @@ class Client:
     def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
         return parsed(answer, self.request(method, path, **options))
 
-    def _items(self, answer: type[Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
+    def _items(self, answer: type[responses.Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
         token: str | None = ""
         while token is not None:
             params = {"page_size": PAGE_SIZE, **(query or {})} | ({"page_token": token} if token else {})

@@ -14,10 +14,9 @@ from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 
-from stickslip_services.access.asker import own_task
+from stickslip_services.access.keys import own_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
-from stickslip_services.database.database import batches
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Prepared, batches
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
 from stickslip_services.queue.ids import task_id, task_key

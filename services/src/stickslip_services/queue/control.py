@@ -18,11 +18,10 @@ from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 
-from stickslip_services.access.asker import note
-from stickslip_services.access.keys import admit_local_worker
+from stickslip_services.access.keys import admit_local_worker, note
 from stickslip_services.catalog.versions import damaged_files, mend_signature
+from stickslip_services.database.database import Prepared
 from stickslip_services.database.opening import upgrade
-from stickslip_services.database.prepared import Prepared
 from stickslip_services.database.tables import dataset_versions, jobs, tasks, workers
 from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.context import Context

@@ -25,7 +25,7 @@ from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
 from stickslip_schemas.documents.tasks import TaskResult
 
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Prepared
 from stickslip_services.database.tables import cost_groups, job_counts, job_groups, job_stages, job_tasks, tasks
 from stickslip_services.queue.ids import task_key
 

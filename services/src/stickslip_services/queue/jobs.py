@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, func, or_, select
+from sqlalchemy import Connection, Row, func, or_, select
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetRef,
@@ -19,9 +19,8 @@ from stickslip_schemas.documents.responses import (
     SampleState,
 )
 
-from stickslip_services.access.asker import own, own_task
-from stickslip_services.database.database import PageRequest, document_of, read_page
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.access.keys import own, own_task
+from stickslip_services.database.database import PageRequest, Prepared, document_of, read_page
 from stickslip_services.database.tables import events, job_stages, job_tasks, jobs, previews, samples, tasks
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
@@ -113,23 +112,13 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
     return read_page(connection, query, page, samples.c.slot, checked, newest_first=False)
 
 
-def list_previews(connection: Connection, job: int) -> list[Preview]:
-    return _previews(connection, _PREVIEWS.where(samples.c.job == job).order_by(samples.c.slot).limit(1000))
-
-
-def newest_previews(connection: Connection, job: int, count: int) -> list[Preview]:
-    """Return the last `count` previews of a job, newest first."""
-    query = _PREVIEWS.join(tasks, tasks.c.seq == previews.c.task).where(samples.c.job == job)
-    return _previews(connection, query.order_by(tasks.c.finished_at.desc(), samples.c.slot).limit(count))
-
-
-_PREVIEWS = select(samples.c.slot, samples.c.labels, previews.c.digest).join(
-    previews, previews.c.task == samples.c.render_task
-)
-
-
-def _previews(connection: Connection, query: Select[Any]) -> list[Preview]:
-    rows = connection.execute(query)
+def list_previews(connection: Connection, job: int, *, count: int = 1000, newest: bool = False) -> list[Preview]:
+    """Return at most `count` previews of a job: the first ones by slot, or the newest ones, newest first."""
+    query = select(samples.c.slot, samples.c.labels, previews.c.digest).where(samples.c.job == job)
+    query = query.join(previews, previews.c.task == samples.c.render_task)
+    if newest:
+        query = query.join(tasks, tasks.c.seq == previews.c.task).order_by(tasks.c.finished_at.desc())
+    rows = connection.execute(query.order_by(samples.c.slot).limit(count))
     return [Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}") for row in rows]
 
 

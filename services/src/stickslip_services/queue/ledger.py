@@ -31,8 +31,7 @@ from stickslip_schemas.documents.responses import (
 )
 from stickslip_schemas.documents.tasks import TaskResult
 
-from stickslip_services.database.database import batches, document_of
-from stickslip_services.database.prepared import Counters, Prepared
+from stickslip_services.database.database import Counters, Prepared, batches, document_of
 from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import add_costs
 from stickslip_services.queue.ids import task_id

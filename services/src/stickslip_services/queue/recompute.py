@@ -24,8 +24,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.catalog.versions import damaged_files, find_committed
-from stickslip_services.database.database import insert_rows, rows_with
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Prepared, insert_rows, rows_with
 from stickslip_services.database.tables import dataset_versions, jobs, task_dependencies, tasks
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
@@ -38,7 +37,7 @@ logger = logging.getLogger(__name__)
 CHECKED_AT_ONCE = 64 * 2**20
 """Largest dataset that is checked within a request, and not in the background [bytes]."""
 
-_DIGEST = re.compile(r"[0-9a-f]{64}")
+DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> None:
@@ -131,7 +130,7 @@ def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Any]
     while level and digests:
         below: set[int] = set()
         for row in rows_with(book.connection, needed, task_dependencies.c.task, level):
-            made = digests.intersection(_DIGEST.findall(row.output or ""))
+            made = digests.intersection(DIGEST.findall(row.output or ""))
             if row.seq not in seen and made:
                 makers.append(row)
                 digests = digests - made

@@ -31,8 +31,7 @@ from stickslip_services.catalog.versions import (
     sign_version,
 )
 from stickslip_services.client.http import ClientError
-from stickslip_services.database.database import batches
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Prepared, batches
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest, task_id, task_key

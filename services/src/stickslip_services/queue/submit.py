@@ -22,11 +22,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.points import Counts, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.access.asker import note, this_asker
-from stickslip_services.access.keys import check_quota
+from stickslip_services.access.keys import check_quota, note, this_asker
 from stickslip_services.catalog.inputs import check_files
-from stickslip_services.database.database import Database, batches, document_of
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.database.database import Database, Prepared, batches, document_of
 from stickslip_services.database.tables import dataset_versions, idempotency_keys, job_stages, job_tasks, jobs, tasks
 from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
 from stickslip_services.queue.context import Context

@@ -8,7 +8,6 @@ intact version, `reindex` inserts the job that made it, so that the dataset is l
 is submitted again finds it. Results of single simulations and renders, and certificates, are not restored.
 """
 
-import re
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
 from stickslip_schemas.store import ShownVersion, Store, Stored, in_parallel
 
-from stickslip_services.access.asker import note
+from stickslip_services.access.keys import note
 from stickslip_services.catalog.versions import (
     commit_version,
     find_committed,
@@ -34,26 +33,20 @@ from stickslip_services.database.tables import (
     certificates,
     dataset_versions,
     datasets,
-    events,
-    idempotency_keys,
-    job_counts,
-    job_groups,
-    job_stages,
     job_tasks,
     jobs,
+    metadata,
     previews,
-    samples,
     task_dependencies,
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
 from stickslip_services.queue.ledger import TASK_COUNTS, Task, ledger
 from stickslip_services.queue.plan import Terms, begin_planning, insert_job, pieces, write_plan
+from stickslip_services.queue.recompute import DIGEST
 
 PIECE = 10_000
 """Size of the pieces of a plan [samples]."""
-
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def remove(database: Database, store: Store, dataset: str, version: int) -> tuple[int, int]:
@@ -87,8 +80,9 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
             raise ConflictError(f"the job {row.id} is {row.state} and makes this version: cancel it first")
     own = [row.seq for row in rows]
     held = set(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(own))))
-    for table in (events, idempotency_keys, job_counts, job_stages, job_groups, samples, job_tasks):
-        connection.execute(delete(table).where(table.c.job.in_(own)))
+    for table in metadata.sorted_tables:
+        if "job" in table.c and table is not tasks:  # a task stays where another job needs it
+            connection.execute(delete(table).where(table.c.job.in_(own)))
     connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
     still = {row.task for row in rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, held)}
     lost = held - still  # a job has all dependencies of its tasks, too
@@ -129,10 +123,10 @@ def _needed(database: Database, store: Store) -> set[bytes]:
     with database.read() as connection:
         for texts in connection.execute(select(tasks.c.output, tasks.c.payload)):
             for text in texts:
-                add(*_DIGEST.findall(text or ""))
+                add(*DIGEST.findall(text or ""))
         add(*connection.scalars(select(previews.c.digest)))
         for manifest, spec in connection.execute(select(jobs.c.manifest, jobs.c.spec)):
-            add(manifest, *_DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
+            add(manifest, *DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
         add(*connection.scalars(select(certificates.c.artifact)))
         columns = dataset_versions.c
         versions = connection.execute(

@@ -13,9 +13,8 @@ from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 
-from stickslip_services.access.asker import own
-from stickslip_services.database.database import as_datetime, document_of
-from stickslip_services.database.prepared import Prepared
+from stickslip_services.access.keys import own
+from stickslip_services.database.database import Prepared, as_datetime, document_of
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
 from stickslip_services.queue.context import Context

@@ -13,7 +13,7 @@ from stickslip_schemas.base import Document
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
-from stickslip_services.access.asker import refuse_projects
+from stickslip_services.access.keys import refuse_projects
 from stickslip_services.api.routes.common import ContextDep, problem_responses
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.database.tables import tasks as tasks_
