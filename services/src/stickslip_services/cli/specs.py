@@ -19,8 +19,8 @@ from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
 from stickslip_schemas.scene.library import load_scene, parse_yaml
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
-from stickslip_schemas.spec.fabrics import MATERIAL_NAME
 from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.names import MATERIAL_NAME
 
 from stickslip_services.cli.common import FILE, field_line, json_option, print_table, say, shows_errors
 from stickslip_services.client.http import ClientError

@@ -19,7 +19,6 @@ from pydantic import BaseModel, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
-from stickslip_schemas.plan.grid import grid
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.store import Store, open_store
@@ -88,7 +87,7 @@ def simulate(
     why = why_uncertified(spec, certificate, build)
     if why and spec.needs_certificate:
         raise CommandError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
-    task = SimulateTask(simulation=spec.simulation(next(iter(grid(spec)))))
+    task = SimulateTask(simulation=spec.simulation(next(iter(spec.grid()))))
     with _handed_over(task, files) as (given, store):
         result = TaskResult.model_validate(_workers(["replay", *given]))
         if result.outcome == "failed":

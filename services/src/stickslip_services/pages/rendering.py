@@ -17,7 +17,6 @@ import numpy.typing as npt
 import yaml
 from fastapi import Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from stickslip_schemas.plan.grid import columns_of
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.units import duration, size
@@ -123,7 +122,7 @@ def grid_maps(spec: JobSpec, done: Flags, lost: Flags, *, most: int | None = Non
     A map has the axes `across` and `up`, and `cells` that hold samples, counted from the lower left. A grid with
     one axis of several values has one map with one row.
     """
-    columns = [np.asarray(column) for column in columns_of(spec)]
+    columns = [np.asarray(column) for column in spec.columns()]
     slots = np.arange(spec.sample_count)
     places = [slots] * len(columns) if spec.combine == "zip" else np.unravel_index(slots, [len(own) for own in columns])
     axes = [_axis(name, own[at]) for name, own, at in zip(spec.named_axes, columns, places, strict=True)]

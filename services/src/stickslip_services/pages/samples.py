@@ -30,7 +30,7 @@ class SampleData:
     def read(self, name: str, slot: int) -> Array:
         """Return the value of an array for a sample; raise KeyError, OSError or CorruptChunkError."""
         array = self.arrays[name]
-        size = self.manifest.samples_per_file(array)
+        size = self.manifest.spec.samples_per_file(array)
         file = self._file(array, slot // size)
         return (
             _chunk(self.store, file, array, slot % size, size)
@@ -40,7 +40,7 @@ class SampleData:
 
     def label(self, name: str) -> Array:
         array = self.arrays[name]
-        size = self.manifest.samples_per_file(array)
+        size = self.manifest.spec.samples_per_file(array)
         files = (self._file(array, number) for number in range(-(-self.manifest.sample_count // size)))
         columns = [_column(self.store, file.sha256, array, size) for file in files]
         return np.concatenate(columns)[: self.manifest.sample_count]
