@@ -243,7 +243,7 @@ def test_a_copy_of_the_database_has_no_secret(
 
 def fault_of(context: Context, name: str) -> str:
     with context.database.read() as connection:
-        return next(one.fault for one in list_webhooks(connection, context.clock()) if one.id == name)
+        return next(str(one.fault) for one in list_webhooks(connection, context.clock()) if one.id == name)
 
 
 def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
