@@ -25,8 +25,12 @@ void Stepper::restart(const std::vector<Body>& bodies) {
   bodies_before_ = bodies;
   started_ = !bodies.empty();
   if (started_) place_skeletons(bodies);
-  newton.contact.forget();
+  forget();
   watch_.restart();
+}
+
+void Stepper::forget() {
+  newton.contact.forget();
   if (newton.pairs) newton.pairs->restart();
 }
 

@@ -73,6 +73,8 @@ class Stepper {
   bool attempt(double dt, const Drive& drive, StepReport& report);
   void accept(const Drive& drive, StepReport& report);
   void reject();
+  // Forgets the contacts of the last step, which only begin the next: where closest points have changed they mislead it.
+  void forget();
   // Whether pairs mattered in the last attempt, and whether a step of so many iterations is easy there: longer ones may
   // follow.
   bool near() const;
