@@ -103,8 +103,7 @@ bool Stepper::easy(int iterations, bool near) const { return iterations <= const
 
 bool Stepper::near() const { return newton.pairs && newton.pairs->relevant(); }
 
-// Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law. Where no part is
-// shorter this has as many iterations as in all parts before.
+// Where Newton's method fails near other cloth: with stiff pairs, else by way of a smoothed law.
 StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>& driven, StepReport& report) {
   x = driven;
   newton.pairs->stiff = true;
@@ -113,8 +112,7 @@ StepOutcome Stepper::solve_hard(const StepProblem& problem, const Buffer<double>
   if (outcome.converged) return outcome;
   x = driven;
   assembly_.definite = true;
-  const int attempts = halvings_ == settings_.halvings_max ? 1 + settings_.halvings_max : 1;
-  return newton.solve(problem, x, false, attempts * constants_.smooth_iterations, report, true);
+  return newton.solve(problem, x, false, constants_.smooth_iterations, report, true);
 }
 
 // Solves for the state at the end of a part of a step. Where that fails it does nothing, unless no part is shorter:
