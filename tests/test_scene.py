@@ -108,6 +108,11 @@ def run_job(service: Service, given: dict[str, Any], busy: set[str]) -> dict[str
     return over
 
 
+def ready(service: Service) -> int:
+    """Return how many dispatchers can take tasks."""
+    return sum(worker["condition"]["state"] == "ready" for worker in service.get("/v1/workers"))
+
+
 def ran(job: dict[str, Any]) -> dict[str, int]:
     """Return how many tasks of each stage a job has run itself."""
     stages = job["progress"]["stages"]
@@ -145,6 +150,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     known = httpx.post(f"{service.url}/v1/jobs:validate", json=more, timeout=60).json()
     assert known["cached_count"] == 16  # simulations and renders of two frictions
     # One vertex of the block elsewhere: all runs, on both nodes together.
+    wait_for("both nodes", lambda: ready(service) == 2 or None, 60)
     moved = run_job(service, spec(upload(service, 0.0199)), busy)
     assert ran(moved) == ran(job)
     assert moved["dataset"]["dataset"] != version

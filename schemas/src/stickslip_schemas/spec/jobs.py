@@ -137,7 +137,7 @@ class JobSpec(Document):
     """What the specs of all kinds have in common, and what common code may ask a spec.
 
     A kind states which documents describe a simulation and a render. A field of these documents that has the name of an
-    axis takes its value. `simulation_settings` and `render_settings` give the other fields, and `SeedRule`s draw seeds.
+    axis takes its value. `simulation_settings` and `render_settings` give the others, and each `SeedRule` draws a seed.
     """
 
     simulation_type: ClassVar[type[Simulation]]
