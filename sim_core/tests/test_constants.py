@@ -56,7 +56,7 @@ CASES: dict[str, str] = {
 }
 """The scene in which each constant matters, and which is quick."""
 
-DEARER = {("stepping.strained_soon", 0.5): 25.0}
+DEARER = {("stepping.strained_soon", 0.5): 20.0}
 """Factors of the cost beyond COST."""
 
 OTHERWISE = {("newton.cuts_max", 0.5), ("node.penalty", 2.0)}

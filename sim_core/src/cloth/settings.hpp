@@ -140,7 +140,7 @@ struct SteppingSettings {
   // 27 % less and 5 takes 63 % more in a crumple; in a fold both take 6 % less.
   double near_patience = 2.5;
   // Strained iterations in a row, stopped short or with all rounds taken, after which an attempt that the controller
-  // may halve at once is given up. Sweep: 1 takes twelve times as many where walls push, 4 takes 1 % less.
+  // may halve at once is given up. Sweep: 1 takes 19 times as many where walls push, 4 takes 1 % less.
   int strained_soon = 2;
   // The same of an attempt for which halving comes last. Sweep: 2 takes 20 % more in a crumple, 8 takes 6 % more.
   int strained_long = 4;
