@@ -204,9 +204,9 @@ class FrictionLearner(Learner):
         last = range(max(0, newest - KEPT + 1), newest + 1)
         self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
         random, count = np.random.default_rng((self.settings.seed, CHOICE, step)), self.settings.batch_size
-        some = torch.from_numpy(random.integers(len(last) * count, size=count)).to(self.settings.device)
-        parts = zip(*self.drawn.values(), strict=True)
-        crops, direction, material, mu, silhouettes = (torch.cat(part)[some] for part in parts)
+        drawn, places = list(self.drawn.values()), random.integers(len(last) * count, size=count).tolist()
+        parts = zip(*([part[at % count] for part in drawn[at // count]] for at in places), strict=True)
+        crops, direction, material, mu, silhouettes = map(torch.stack, parts)
         turned = torch.from_numpy(random.random(count) < 0.5)[:, None].to(self.settings.device)
         direction = torch.where(turned, direction * direction.new_tensor([1.0, -1.0, 1.0]), direction)
         crops, silhouettes = (torch.where(turned[:, None, None], part.flip(3), part) for part in (crops, silhouettes))
