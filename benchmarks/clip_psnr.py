@@ -4,19 +4,19 @@ Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajector
 
     .venv-blender/bin/python benchmarks/clip_psnr.py /tmp/cloth.npz [--material gray-interlock] [--quality standard]
 
-Three clips of 30 frames, with eight textures each. The longer references are 2 x 160 paths per pixel, not denoised,
-at seven instants, for three of the textures; they share no noise with what a clip is measured with.
+Three clips of 30 frames, with eight textures each. The longer references are 3 x 128 paths per pixel and 6 x 128 of
+landed cloth, not denoised, at seven instants, for three of the textures; they share no noise with a clip's own.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
-from stickslip_blender.cloth.quality import pooled, trio
+from stickslip_blender.cloth.quality import errors, pooled, trio
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.arrays import shown_frames
@@ -25,7 +25,7 @@ from stickslip_schemas.spec.names import Texture
 
 SHOWN = (("left", "matt", 21), ("calibrated", "stainless-steel", 22), ("right", "cloth", 23))
 TEXTURES = tuple(map(str, Texture))[:8]
-LONG, INSTANTS = 40, [*range(2, 30, 4)]  # paths per pixel of a shading, four in each of a picture
+LONG, INSTANTS = 32, [*range(2, 30, 4)]  # paths per pixel of a shading, four in each of a picture
 
 
 def main() -> None:
@@ -33,14 +33,13 @@ def main() -> None:
     arguments.add_argument("trajectory", type=Path)
     arguments.add_argument("--material", default="gray-interlock")
     arguments.add_argument("--quality", default="standard")
-    arguments.add_argument("--measured", type=float, default=0.25)
+    arguments.add_argument("--measured", type=float, default=0.5)
     arguments.add_argument("--clips", type=int, nargs="+", default=[0, 1, 2])
     options = arguments.parse_args()
     with np.load(options.trajectory) as file:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
     pictures = {str(name): texture_image(name) for name in Texture}
-    instants, samples = quality.instants, quality.HALF_SAMPLES
     for viewpoint, substrate, seed in (SHOWN[number] for number in options.clips):
         look = ClothDragRender(
             rig="drag",
@@ -61,20 +60,18 @@ def main() -> None:
         videos, _ = clip.clips(shading, [pictures[name] for name in TEXTURES])
         made = time.process_time()
         groups = list(dict.fromkeys(map(trio, TEXTURES)))
-        own = [list(clip.references([pictures[name] for name in g], options.measured, g[0].encode())) for g in groups]
+        own = [list(clip.references([pictures[x] for x in g], clip.measured(options.measured, g))) for g in groups]
         weights, usual = clip.weights(shading)
         ended = time.process_time()
-        quality.instants, quality.HALF_SAMPLES = (lambda *_: INSTANTS), LONG
-        object.__setattr__(clip, "seed", seed + 5000)
-        long = list(clip.references([pictures[name] for name in groups[0]], 1.0))
-        quality.instants, quality.HALF_SAMPLES = instants, samples
+        others = replace(clip, seed=seed + 5000)
+        long = list(others.references([pictures[name] for name in groups[0]], INSTANTS, LONG))
         seconds = (made - start) / len(TEXTURES) / 30
         print(f"{viewpoint}, {substrate}: {seconds:.4f} CPU s a frame and texture", end=", ")
         print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)
         for channel, name in enumerate(groups[0]):
             video = videos[TEXTURES.index(name)]
-            stated = pooled([(r.errors(video, channel), weights[r.frame]) for r in own[0]], usual)
-            found = pooled([(r.errors(video, channel), weights[r.frame] > 0.0) for r in long])
+            stated = pooled([(errors(video[f], lit, channel), weights[f]) for f, lit in own[0]], usual)
+            found = pooled([(errors(video[f], lit, channel), weights[f] > 0.0) for f, lit in long])
             said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
             print(f"  {name}:", "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said), flush=True)
 

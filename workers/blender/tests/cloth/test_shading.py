@@ -28,12 +28,13 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
     truth = np.repeat(np.array([20, 60, 120, 180, 230], dtype=np.uint8), 40_000).reshape(400, 500)
     clip = (truth + 3 * random.choice([-1, 1], truth.shape)).astype(np.uint8)
     for noise in (0.1, 0.4):
-        one, other = (decoded(truth) * (1.0 + noise * random.standard_normal(truth.shape)) for _ in range(2))
-        found = pooled([(errors(clip, one, other), np.ones((3, 400, 500), dtype=bool))])
+        light = decoded(truth) * (1.0 + noise * random.standard_normal((4, *truth.shape)))
+        light[2:, :200] = np.nan
+        found = pooled([(errors(np.dstack([clip] * 3), light[..., None], 0), np.ones((3, 400, 500), dtype=bool))])
         exact = 10.0 * np.log10(255.0**2 / 9.0)
         assert abs(found.psnr[0] - exact) < max(0.15, 2.5 * found.deviations[0])
-    white, bright = np.full((8, 8), 255, dtype=np.uint8), np.full((8, 8), 1.7)
-    assert errors(white, bright, bright).max() < 1e-4
+    white, bright = np.full((8, 8, 3), 255, dtype=np.uint8), np.full((2, 8, 8, 3), 1.7)
+    assert errors(white, bright, 0).max() < 1e-4
 
 
 def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
@@ -59,11 +60,11 @@ def test_a_clip_below_its_floor_says_so() -> None:
 
 def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
     for seed in range(20):
-        drawn = instants(30, 0.25, 24, (seed, 3))
+        drawn = instants(30, 0.25, 6, (seed, 3))
         assert [frame // (30 // len(drawn)) for frame in drawn] == list(range(len(drawn)))
         assert len(drawn) >= 3
-    assert instants(5, 9.0, 64, (1, 3)) == [0, 1, 2, 3, 4]
-    assert len(instants(2, 0.0, 16, (1, 3))) == 1
+    assert instants(5, 9.0, 16, (1, 3)) == [0, 1, 2, 3, 4]
+    assert len(instants(2, 0.0, 4, (1, 3))) == 1
     assert trio("checker") == ("checker", "dots", "stripes")
     assert trio("sha256:0") == ("sha256:0",)
 
@@ -93,9 +94,9 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
     shading = clip.shading()
     videos, _ = clip.clips(shading, pictures)
     weights, usual = clip.weights(shading)
-    (reference,) = clip.references(pictures, 0.0)
+    ((_, light),) = clip.references(pictures, [0])
     for channel, video in enumerate(videos):
-        found = pooled([(reference.errors(video, channel), weights[0])], usual)
+        found = pooled([(errors(video[0], light, channel), weights[0])], usual)
         assert min(found.psnr) > 28.0, names[channel]
         assert found.psnr[0] > 35.0, names[channel]
 

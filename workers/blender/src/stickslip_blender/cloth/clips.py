@@ -24,7 +24,7 @@ from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.geometry import Geometry, Holders, Surroundings
 from stickslip_blender.cloth.ground_truth import bent, ground_truth
 from stickslip_blender.cloth.looks import Look, drawn_light, drawn_substrate, floor_factor, grained, look_of
-from stickslip_blender.cloth.quality import BAND, UNMEASURED, pooled, regions, trio
+from stickslip_blender.cloth.quality import BAND, OF_LANDED, PATHS, UNMEASURED, WHOLE, errors, pooled, regions, trio
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.shading import FINE, SHOWN
 from stickslip_blender.cloth.textures import custom_texture, texture_image
@@ -44,6 +44,7 @@ _KEPT_SHADINGS = 2  # of 36 MB each at 30 frames
 
 Clip = npt.NDArray[np.uint8]
 Light = npt.NDArray[np.float16]  # linear, at the albedos of `shading.SHOWN`
+Reference = tuple[int, npt.NDArray[np.float32]]  # a frame, and its light (renderings, height, width, 3), as in `errors`
 
 
 class ClothRenderer:
@@ -80,10 +81,8 @@ class ClipRenderer:
 
     scene: ClothScene
     camera: Camera
-    pinhole: Camera
-    """Renders what the camera's lens then bends."""
-    shots: Sequence[Points]
-    """All vertices at each instant."""
+    pinhole: Camera  # renders what the camera's lens then bends
+    shots: Sequence[Points]  # all vertices at each instant
     floor: npt.NDArray[np.float32]
     fabric: Look
     sampling: ClothSampling
@@ -117,25 +116,33 @@ class ClipRenderer:
     def weights(self, shading: Light) -> tuple[npt.NDArray[np.float64], list[float]]:
         """Return the weights of pixels by region, (frames, 3, height, width), and their means, for `pooled`."""
         size = (len(shading), self.pinhole.height, FINE, self.pinhole.width, FINE)
-        light = (shading[..., 1] - shading[..., 0]).reshape(size).mean(axis=(2, 4), dtype=np.float32) / SHOWN[1]
+        black, shown, bounced = shading.reshape(*size, 3).mean(axis=(2, 4), dtype=np.float32).transpose(3, 0, 1, 2)
         masks = np.stack([regions(self.scene.geometry, shot, self.pinhole) for shot in self.shots])
-        weights = masks * np.maximum(light + quality.DARK, quality.DARK)[:, None] ** -0.5
+        light = np.maximum((shown - black) / SHOWN[1] + quality.DARK, quality.DARK)
+        weights = masks * (light**-0.5 + quality.BOUNCED * ((shown - bounced) / SHOWN[1]) ** 2 / light)[:, None]
         return weights, (weights.sum(axis=(0, 2, 3)) / np.maximum(masks.sum(axis=(0, 2, 3)), 1)).tolist()
 
-    def references(self, textures: Sequence[Clip], share: float, draw: bytes = b"") -> Iterator[Reference]:
-        """Render instants directly with up to three textures, a share as `instants` says; `draw`: more of the seed."""
+    def measured(self, share: float, group: Sequence[str]) -> list[int]:
+        """Draw in which frames a group of textures is measured, a share as `quality.instants` says."""
+        return quality.instants(len(self.shots), share, self.sampling.window, (self.seed, *group[0].encode()))
+
+    def references(self, textures: Sequence[Clip], frames: Sequence[int], paths: int = PATHS) -> Iterator[Reference]:
+        """Render frames directly with up to three textures, whose greens are the channels of the light."""
         greens = [self._grained(texture)[..., 1] for texture in textures]
         picture = np.stack([*greens, *greens[:1] * (3 - len(greens))], axis=-1)
-        for frame in quality.instants(len(self.shots), share, FINE**2 * self.sampling.window, (self.seed, *draw)):
+        for frame in frames:
             shot = self.shots[frame]
-            window = self.scene.window(shot, BAND + 1)
-            light = np.zeros((2, self.pinhole.height, self.pinhole.width, 3), dtype=np.float32)
+            cloth = shot[: self.scene.geometry.cloth_vertices]
+            landed = cloth[cloth[:, 2] < quality.landed_top(self.scene.geometry)]
+            windows = [self.scene.window(cloth, BAND + 1)] * WHOLE + [self.scene.window(landed, 0)] * OF_LANDED
+            light = np.full((len(windows), *self.floor.shape), np.nan, dtype=np.float32)
             factor = self.scene.composer.floor_factor(shot, self.pinhole, self.floor, FINE)[..., 1:2]
-            for number, half in enumerate(light, 1):
-                sampling = Sampling(quality.HALF_SAMPLES, "none", self.seed + number, skipped=quality.HALF_SAMPLES)
-                parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
-                half[window.slices] = parts.reshape(-1, FINE, window.right - window.left, FINE, 3).mean(axis=(1, 3))
-            yield Reference(frame, light)
+            for number, (one, window) in enumerate(zip(light, windows, strict=True), 1):
+                if window.area:
+                    sampling = Sampling(paths, "none", self.seed + number, skipped=paths)
+                    parts = self.scene.direct(shot, picture, sampling, window, FINE) * factor[window.times(FINE).slices]
+                    one[window.slices] = parts.reshape(-1, FINE, window.right - window.left, FINE, 3).mean(axis=(1, 3))
+            yield frame, light
 
     def _grained(self, texture: Clip) -> Clip:
         return grained(texture, self.fabric, self.scene.geometry.surface)
@@ -151,20 +158,6 @@ class ClipRenderer:
         return {name: np.stack([frame[name] for frame in known]) for name in names}
 
 
-@dataclass(frozen=True)
-class Reference:
-    """What a frame of up to three clips should look like."""
-
-    frame: int
-    light: npt.NDArray[np.float32]
-    """Linear, of two renderings, with the green of each texture in a channel, shape (2, height, width, 3)."""
-
-    def errors(self, clip: Clip, channel: int) -> npt.NDArray[np.float64]:
-        """Return the squared errors of a frame of a clip (frames, height, width, 3) [levels^2]."""
-        one, other = self.light[..., channel]
-        return quality.errors(clip[self.frame, ..., 1], one, other)
-
-
 def render_clips(
     look: AnyLook,
     task: RenderTask,
@@ -174,10 +167,9 @@ def render_clips(
     sheet: str = "",
     frame: Callable[[Geometry], Camera] | None = None,
 ) -> TaskResult:
-    """Render the clips of a task on the scene that `make` makes of a rest shape.
+    """Render the clips of a task on the scene that `make` makes of a rest shape; `sheet`: before the cloth's arrays.
 
-    `sheet` is before the names of the cloth's arrays. With `frame`, which makes the camera where the task has none, the
-    camera is a label.
+    With `frame`, which makes the camera where the task has none, the camera is a label.
     """
     record = workshop.record(task.record)
     track, rest, triangles = (record[f"{sheet}{name}"] for name in ("positions", "rest", "triangles"))
@@ -210,7 +202,7 @@ def _results(
     """Yield the result of each texture: a clip that is good enough, or a rejection."""
     wanted = task.textures or (look.variant,)
     references = {
-        group: list(clip.references([picture(name, workshop) for name in group], look.measured, group[0].encode()))
+        group: list(clip.references([picture(name, workshop) for name in group], clip.measured(look.measured, group)))
         for group in dict.fromkeys(map(trio, wanted))
         if look.measured > 0.0
     }
@@ -223,8 +215,8 @@ def _results(
             measured = UNMEASURED
             if weighed is not None:
                 (weights, usual), group = weighed, trio(name)
-                errors = [(r.errors(video, group.index(name)), weights[r.frame]) for r in references[group]]
-                measured = pooled(errors, usual)
+                pairs = [(errors(video[f], lit, group.index(name)), weights[f]) for f, lit in references[group]]
+                measured = pooled(pairs, usual)
             if shortfall := measured.shortfall(clip.sampling.floors):
                 poor[name] = shortfall
                 continue
@@ -267,9 +259,8 @@ def _shading(clip: ClipRenderer, sampling: ClothSampling, look: AnyLook, task: R
             kept[key] = clip.shading(sampling)
             workshop.keep_shading(key, encode_chunk(kept[key]))
         else:
-            kept[key] = np.empty(
-                (len(clip.shots), FINE * clip.pinhole.height, FINE * clip.pinhole.width, 3), dtype=np.float16
-            )
+            size = len(clip.shots), FINE * clip.pinhole.height, FINE * clip.pinhole.width, 3
+            kept[key] = np.empty(size, dtype=np.float16)
             decode_chunk(stored, kept[key])
         while len(kept) > _KEPT_SHADINGS:
             kept.popitem(last=False)

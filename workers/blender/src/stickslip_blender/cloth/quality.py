@@ -1,14 +1,16 @@
 """How good a clip is: its squared error against direct renderings of its own, without their noise.
 
-At seeded instants, Cycles renders the cloth directly, twice, with two seeds and no denoiser. At a pixel, let P be the
-clip's linear light, X and Y that of the two renderings, and f the sRGB encoding in 8-bit levels. The noises of X and Y
-are independent, so that in
+At seeded instants, Cycles renders the cloth directly, with several seeds and no denoiser. At a pixel, let P be the
+clip's linear light, X and Y that of two renderings, and f the sRGB encoding in 8-bit levels. The noises of X and Y are
+independent, so that in
 
     e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
-nothing of the noise of the references is left, however few samples they have. Frames with cloth in the shade, where a
-level is little light, are worst, and may be missed. So the sum of e over that of 1 / sqrt(light on the cloth), times
-the mean of the latter over all frames, is the mean squared error. Blocks of pixels, and instants, tell the deviation.
+nothing of the noise of the references is left, however few samples they have; e is the mean over all pairs. Landed
+cloth in a penumbra has paths that rarely meet the lamp, and more renderings. Frames with cloth in the shade, where a
+level is little light, or lit by other cloth, are worst, and may be missed. So the sum of e over that of weights,
+1 / sqrt(L) + BOUNCED B^2 / L, times the mean of these over all frames, is the mean squared error; L: light on the
+cloth, B: what an albedo of 0.25 elsewhere adds to it. Blocks of pixels, and instants, tell the deviation.
 
 One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a
 clip gets the same numbers alone or with others. A user's picture is measured by itself.
@@ -28,12 +30,10 @@ from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
-HALF_SAMPLES = 4
-"""Paths per pixel of a shading of each of the two direct renderings, after as many: at edges of a print, the first path
-through the middle of a pixel is an error that both have. A power of two has the least noise."""
-_FIXED = 22  # what else a frame of a shading costs [paths per pixel of its window]
-_SET_UP = 2  # the same of the two renderings
-_TRIOS = 3  # that eight textures make
+PATHS = 2  # per pixel of a shading of a direct rendering, after as many: the first is through the middle of the pixel
+WHOLE, OF_LANDED = 3, 3  # direct renderings of all cloth, and of its landed part, usually half of it in area
+_FIXED, _SET_UP = 22, 1  # what else a frame of a shading costs, and a rendering [paths per pixel of its window]
+_TRIO = 3  # textures that are measured together; eight make as many
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
 FEWEST = 30  # pixels of a region, over all measured instants, below which nothing is said of it
@@ -41,8 +41,8 @@ DEVIATIONS = 2.0  # standard deviations below a floor that are taken for chance
 _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
 _TRUST = 4  # instants that it counts for
 DARK = 0.003  # light on the cloth below which errors do not grow
+BOUNCED = 50.0  # fitted: the composition errs where much light comes from other cloth
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
-_TRIO = 3
 
 Floats = npt.NDArray[np.float64]
 
@@ -81,23 +81,28 @@ def trio(texture: str) -> tuple[str, ...]:
     return tuple(names[first : first + _TRIO])
 
 
-def instants(frames: int, share: float, samples: int, seed: Sequence[int]) -> list[int]:
+def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
     """Draw which frames are measured, each from one of as many equal parts of the clip, at least one.
 
-    To measure eight textures costs a share of their shading, which has so many samples per pixel.
+    To measure eight textures costs a share of their shading, which has so many paths in each part of a pixel.
     """
-    cost = _TRIOS * (2 * HALF_SAMPLES * FINE**2 + _SET_UP) / (samples + _FIXED)
+    cost = _TRIO * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP) / (FINE**2 * paths + _FIXED)
     count = min(max(1, round(share * frames / cost)), frames)
     draws = np.random.Generator(np.random.PCG64(seed)).random(count)
     return [int((k + draw) / count * frames) for k, draw in enumerate(draws)]
+
+
+def landed_top(geometry: Geometry) -> float:
+    """Return the height below which cloth counts as landed [m]."""
+    floor = geometry.surroundings.floor
+    return -np.inf if floor is None else floor + LANDED
 
 
 def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[np.bool_]:
     """Return where the cloth is, where landed cloth is, and the band along its edge, (3, height, width)."""
     seen = see(projected(camera, points), geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
     cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
-    floor = geometry.surroundings.floor
-    low = seen.at_centers(points[:, 2:])[..., 0] < (-np.inf if floor is None else floor + LANDED)
+    low = seen.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
     return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
 
 
@@ -108,12 +113,16 @@ def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
     return mask
 
 
-def errors(levels: npt.NDArray[np.uint8], one: Floats, other: Floats) -> Floats:
-    """Return e of this module's docstring, for 8-bit levels and two references in linear light, all (height, width)."""
+def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel: int) -> Floats:
+    """Return e: a picture's green against a channel of linear light (renderings, height, width, 3), NaN if not seen."""
+    levels, others = picture[..., 1], references[..., channel]
     light = decoded(levels).astype(np.float64)
     slope = 255.0 * np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0))
     top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
-    return np.asarray(slope**2 * (light - np.minimum(one, top)) * (light - np.minimum(other, top)))
+    known = np.isfinite(others).sum(axis=0)
+    off = np.nan_to_num(light - np.minimum(others, top))
+    pairs = off.sum(axis=0) ** 2 - (off**2).sum(axis=0)
+    return np.asarray(slope**2 * pairs / np.maximum(known * (known - 1), 1))
 
 
 def pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3) -> Measured:
