@@ -41,7 +41,7 @@ DEVIATIONS = 2.0  # standard deviations below a floor that are taken for chance
 _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
 _TRUST = 4  # instants that it counts for
 DARK = 0.003  # light on the cloth below which errors do not grow
-BOUNCED = 50.0  # fitted: the composition errs where much light comes from other cloth
+BOUNCED = 40.0  # fitted: the composition errs where much light comes from other cloth
 _BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
 
 Floats = npt.NDArray[np.float64]
