@@ -23,14 +23,13 @@ Correction::Correction(Assembly& assembly, const ClothSettings& settings, const 
 
 bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, StepReport& report) {
   if (pairs) force_ = contact_.force;
+  change = contact_.correction;
   if (!pairs || !pairs->active()) {
     StaleFactor& factor = factors.latest();
     report.factorizations += factor.renew(assembly_, x, contact_, dt, settings_);
-    const int iterations = solve_linear(pairs, factor.view(), settings_.krylov_tolerance);
-    factor.age.spent(iterations);
-    report.krylov += iterations;
+    factor.age.spent(solve_linear(pairs, factor.view(), settings_.krylov_tolerance, report));
   } else {
-    solve_with_pairs(*pairs, x, dt, report);
+    pair_factor_.age.spent(solve_with_pairs(*pairs, x, dt, report));
   }
   if (!pairs) return false;
   int round = 0;
@@ -41,30 +40,32 @@ bool Correction::solve(ContactSet* pairs, const Buffer<double>& x, double dt, St
   return round == constants_.rounds_max;
 }
 
-void Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt, StepReport& report) {
+int Correction::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt, StepReport& report) {
   report.factorizations += pair_factor_.renew(assembly_, x, contact_, pairs, dt, settings_);
   contact_.force = force_;
   pair_rows_ = pairs.rows();
   assembly_.matrix.pairs = &pair_rows_;
   const double tolerance = pairs.smoothing > 0.0 ? constants_.smooth_tolerance
                                                  : std::min(settings_.krylov_tolerance, constants_.pairs_tolerance);
-  const int iterations = solve_linear(&pairs, pair_factor_.view(), tolerance);
+  const int iterations = solve_linear(&pairs, pair_factor_.view(), tolerance, report);
   assembly_.matrix.pairs = nullptr;
-  pair_factor_.age.spent(iterations);
-  report.krylov += iterations;
+  return iterations;
 }
 
-int Correction::solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance) {
+int Correction::solve_linear(const ContactSet* pairs, const Factor& factor, double krylov_tolerance,
+                             StepReport& report) {
   subtract_corrections(pairs);
   double size = 0.0;
   for (float f : contact_.force) size += static_cast<double>(f) * f;
   size = std::sqrt(size);
   const double tolerance =
       std::max(krylov_tolerance, constants_.linear_share * settings_.tolerance / std::max(size, 1e-300));
+  for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) change[i] -= contact_.correction[i];
   const int iterations =
       assembly_.kernel.krylov(assembly_.matrix, factor, contact_.rows(), contact_.force.data(), change.data(),
                               work_.data(), settings_.krylov_max, std::min(tolerance, 0.5));
   for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) change[i] += contact_.correction[i];
+  report.krylov += iterations;
   return iterations;
 }
 

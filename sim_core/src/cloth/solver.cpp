@@ -245,6 +245,7 @@ double ClothSolver::softest(const Points3& positions) {
     for (float& component : v) component *= scale;
     Buffer<float> force = v;
     for (int i = 0; i < free_nodes; ++i) at_node(force, i) *= static_cast<float>(assembly.mass[i]);
+    std::fill(y.begin(), y.end(), 0.0f);
     assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(), work.data(), krylov_max,
                            1e-3);
     for (int i = 0; i < free_nodes; ++i) {

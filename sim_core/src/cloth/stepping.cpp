@@ -47,9 +47,7 @@ void Stepper::refuse_inside(const std::vector<Body>& bodies) const {
   }
   // Whose vertices are on an edge rounded by half a cell sinks into it by 0.46 of that; from 1 on no step leads out.
   constexpr double sunk = 0.5;
-  for (const Skeleton& one : skeletons) {
-    watch_.refuse_inside(bodies[one.body], one.body, sunk * one.radius, x);
-  }
+  for (const Skeleton& one : skeletons) watch_.refuse_inside(bodies[one.body], one.body, sunk * one.radius, x);
 }
 
 void Stepper::place_skeletons(const std::vector<Body>& bodies) {

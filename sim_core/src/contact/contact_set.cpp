@@ -236,9 +236,7 @@ PairData ContactSet::rows() {
   stiffness_.clear();
   for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
-    for (int c = 0; c < 4; ++c) {
-      nodes_.push_back(pair.who.node[c] < free_nodes_ ? pair.who.node[c] : -1);
-    }
+    for (int node : pair.who.node) nodes_.push_back(node < free_nodes_ ? node : -1);
     for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
       for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
     }

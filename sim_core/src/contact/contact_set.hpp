@@ -125,8 +125,8 @@ class ContactSet {
  private:
   // Replaces the pairs by those at x, without forces.
   void find(const Buffer<double>& x);
-  void find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x);
-  void find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x);
+  void find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
+  void find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
   void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
   Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights, const Eigen::Vector3d& rho);
   void transfer(double share);
@@ -136,6 +136,7 @@ class ContactSet {
   ContactSettings settings_;
   int free_nodes_;
   double least_distance_;
+  std::vector<double> ways_;  // of each node in the step but for a common one, m
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_, bone_turns_;

@@ -58,6 +58,7 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, co
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
+      ways_(near.surface.sheet_of_node.size()),
       turns_(settings.turn_max) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
@@ -72,11 +73,12 @@ void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, 
 
 void ContactSet::find(const Buffer<double>& x) {
   std::vector<Candidate>& candidates = near.pairs(x);
-  const double reach = (settings_.detection_range - 1.0) * near.thickness + 2.0 * near.moved(*start_, x);
+  const double range = (settings_.detection_range - 1.0) * near.thickness;
+  near.measure(*start_, x, ways_);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
-  find_vertices(candidates, reach, x);
-  find_edges(candidates, reach, x);
+  find_vertices(candidates, range, x);
+  find_edges(candidates, range, x);
 }
 
 const Bone* ContactSet::bone_of(const Candidate& pair) const {
@@ -84,33 +86,31 @@ const Bone* ContactSet::bone_of(const Candidate& pair) const {
   return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
-// `reach`: beyond what a pair keeps apart, m. A vertex may be closest to an edge or a corner of a triangle. Such a pair
-// counts once, and only where all triangles around the feature agree: otherwise a point inside one of them is closer.
-void ContactSet::find_vertices(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x) {
+// `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a triangle. Such a
+// pair counts once, and only where all triangles around the feature agree: else a point inside one of them is closer.
+void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x) {
   const Surface& surface = near.surface;
   const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
   const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
+  const auto is_of = [&](std::size_t c, int vertex) {
+    return c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
+  };
   std::vector<Found> found;
-  std::size_t c = 0;
+  std::size_t c = 0, end = 0;
   while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
     const int vertex = candidates[c].first;
+    double reach = range;
+    for (; is_of(end, vertex); ++end) reach = std::max(reach, range + fastest(candidates[end], ways_));
     found.clear();
-    for (; c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
-         ++c) {
+    for (; c < end; ++c) {
       Candidate& who = candidates[c];
       if (who.distance > near.apart(who) + reach) continue;
       const FourPoints at = points_of(who, x);
       const Vector4d weights = closest_weights(who.kind, at);
       who.distance = between_closest(weights, at).norm();
-      int corners = 0, corner = 0, opposite = 0;
-      for (int i = 0; i < 3; ++i) {
-        if (weights[1 + i] != 0.0) {
-          ++corners;
-          corner = i;
-        } else {
-          opposite = i;
-        }
-      }
+      int corner = 0, opposite = 0;
+      for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
+      const auto corners = (weights.tail<3>().array() != 0.0).count();
       const int feature = corners == 3   ? who.second
                           : corners == 2 ? triangles + surface.triangle_edges[who.second][opposite]
                                          : triangles + edges + who.node[1 + corner];
@@ -145,13 +145,14 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double reach,
   }
 }
 
-void ContactSet::find_edges(std::vector<Candidate>& candidates, double reach, const Buffer<double>& x) {
+void ContactSet::find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x) {
   for (Candidate& who : candidates) {
-    if (who.kind != PairKind::edge_edge || who.distance > near.apart(who) + reach) continue;
+    const double reach = near.apart(who) + range + fastest(who, ways_);
+    if (who.kind != PairKind::edge_edge || who.distance > reach) continue;
     const FourPoints at = points_of(who, x);
     const Vector4d weights = closest_weights(who.kind, at);
     who.distance = between_closest(weights, at).norm();
-    if (who.distance > near.apart(who) + reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
+    if (who.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
         crossing_squared(at) < settings_.crossing_least)
       continue;
     add(who, who.second, weights, x);
@@ -196,15 +197,13 @@ void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
   const double across = (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
   const Vector3d first =
       who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  const double back = !bone ? 0.5 : a > b ? 1.0 : 0.0;
   pairs_.push_back({who,
                     feature,
                     weights,
                     {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
                      k * smoothing * smoothing},
-                    first - (!bone   ? 0.5
-                             : a > b ? 1.0
-                                     : 0.0) *
-                                rho,
+                    first - back * rho,
                     thickness,
                     bone ? materials.thickness[std::min(a, b)] : thickness,
                     along_first,

@@ -15,7 +15,8 @@ AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from, con
   return out;
 }
 
-// No distance of a point of the first from one of the second changes by more, if nodes go `ways`.
+}  // namespace
+
 double fastest(const Candidate& pair, const std::vector<double>& ways) {
   const auto& node = pair.node;
   if (pair.kind == PairKind::vertex_triangle) {
@@ -23,8 +24,6 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
   }
   return std::max(ways[node[0]], ways[node[1]]) + std::max(ways[node[2]], ways[node[3]]);
 }
-
-}  // namespace
 
 Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings,
                              std::vector<double> farther)
@@ -49,14 +48,11 @@ Leaves Neighbourhood::leaves(const Candidate& pair) const {
   return {settings_.keep, most, settings_.floor * most, settings_.rest};
 }
 
-// Half of the diagonal of the box of the motions, which bounds them but for a common one.
-double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to) const {
-  return 0.5 * box_of_ways(surface, from, to).diagonal().norm();
-}
-
-// The same if each node goes to one of two places, or between them.
-double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const {
-  return 0.5 * box_of_ways(surface, from, to).merged(box_of_ways(surface, from, or_to)).diagonal().norm();
+// Half of the diagonal of the box of the motions.
+double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>* or_to) const {
+  AlignedBox3d box = box_of_ways(surface, from, to);
+  if (or_to) box.extend(box_of_ways(surface, from, *or_to));
+  return 0.5 * box.diagonal().norm();
 }
 
 Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<double>& to,
@@ -84,7 +80,7 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops
   if (!reference_.empty() && moved(reference_, from) <= margin_ && moved(reference_, to) <= margin_) {
     Buffer<double> capped = to;
     if (cap_near(from, capped)) return true;
-    if (moved(reference_, from, to) <= margin_) {
+    if (moved(reference_, from, &to) <= margin_) {
       to = std::move(capped);
       return false;
     }
@@ -103,7 +99,7 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops
     rebuild(part(0.5 * share));
     Buffer<double> wanted = part(share), next = wanted;
     bool stopped = !cap_near(at, next);
-    const double shorter = margin_ / moved(part(0.5), at, to);
+    const double shorter = margin_ / moved(part(0.5), at, &to);
     if (stopped && shorter < share) {
       share = shorter;
       rebuild(part(0.5 * share));

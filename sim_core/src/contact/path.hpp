@@ -23,6 +23,8 @@ struct Candidate {
 };
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);
+// No distance of a point of the first from one of the second changes by more, if nodes go `ways`, m.
+double fastest(const Candidate& pair, const std::vector<double>& ways);
 
 // All pairs of sheets that touch each other, without a common node, that are within `reach` at x: vertices and
 // triangles first, sorted by (first, second). By a grid of cells about as large as a triangle. `farther`: of each
@@ -57,16 +59,15 @@ class Neighbourhood {
 
   double margin() const { return margin_; }
 
-  // What bounds all ways from there, but for a common one, m.
-  double moved(const Buffer<double>& from, const Buffer<double>& to) const;
+  // Of each vertex the length of its way but for a common one, which it returns: the middle of the box of all ways.
+  Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;
 
  private:
-  double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>& or_to) const;
+  // What bounds all ways from there to one of two places, or between them, but for a common one, m.
+  double moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>* or_to = nullptr) const;
   void rebuild(const Buffer<double>& x);
   Leaves leaves(const Candidate& pair) const;
   bool cap_near(const Buffer<double>& from, Buffer<double>& to);
-  // Of each vertex the length of its way but for a common one, which it returns: the middle of the box of all ways.
-  Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to, std::vector<double>& ways) const;
 
   double margin_;
   PathSettings settings_;

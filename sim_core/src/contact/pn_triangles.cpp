@@ -41,9 +41,7 @@ Vector3d PNPatch::n(const Vector3d& b) const {
 
 Matrix3d PNPatch::dy(const Vector3d& b) const {
   Matrix3d out;
-  for (int k = 0; k < 3; ++k) {
-    out.col(k) = 3.0 * b[k] * b[k] * corner[k] + 6.0 * b[next(k)] * b[after_next(k)] * middle;
-  }
+  for (int k = 0; k < 3; ++k) out.col(k) = 3.0 * b[k] * b[k] * corner[k] + 6.0 * b[next(k)] * b[after_next(k)] * middle;
   for (int k = 0; k < 3; ++k) {
     const double i = b[next(k)], j = b[after_next(k)];
     out.col(next(k)) += 3.0 * j * (2.0 * i * near[k] + j * far[k]);

@@ -131,7 +131,8 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
   for (long i = 0; i < count; ++i) a[i] += factor * b[i];
 }
 
-// Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `work`: 2 krylov_max + 1 vectors.
+// Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `x`: the first guess, of which the
+// best multiple is taken, and the solution. `work`: 2 krylov_max + 1 vectors.
 int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b, float* x,
            float* work, int iterations, double tolerance) {
   const FlushTiny flush;
@@ -139,13 +140,21 @@ int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& c
   float* basis = work;
   float* images = work + (krylov_max + 1) * count;
   double h[krylov_max + 1][krylov_max], cosine[krylov_max], sine[krylov_max], g[krylov_max + 1];
-  for (long i = 0; i < count; ++i) x[i] = 0.0f;
   for (long i = 0; i < count; ++i) basis[i] = b[i];
   admit(contact, matrix.nodes, basis);
   const double size = __builtin_sqrt(product(basis, basis, count));
-  if (!(size > 0.0)) return 0;
-  for (long i = 0; i < count; ++i) basis[i] = float(basis[i] / size);
-  g[0] = size;
+  double left = size;
+  admit(contact, matrix.nodes, x);
+  if (product(x, x, count) > 0.0) {
+    apply_contact(matrix, contact, x, images);
+    const float share = float(product(basis, images, count) / product(images, images, count));
+    for (long i = 0; i < count; ++i) x[i] *= share;
+    add_multiple(basis, -share, images, count);
+    left = __builtin_sqrt(product(basis, basis, count));
+  }
+  if (!(left > tolerance * size)) return 0;
+  for (long i = 0; i < count; ++i) basis[i] = float(basis[i] / left);
+  g[0] = left;
   if (iterations > krylov_max) iterations = krylov_max;
   int k = 0;
   while (k < iterations) {
@@ -178,13 +187,11 @@ int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& c
     ++k;
     if (exhausted || __builtin_fabs(g[k]) <= tolerance * size) break;
   }
-  double y[krylov_max];
   for (int i = k - 1; i >= 0; --i) {
-    y[i] = g[i];
-    for (int j = i + 1; j < k; ++j) y[i] -= h[i][j] * y[j];
-    y[i] /= h[i][i];
+    for (int j = i + 1; j < k; ++j) g[i] -= h[i][j] * g[j];
+    g[i] /= h[i][i];
   }
-  for (int j = 0; j < k; ++j) add_multiple(x, float(y[j]), images + j * count, count);
+  for (int j = 0; j < k; ++j) add_multiple(x, float(g[j]), images + j * count, count);
   return k;
 }
 

@@ -54,9 +54,7 @@ inline void forward(const float* tile, float* y, int below) {
   add_tile<width, false>(tile, y, z);
   for (int q = 0; q < width; ++q) y[q] = z[q];
   tile += width * tile_rows;
-  for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows) {
-    add_tile<width, true>(tile, z, y + width + i);
-  }
+  for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows) add_tile<width, true>(tile, z, y + width + i);
 }
 
 template <int width>
