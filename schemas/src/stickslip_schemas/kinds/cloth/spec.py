@@ -161,7 +161,7 @@ class ClipSpec(JobSpec):
         le=10,
         description="cost of measuring how good the clips of eight textures are, over that of rendering them; at "
         "least one frame of each clip is measured, and none at 0",
-        json_schema_extra={"x-cost": "at 0.5, half of the CPU time of rendering 30 frames, and more of fewer frames"},
+        json_schema_extra={"x-cost": "at 0.5, 60 % of the CPU time of rendering 30 frames, and more of fewer frames"},
     )
     creases: Float = Field(
         default=0.0, ge=0, le=1, description="strength of the fine creases that the renderer adds; 1 is 0.5 mm"
