@@ -12,36 +12,19 @@ import click
 from stickslip_services import __version__
 
 _COMMANDS = {
-    "up": "admin.up",
-    "workers": "workers.workers",
-    "validate": "jobs.validate",
-    "upload": "jobs.upload",
-    "submit": "jobs.submit",
-    "jobs": "jobs.jobs",
-    "show": "jobs.show",
-    "watch": "jobs.watch_job",
-    "pause": "jobs.pause",
-    "resume": "jobs.resume",
-    "priority": "jobs.prioritise",
-    "cancel": "jobs.cancel",
-    "pull": "datasets.pull_dataset",
-    "sign": "datasets.sign",
-    "verify": "datasets.verify",
-    "rm": "maintenance.rm",
-    "gc": "maintenance.gc",
-    "reindex": "maintenance.reindex",
-    "scrub": "maintenance.scrub",
-    "scene": "specs.scenes",
-    "simulate": "specs.simulate",
-    "certify": "workers.certify",
-    "register": "workers.register",
-    "certificates": "workers.certificates",
-    "keys": "admin.keys",
-    "projects": "admin.projects",
-    "webhooks": "admin.webhooks",
-    "audit-log": "admin.audit_log",
-    "datasets": "datasets.datasets",
-    "export": "datasets.export",
+    name: (module, name.replace("-", "_"))
+    for module, names in (
+        ("admin", "up"),
+        ("workers", "workers"),
+        ("jobs", "validate upload submit jobs show watch pause resume priority cancel"),
+        ("datasets", "pull sign verify"),
+        ("maintenance", "rm gc reindex scrub"),
+        ("specs", "scene simulate"),
+        ("workers", "certify register certificates"),
+        ("admin", "keys projects webhooks audit-log"),
+        ("datasets", "datasets export"),
+    )
+    for name in names.split()
 }
 """Module and function of each command."""
 
@@ -58,7 +41,7 @@ def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
     from stickslip_services.cli.common import shows_errors  # some need the server, which a client lacks
 
-    module, attribute = _COMMANDS[name].split(".")
+    module, attribute = _COMMANDS[name]
     command: click.Command = getattr(shows_errors(import_module)(f"stickslip_services.cli.{module}"), attribute)
     return command
 
@@ -70,7 +53,7 @@ def _source(module: str) -> list[ast.stmt]:
 
 def _help(name: str) -> str:
     """Return the docstring of a command, from its source."""
-    module, attribute = _COMMANDS[name].split(".")
+    module, attribute = _COMMANDS[name]
     found = (node for node in _source(module) if isinstance(node, ast.FunctionDef) and node.name == attribute)
     return ast.get_docstring(next(found)) or ""
 

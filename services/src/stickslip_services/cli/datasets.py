@@ -14,8 +14,8 @@ from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
 from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table, say, shows_errors
+from stickslip_services.client import pulling
 from stickslip_services.client.http import Client, ClientError
-from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import READS_ARRAYS, sign_directory, signer_of
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
@@ -57,7 +57,7 @@ def datasets(client: Client, as_json: bool) -> None:
 @click.option("--where", multiple=True, help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
 @allowed_signers_option
 @asks
-def pull_dataset(
+def pull(
     client: Client,
     dataset: str,
     target: Path,
@@ -83,7 +83,7 @@ def pull_dataset(
             with counting:
                 bar.update(count)
 
-        done = pull(
+        done = pulling.pull(
             client,
             name,
             version,

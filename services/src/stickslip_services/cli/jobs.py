@@ -120,7 +120,7 @@ def submit(client: Client, file: Path, then_watch: bool, idempotency_key: str | 
     if not then_watch:
         say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
     else:
-        raise Exit(0 if watch(client, job.id) in GOOD else 1)
+        raise Exit(0 if _watched(client, job.id) in GOOD else 1)
 
 
 @click.command()
@@ -207,12 +207,12 @@ def _fields(job: responses.JobDetail) -> Iterator[tuple[str, str]]:
 @click.command()
 @job_argument
 @asks
-def watch_job(client: Client, job_id: str) -> None:
+def watch(client: Client, job_id: str) -> None:
     """Watch a job until it ends; exit with 0 if it succeeded, else 1."""
-    raise Exit(0 if watch(client, job_id) in GOOD else 1)
+    raise Exit(0 if _watched(client, job_id) in GOOD else 1)
 
 
-def watch(client: Client, job_id: str) -> JobState:
+def _watched(client: Client, job_id: str) -> JobState:
     """Show the progress of a job until it ends; return its final state."""
     job = client.job(job_id)
     view, state = _Lines(job.sample_count), job.state
@@ -292,7 +292,7 @@ def resume(client: Client, job_id: str) -> None:
 @job_argument
 @click.argument("priority", type=PRIORITY, help=PRIORITY_HELP)
 @asks
-def prioritise(client: Client, job_id: str, priority: int) -> None:
+def priority(client: Client, job_id: str, priority: int) -> None:
     """Change the priority of a job, from its next task on. Running tasks continue."""
     job = client.prioritise(job_id, priority)
     click.echo(f"{job.id} has priority {job.priority}")

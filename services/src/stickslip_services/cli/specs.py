@@ -73,11 +73,11 @@ def simulate(
 
 
 @click.group()
-def scenes() -> None:
+def scene() -> None:
     """Check and preview scenes."""
 
 
-@scenes.command()
+@scene.command()
 @scene_argument
 @json_option
 @shows_errors
@@ -127,7 +127,7 @@ def check(scene: str, as_json: bool) -> None:
     return None
 
 
-@scenes.command()
+@scene.command()
 @scene_argument
 @click.argument("out", metavar="DIR", type=FILE, help="a directory for the pictures")
 @json_option
