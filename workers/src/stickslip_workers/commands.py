@@ -26,7 +26,6 @@ from stickslip_schemas.scene.parameters import with_values
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_schemas.store import Store, open_store, write_durably
 from stickslip_sim_core import build_info, protocols
-from stickslip_sim_core.protocols import ProtocolResult
 from stickslip_sim_core.protocols.result import dense_master
 from stickslip_sim_core.scenes import cloth_scene
 from stickslip_sim_core.scenes.scene import ClothRun
@@ -130,7 +129,10 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         cpu, wall = time.process_time(), time.monotonic()
         try:
             result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
-            report = ProtocolReport.model_validate(_with_dense_curves(result))
+            document = result.as_dict()
+            for shown, curve in zip(document["curves"], result.curves, strict=True):
+                shown["dense_x"], shown["dense_master"] = (v.tolist() for v in dense_master(result.protocol, curve))
+            report = ProtocolReport.model_validate(document)
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
         except Exception as error:  # any error becomes part of the certificate
             report = _broken_off(name, error)
@@ -158,13 +160,6 @@ def verdict(report: ProtocolReport) -> str:
         return f"broke off: {report.message}"
     error = "infinite" if report.error is None else f"{report.error:.1e}"
     return f"{'passed' if report.passed else 'FAILED'}, largest error {error} of {report.tolerance:g} allowed"
-
-
-def _with_dense_curves(result: ProtocolResult) -> dict[str, Any]:
-    document = result.as_dict()
-    for shown, curve in zip(document["curves"], result.curves, strict=True):
-        shown["dense_x"], shown["dense_master"] = (v.tolist() for v in dense_master(result.protocol, curve))
-    return document
 
 
 def _broken_off(name: str, error: Exception) -> ProtocolReport:

@@ -61,10 +61,6 @@ class _BuiltIn(BeforeValidator):
         return document if handler.mode == "serialization" else {"anyOf": [name, document]}
 
 
-def _built_in(scene: Any) -> Any:
-    return load_scene(scene) if isinstance(scene, str) else scene
-
-
 class ClothSceneAxes(Document):
     """What a clip of a scene depends on: any parameter of the scene, by its name, and looks."""
 
@@ -131,7 +127,7 @@ class ClothSceneSpec(ClipSpec):
     render_seeds = (SeedRule("light_seed", "light", None), SeedRule("crease_seed", "creases", None))
 
     kind: Literal["cloth_scene"]
-    scene: Annotated[Scene, _BuiltIn(_built_in)] = Field(
+    scene: Annotated[Scene, _BuiltIn(lambda scene: load_scene(scene) if isinstance(scene, str) else scene)] = Field(
         description="the name of a built-in scene, or the document of a scene"
     )
     set: dict[str, JsonValue] = Field(

@@ -100,17 +100,11 @@ def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], proj
 @administers
 def list_keys(connection: Connection) -> None:
     """List all keys, newest first, including revoked ones."""
-    rows = (
-        (
-            key.id,
-            key.name,
-            "" if key.revoked_at is None else f"{as_datetime(key.revoked_at):%Y-%m-%d %H:%M}",
-            key.scopes.replace(" ", ", "),
-            key.project,
-            f"{as_datetime(key.created_at):%Y-%m-%d %H:%M}",
-        )
-        for key in stored_keys.list_keys(connection)
-    )
+    rows = []
+    for key in stored_keys.list_keys(connection):
+        revoked = "" if key.revoked_at is None else f"{as_datetime(key.revoked_at):%Y-%m-%d %H:%M}"
+        made = f"{as_datetime(key.created_at):%Y-%m-%d %H:%M}"
+        rows.append((key.id, key.name, revoked, key.scopes.replace(" ", ", "), key.project, made))
     print_table(("key", "name", "revoked", "scopes", "project", "made"), rows)
 
 

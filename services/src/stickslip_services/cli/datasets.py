@@ -33,19 +33,11 @@ def datasets(client: Client, as_json: bool) -> None:
     found = list(client.datasets())
     if as_json:
         return print_json(found)
-    rows = (
-        (
-            f"{dataset.id}:v{version.version}",
-            dataset.name or "",
-            str(version.sample_count),
-            str(version.valid_count),
-            size(version.bytes),
-            dataset.kind,
-            f"{version.created_at:%Y-%m-%d %H:%M} UTC",
-        )
-        for dataset in found
-        for version in dataset.versions
-    )
+    rows = []
+    for dataset, version in ((each, version) for each in found for version in each.versions):
+        name, made = f"{dataset.id}:v{version.version}", f"{version.created_at:%Y-%m-%d %H:%M} UTC"
+        sizes = str(version.sample_count), str(version.valid_count), size(version.bytes)
+        rows.append((name, dataset.name or "", *sizes, dataset.kind, made))
     return print_table(("dataset", "name", "samples", "valid", "size", "kind", "made"), rows)
 
 

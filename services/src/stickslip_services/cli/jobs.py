@@ -135,20 +135,11 @@ def jobs(client: Client, as_json: bool, limit: int, search: str, state: JobState
     found = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
         return print_json(found)
-    rows = (
-        (
-            job.id,
-            _coloured(job.state),
-            f"{job.progress.done}/{job.progress.total}",
-            "" if job.progress.eta is None else duration(job.progress.eta.seconds),
-            _version(job.dataset),
-            job.name or "",
-            job.kind,
-            str(job.sample_count),
-            str(job.rejected_count),
-        )
-        for job in found
-    )
+    rows = []
+    for job in found:
+        left = "" if job.progress.eta is None else duration(job.progress.eta.seconds)
+        progress = _coloured(job.state), f"{job.progress.done}/{job.progress.total}", left, _version(job.dataset)
+        rows.append((job.id, *progress, job.name or "", job.kind, str(job.sample_count), str(job.rejected_count)))
     return print_table(("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected"), rows)
 
 
@@ -166,15 +157,10 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
     print_fields(_fields(job))
     if shown:
         click.secho(f"rejected samples ({job.rejected_count})", italic=True)
-        rows = (
-            (
-                str(reject.slot),
-                str(reject.reason),
-                ", ".join(f"{name}={value}" for name, value in reject.labels.items()),
-                reject.message,
-            )
-            for reject in shown
-        )
+        rows = []
+        for reject in shown:
+            parameters = ", ".join(f"{name}={value}" for name, value in reject.labels.items())
+            rows.append((str(reject.slot), str(reject.reason), parameters, reject.message))
         print_table(("slot", "reason", "parameters", "message"), rows, sentences=True)
         if job.rejected_count > len(shown):
             click.echo(f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected")

@@ -88,15 +88,10 @@ def certificates(client: Client, as_json: bool) -> None:
     if as_json:
         return print_json(found)
     builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
-    rows = (
-        (
-            entry.digest[:16],
-            entry.preset,
-            click.style("passed", fg="green") if entry.passed else click.style("failed", fg="red"),
-            "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})",
-            entry.extent,
-            f"{entry.created_at:%Y-%m-%d %H:%M} UTC",
-        )
-        for entry in found
-    )
+    rows = []
+    for entry in found:
+        verdict = click.style("passed", fg="green") if entry.passed else click.style("failed", fg="red")
+        build = "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})"
+        made = f"{entry.created_at:%Y-%m-%d %H:%M} UTC"
+        rows.append((entry.digest[:16], entry.preset, verdict, build, entry.extent, made))
     return print_table(("certificate", "preset", "verdict", "build", "extent", "made"), rows)

@@ -7,7 +7,7 @@ wait for it; if it failed or was cancelled, the new job starts it again.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple
@@ -245,7 +245,10 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> str:
     """Insert the tasks of `job`; return the state of the last one."""
     connection = book.connection
     needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
-    known = _find(connection, [*plan.tasks, *needed])
+    known = {}
+    if connection.scalar(select(tasks.c.seq).limit(1)):
+        found = rows_with(connection, select(*_KNOWN), tasks.c.key, [*plan.tasks, *needed])
+        known = {row.key: row for row in found}
     seqs, rejected = _insert_tasks(connection, job, plan, known)
     of_job = select(job_tasks.c.task).where(job_tasks.c.job == job)
     earlier = rows_with(connection, of_job, job_tasks.c.task, (task.seq for task in known.values()))
@@ -282,12 +285,6 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> str:
             connection.execute(update(tasks).where(tasks.c.seq == old.seq).values(values))
     reassign(book, [task for task in shared if task.state not in SETTLED])
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
-
-
-def _find(connection: Connection, keys: Iterable[bytes]) -> dict[bytes, Any]:
-    if not connection.scalar(select(tasks.c.seq).limit(1)):
-        return {}
-    return {row.key: row for row in rows_with(connection, select(*_KNOWN), tasks.c.key, keys)}
 
 
 def _insert_tasks(

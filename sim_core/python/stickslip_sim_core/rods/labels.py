@@ -137,17 +137,13 @@ def other_minima(
 
     natural = np.stack([twist, np.zeros(n), bend], axis=1)[:, None, :]
     stiffness = (1.0 / (1.0 + poisson), 1.0, 1.0)
-    start = _representable(found.curvature * MIRROR, elements)
+    # The curvature of the start is cut to what the coarsest level can hold, and 0 for rods without one.
+    start = np.nan_to_num(found.curvature * MIRROR)
+    largest = np.linalg.norm(start, axis=2).max(axis=1, initial=0.0)
+    limit = 0.9 * ELEMENT_TURN_MAX * (elements // 4)
+    start = start * np.minimum(1.0, limit / np.maximum(largest, 1e-300))[:, None, None]
     other = solve_general_rods(natural, weight, stiffness=stiffness, start_curvature=start, **options)
     distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
     distinct = other.stable & ~(distance <= DISTINCT)
     centerline = np.where(distinct[:, None, None], other.centerline, np.nan)
     return OtherMinima(distinct, np.where(distinct, other.energy, np.nan), centerline)
-
-
-def _representable(start: Floats, elements: int) -> Floats:
-    """Return the start with its curvature cut to what the coarsest level can hold, and 0 for rods without one."""
-    start = np.nan_to_num(start)
-    largest = np.linalg.norm(start, axis=2).max(axis=1, initial=0.0)
-    limit = 0.9 * ELEMENT_TURN_MAX * (elements // 4)
-    return np.asarray(start * np.minimum(1.0, limit / np.maximum(largest, 1e-300))[:, None, None])

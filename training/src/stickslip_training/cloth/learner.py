@@ -189,7 +189,8 @@ class FrictionLearner(Learner):
         crops, direction, material, mu, silhouettes = self.chosen(step)
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
-        target = _blurred(self.centers, mu, deviation)
+        target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / deviation) ** 2)
+        target = target / target.sum(dim=1, keepdim=True)
         log_material, log_mu = net.read(net.features(crops, direction, silhouettes if self.settled else None))
         rows = torch.arange(len(mu), device=mu.device)
         loss = -(log_material[rows, material] + (target * log_mu[rows, material]).sum(dim=1)).mean()
@@ -287,9 +288,3 @@ class FrictionLearner(Learner):
             familiarity=known,
             card=card,
         )
-
-
-def _blurred(centers: torch.Tensor, truth: torch.Tensor, deviation: float) -> torch.Tensor:
-    """Return histograms (B, bins) of this deviation about the truth, (B,)."""
-    target = torch.exp(-0.5 * ((centers - truth[:, None]) / deviation) ** 2)
-    return target / target.sum(dim=1, keepdim=True)

@@ -87,7 +87,9 @@ def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
     r = torch.rand(14, clips, 1, 1, generator=generator)
     first, second = (_wave(u, v, r[start : start + 5]) for start in (0, 5))
     plain, mean = torch.full_like(first, 0.5), 0.5 * (first + second)
-    sorts = [plain, first, first * second, torch.maximum(first, second), mean, _blots(clips, generator)]
+    coarse = torch.randint(5, 18, (clips, 1), generator=generator).expand(-1, 2)
+    blots = torch.sigmoid(12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5))
+    sorts = [plain, first, first * second, torch.maximum(first, second), mean, blots]
     pattern = torch.stack(sorts)[(6 * r[10, :, 0, 0]).long(), torch.arange(clips)]
     low, high = 0.12 + 0.75 * r[11:13].amin(dim=0), 0.12 + 0.75 * r[11:13].amax(dim=0)
     return low + (high - low) * torch.where(r[13] < 0.5, pattern, 1 - pattern)
@@ -98,11 +100,6 @@ def _wave(u: torch.Tensor, v: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
     angle = math.pi * torch.where(r[1] < 0.4, r[0], r[0].round() / 2)
     wave = torch.sin(2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * torch.cos(angle) + v * torch.sin(angle)) + r[3]))
     return torch.sigmoid((1 + 12 * r[4]) * (wave - 0.6 * (r[3] - 0.5)))
-
-
-def _blots(clips: int, generator: torch.Generator) -> torch.Tensor:
-    coarse = torch.randint(5, 18, (clips, 1), generator=generator).expand(-1, 2)
-    return torch.sigmoid(12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5))
 
 
 def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:

@@ -147,7 +147,10 @@ def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Ar
         names += [f"{body}.{what}" for body in arrays["body_pose"].attributes["names"] for what in _POSE]
     for name in (name for name in arrays if name.endswith(".positions")):
         sheet = name.removesuffix(".positions")
-        tracked = _tracked(content.read(f"{sheet}.rest", alone)[0])
+        rest = content.read(f"{sheet}.rest", alone)[0]  # a flat sheet (V, 2): its corners and its middle are tracked
+        low, high = rest.min(axis=0), rest.max(axis=0)
+        places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
+        tracked = [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
         parts.append(over_time(name)[:, tracked].reshape(len(holders), -1))
         names += [f"{sheet}.{vertex}.{axis}" for vertex in tracked for axis in "xyz"]
     following = np.concatenate([held[1:], held[-1:]])
@@ -161,13 +164,6 @@ def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Ar
 def _flat_poses(poses: Array) -> Array:
     """Return poses (n, things, 3, 4) as places and first two columns of rotations, (n, things, 9)."""
     return np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
-
-
-def _tracked(rest: Array) -> list[int]:
-    """Return the vertices of a flat sheet (V, 2) that are nearest to its corners and its middle."""
-    low, high = rest.min(axis=0), rest.max(axis=0)
-    places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
-    return [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
 
 
 def _encode(video: Array, path: Path, rate: Fraction) -> None:

@@ -307,15 +307,10 @@ class Holders:
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
         self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
-        vertices, faces = _holder()
+        boxes = [box(HOLDER, (0.0, 0.0, 0.0)), box(ROD, (0.0, 0.0, ROD[2] / 2))]  # a clip and the rod it hangs on
+        vertices = np.concatenate([corners for corners, _ in boxes])
+        faces = [tuple(8 * part + index for index in face) for part, (_, sides) in enumerate(boxes) for face in sides]
         self.props = tuple(Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2))
 
     def placed(self, _instant: int, vertices: Array) -> list[Array]:
         return [prop.vertices + at for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)]
-
-
-def _holder() -> tuple[Array, list[tuple[int, ...]]]:
-    """Return a clip of one centimetre, about its middle, and the rod it hangs on."""
-    boxes = [box(HOLDER, (0.0, 0.0, 0.0)), box(ROD, (0.0, 0.0, ROD[2] / 2))]
-    faces = [tuple(8 * number + index for index in face) for number, (_, sides) in enumerate(boxes) for face in sides]
-    return np.concatenate([corners for corners, _ in boxes]), faces

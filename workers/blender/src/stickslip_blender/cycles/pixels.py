@@ -84,15 +84,9 @@ _PATH_SECONDS = 5e-6  # of a path before one is measured: a slow core
 _SLOWER = 20.0  # times as long as its paths took before, and a frame hangs
 
 _LEVELS = 65536  # of the table that encodes linear light
-
-
-def _encoding() -> npt.NDArray[np.uint8]:
-    light = np.arange(_LEVELS) / (_LEVELS - 1)
-    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * srgb).astype(np.uint8)
-
-
-_ENCODED = _encoding()
+_LIGHT = np.arange(_LEVELS) / (_LEVELS - 1)
+_SRGB = np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * _LIGHT ** (1.0 / 2.4) - 0.055)
+_ENCODED = np.rint(255.0 * _SRGB).astype(np.uint8)
 
 
 def encode(light: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
