@@ -12,7 +12,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -21,6 +20,7 @@ from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
+from stickslip_testing.spheres import icosphere
 from stickslip_testing.tumbles import STEP, Tumble, crumple, folding, pile, squeeze
 
 FABRIC = "gray-interlock"
@@ -110,29 +110,13 @@ def _steps(tumble: Tumble, steps: int) -> Cloth:
     return tumble.cloth
 
 
-def _sphere(radius: float, rings: int = 6) -> tuple[NDArray[np.int32], Floats]:
-    down, round_ = np.meshgrid(
-        np.linspace(0.0, np.pi, rings + 1)[1:-1], np.arange(2 * rings) * np.pi / rings, indexing="ij"
-    )
-    at = np.stack([np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)], axis=-1).reshape(-1, 3)
-    points = radius * np.concatenate([at, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-    around, top, bottom = 2 * rings, len(at), len(at) + 1
-    triangles = []
-    for i in range(around):
-        j = (i + 1) % around
-        triangles += [(top, i, j), (bottom, len(at) - around + j, len(at) - around + i)]
-        for ring in range(0, len(at) - around, around):
-            triangles += [(ring + i, ring + around + i, ring + j), (ring + j, ring + around + i, ring + around + j)]
-    return np.array(triangles, np.int32), points
-
-
 def ball(preset: SolverSettings) -> Cloth:
     """A sheet falls onto a coarse sphere of triangles, which turns, and hangs down to a floor."""
-    triangles, points = _sphere(0.03)
+    directions, triangles = icosphere(1)
 
     def at(time: float) -> Floats:
         c, s = np.cos(2.0 * time), np.sin(2.0 * time)
-        turned: Floats = points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turned: Floats = 0.03 * directions @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return turned
 
     mesh = meshes.unstructured(0.08, 0.08, 0.01, 5)
