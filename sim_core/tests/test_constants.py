@@ -37,10 +37,10 @@ CASES: dict[str, str] = {
             contact.transfer_radius contact.length_tolerance contact.stall_ratio contact.stall_up_to contact.mean_share
             factor.hold_change factor.hold_least factor.missing_share factor.stiffening_change
             newton.halving_iterations newton.hops newton.linear_share newton.reversals_from newton.nearly
-            newton.rounds_max newton.cuts_max newton.window node.penalty path.rest path.floor path.keep path.margin""",
+            newton.rounds_max newton.cuts_max newton.window contact.penalty path.rest path.floor path.keep path.margin""",
         "squeeze": "contact.surface_share",
         "crumple": """contact.detection_range contact.penalty_max contact.smooth_proximal contact.stiff_mean_share
-            node.body_first path.rounds_max
+            smooth.body_first path.rounds_max
             factor.fold_smallest newton.common_least newton.slow newton.smooth_hops
             newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy
             stepping.smooth_iterations stepping.strained_long""",
@@ -59,7 +59,7 @@ CASES: dict[str, str] = {
 DEARER = {("stepping.strained_soon", 0.5): 20.0}
 """Factors of the cost beyond COST."""
 
-OTHERWISE = {("newton.cuts_max", 0.5), ("node.penalty", 2.0)}
+OTHERWISE = {("newton.cuts_max", 0.5), ("contact.penalty", 2.0)}
 """Changes with which the fold falls another way."""
 
 

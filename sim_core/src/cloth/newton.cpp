@@ -91,7 +91,7 @@ void Correction::subtract_corrections(const ContactSet* pairs) {
 }
 
 Newton::Newton(Assembly& assembly, const ClothSettings& settings, const Constants& constants)
-    : contact(assembly.numbering.free_nodes, constants.node, constants.contact.law_stiffness),
+    : contact(assembly.numbering.free_nodes, constants.contact),
       correction(assembly, settings, constants, contact),
       residual(4L * assembly.numbering.nodes, 0.0),
       assembly_(assembly),
@@ -134,7 +134,7 @@ void Newton::predict(const StepProblem& problem, const Buffer<double>& ends, Buf
     if (!from_rest) p += problem.dt * at_node(problem.velocity, i);
     at_node(x, i) = p;
   }
-  if (contact.surfaces) contact.surfaces->begin(problem.start, ends, x);
+  if (contact.surfaces) contact.surfaces->begin(problem.start, ends, x, problem.at_start);
   for (int i = 0; i < free_nodes; ++i) {
     Vector3d p = at_node(x, i);
     for (std::size_t b = 0; b < problem.at_end.size(); ++b) {

@@ -214,7 +214,6 @@ struct FactorSettings {
 
 struct Constants {
   ContactSettings contact;
-  NodeSettings node;
   PathSettings path;
   SmoothSettings smooth;
   SkeletonSettings skeleton;
@@ -223,7 +222,7 @@ struct Constants {
   ControlSettings control;
   FactorSettings factor;
 
-  SIM_CORE_NAMED(contact, node, path, smooth, skeleton, newton, stepping, control, factor)
+  SIM_CORE_NAMED(contact, path, smooth, skeleton, newton, stepping, control, factor)
 
   Constants() = default;
   // Replaces those named "group.name". Throws std::invalid_argument if there is none of that name, or where a value

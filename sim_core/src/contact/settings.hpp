@@ -34,6 +34,10 @@ struct ContactSettings {
   // k/K, of the law of pairs, bodies and surfaces. k = K did not solve a sheet on an incline within 60 s. Sweep: 0.05
   // takes 47 % more in a pile, 0.2 takes 62 % more on a ball.
   double law_stiffness = 0.1;
+  // Stiffness of a node's contact in the factor, over K. With less, GMRES iterations of a dragged cloth doubled or
+  // tripled; with more they grew by a tenth. Over law_stiffness it also bounds the stiffness of turning friction:
+  // beyond, a node is as good as stuck.
+  double penalty = 100.0;
   // kappa/K and lambda/K. On an incline 100 took 76 iterations and 143 factors in place of 16 and 15. Sweep: 5 takes 83
   // % more on a ball, 20 takes 55 % more factors in a pile.
   double proximal = 10.0;
@@ -94,22 +98,9 @@ struct ContactSettings {
   // in a pile and a fold.
   double turn_max = 0.05;
 
-  SIM_CORE_NAMED(law_stiffness, proximal, smooth_proximal, mean_share, stiff_mean_share, closing_gap, crossing_least,
-                 end_share, match_cosine, stall_ratio, length_tolerance, stall_up_to, penalty_growth, penalty_max,
-                 merge_radius, transfer_radius, detection_range, surface_share, turn_max)
-};
-
-struct NodeSettings {
-  // Stiffness of a contact in the factor over that of the node. With less, GMRES iterations of a dragged cloth doubled
-  // or tripled; with more they grew by a tenth. Over law_stiffness it also bounds the stiffness of turning friction:
-  // beyond, a node is as good as stuck.
-  double penalty = 100.0;
-  // Distance from a body, in m, within which a node that begins a step there touches surfaces by pairs only, so that it
-  // does not change between body and surface from one iterate to the next. Sweep: 0.5 mm takes 59 % more and 2 mm 41 %
-  // less in a crumple between walls on a floor.
-  double body_first = 1e-3;
-
-  SIM_CORE_NAMED(penalty, body_first)
+  SIM_CORE_NAMED(law_stiffness, penalty, proximal, smooth_proximal, mean_share, stiff_mean_share, closing_gap,
+                 crossing_least, end_share, match_cosine, stall_ratio, length_tolerance, stall_up_to, penalty_growth,
+                 penalty_max, merge_radius, transfer_radius, detection_range, surface_share, turn_max)
 };
 
 struct PathSettings {
@@ -149,8 +140,12 @@ struct SmoothSettings {
   // Jacobian of the map to a foot, over that of the triangle, below which there is no foot: at 0 the point is a centre
   // of curvature. Sweep: nothing changes.
   double fold_over = 0.1;
+  // Distance from a body, in m, within which pairs alone keep a node from surfaces, so that it does not change between
+  // both from one iterate to the next. Sweep: 0.5 mm takes 59 % more and 2 mm 41 % less in a crumple between walls on a
+  // floor.
+  double body_first = 1e-3;
 
-  SIM_CORE_NAMED(reach, curvature_max, same_normal, beyond_edge, between, fold_over)
+  SIM_CORE_NAMED(reach, curvature_max, same_normal, beyond_edge, between, fold_over, body_first)
 };
 
 struct SkeletonSettings {

@@ -21,6 +21,9 @@ std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, co
   return out;
 }
 
+// In place of a triangle: the node is left to pairs.
+constexpr int by_pairs = -2;
+
 bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double distance_max) {
   return std::any_of(bodies.begin(), bodies.end(),
                      [&](const Body& body) { return gap_of(body, p).distance < distance_max; });
@@ -44,12 +47,14 @@ SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles, std::vec
   for (const auto& corners : triangles) first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
 }
 
-void SmoothContact::restart() { std::fill(kept_.triangle.begin(), kept_.triangle.end(), -1); }
+void SmoothContact::restart() {
+  for (int& triangle : kept_.triangle) triangle = std::min(triangle, -1);
+}
 
 void SmoothContact::keep(const std::vector<int>& mode) {
   for (int i = 0; i < free_nodes_; ++i) {
     const bool stays = track_.triangle[i] >= 0 && mode[i] != contact_open && feet_[i].on_patch;
-    kept_.triangle[i] = stays ? track_.triangle[i] : -1;
+    kept_.triangle[i] = stays ? track_.triangle[i] : std::min(track_.triangle[i], -1);
     kept_.side[i] = track_.side[i];
   }
 }
@@ -65,7 +70,8 @@ void SmoothContact::take_shapes(const Buffer<double>& start, const Buffer<double
   if (!same(end_, ends)) end_ = patches_.shape(ends);
 }
 
-void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess) {
+void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess,
+                          const std::vector<Body>& at_start) {
   take_shapes(start, ends);
   // The largest of the box of motions of surfaces: middle and half diagonal.
   Eigen::AlignedBox3d ways;
@@ -77,14 +83,18 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   const double thickness = *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
   track_ = kept_;
   for (int i = 0; i < free_nodes_; ++i) {
-    if (track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const Vector3d p = at_node(start, i);
+    const bool came = track_.triangle[i] == by_pairs, near = began_near(at_start, p, settings_.body_first);
+    if (near) track_.triangle[i] = by_pairs;
+    if (near || track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const double kept = thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
     const double reach = kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest found =
         tree_.nearest(p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
     track_.triangle[i] = found.triangle;
-    if (found.triangle >= 0) track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
+    if (found.triangle < 0) continue;
+    track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
+    if (came && !forced(i, p, 0.0).isZero()) track_.triangle[i] = by_pairs;
   }
 }
 
@@ -132,7 +142,7 @@ void Norms::count(double force_squared) {
   if (!std::isnan(largest) && !(force_squared <= largest * largest)) largest = std::sqrt(force_squared);
 }
 
-ContactState::ContactState(int free_nodes, const NodeSettings& settings, double law_stiffness)
+ContactState::ContactState(int free_nodes, const ContactSettings& settings)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
       sheet(free_nodes, 0),
@@ -143,8 +153,8 @@ ContactState::ContactState(int free_nodes, const NodeSettings& settings, double 
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
       correction(4 * free_nodes + 64, 0.0f),
-      settings_(settings),
-      turning_max_(settings.penalty / law_stiffness) {}
+      penalty_(settings.penalty),
+      turning_max_(settings.penalty / settings.law_stiffness) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
@@ -153,7 +163,7 @@ ContactRows ContactState::rows() const {
 void ContactState::penalty(int node, double own, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
-  const float k = static_cast<float>(settings_.penalty) * static_cast<float>(own);
+  const float k = static_cast<float>(penalty_) * static_cast<float>(own);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
   const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
@@ -182,8 +192,7 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     }
     const Vector3d r = at_node(residual, i);
     const auto bears = [&] { return which >= 0 && r.dot(gap.normal) - stiffness[i] * gap.distance > 0.0; };
-    // The nearest counts, but what began a step near a body does not change to a surface: pairs keep it from that.
-    if (surfaces && !began_near(at_start, at_node(start, i), settings_.body_first)) {
+    if (surfaces) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one && one->gap < gap.distance) {
         gap = {one->gap, one->normal};

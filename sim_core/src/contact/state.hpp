@@ -44,8 +44,11 @@ class SmoothContact {
 
   // Forgets which triangles are touched.
   void restart();
-  // An attempt at a step begins at `start`; it takes the surfaces to `ends`, and the cloth to about `guess`.
-  void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess);
+  // An attempt at a step begins at `start`; it takes the surfaces to `ends`, and the cloth to about `guess`. Pairs
+  // alone keep from surfaces what begins near a body, and go on until it is out of them: put out at once, it would tear
+  // at the cloth around it.
+  void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess,
+             const std::vector<Body>& at_start);
   // A step ended, with these nodes in contact.
   void keep(const std::vector<int>& mode);
 
@@ -76,7 +79,7 @@ class SmoothContact {
   TriangleTree tree_;
   PatchShape start_, end_;
   struct Track {
-    std::vector<int> triangle;  // (free nodes): -1: none is near
+    std::vector<int> triangle;  // (free nodes): -1: none is near; -2: left to pairs
     std::vector<double> side;
   };
   Track track_, kept_;
@@ -91,8 +94,7 @@ struct Norms {
 
 class ContactState {
  public:
-  // `law_stiffness`: k of the law over a node's own stiffness.
-  explicit ContactState(int free_nodes, const NodeSettings& settings = {}, double law_stiffness = 0.1);
+  explicit ContactState(int free_nodes, const ContactSettings& settings = {});
 
   std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<int> sheet;          // (free nodes): to which they belong
@@ -138,8 +140,7 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   Kept kept_;
-  NodeSettings settings_;
-  double turning_max_;
+  double penalty_, turning_max_;
 };
 
 }  // namespace sim_core

@@ -301,6 +301,23 @@ class TestCloth:
         assert cloth.positions[:, 2].min() > -1e-8
         assert (cloth.contacts == 0).any()
 
+    def test_what_leaves_a_floor_beside_a_surface_is_not_thrown_off(self) -> None:
+        """A sheet slides over a floor to a post of flat sides, 3 mm inside its round surface, and is then lifted."""
+        angle = np.pi / 6.0 * (np.arange(12) + 0.5)
+        ring = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        i, j = np.arange(12), (np.arange(12) + 1) % 12
+        sides = np.concatenate([np.stack([i, j, 12 + i], 1), np.stack([j, 12 + j, 12 + i], 1)])
+        cloth = over(Surface(sides, np.concatenate([ring - [0.0, 0.0, 0.05], ring + [0.0, 0.0, 0.2]]), 0.2), 1e-4)
+        cloth.set_state(cloth.positions + [0.135, 0.0, 0.0])
+        for gravity in ([-5.0, 0.0, -GRAVITY], [0.0, 0.0, GRAVITY]):
+            cloth.gravity, speed = np.tile(gravity, (len(SHEET.rest), 1)), np.zeros(0)
+            for _ in range(40):
+                cloth.step(0.01, bodies=[plane(0.1)])
+                speed = np.append(speed, np.linalg.norm(cloth.velocities, axis=1).max())
+            if gravity[2] < 0.0:
+                assert cloth.positions[:, 0].min() == pytest.approx(0.1 * np.cos(np.pi / 12.0), abs=2e-4)
+        assert speed == pytest.approx(0.01 * GRAVITY * np.arange(1, 41), rel=0.05)
+
     def test_what_pokes_through_between_vertices_is_felt(self) -> None:
         """A spike below the middle of a triangle, and the edge of a thin plate along a column of cells."""
         spike = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * [0.002, 0.002, -0.02] + [0.003, 0.004, 0.0]
