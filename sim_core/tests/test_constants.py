@@ -20,6 +20,7 @@ MOVED = {
     "let down": 1e-3,
     "ball": 0.01,
     "edges": 0.01,
+    "trough": 2e-3,
     "crumple": 0.04,
     "push": 0.04,
 }
@@ -49,6 +50,7 @@ CASES: dict[str, str] = {
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
+        "trough": "contact.fillet",
         "push": "stepping.near_patience stepping.strained_soon",
         "let down": "control.halvings",
     }.items()

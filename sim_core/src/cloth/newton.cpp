@@ -137,11 +137,8 @@ void Newton::predict(const StepProblem& problem, const Buffer<double>& ends, Buf
   if (contact.surfaces) contact.surfaces->begin(problem.start, ends, x, problem.at_start);
   for (int i = 0; i < free_nodes; ++i) {
     Vector3d p = at_node(x, i);
-    for (std::size_t b = 0; b < problem.at_end.size(); ++b) {
-      if (contact.by_pairs(b)) continue;
-      const Gap gap = gap_of(problem.at_end[b], p);
-      if (gap.distance < 0.0) p -= gap.distance * gap.normal;
-    }
+    const Gap gap = contact.bearing(problem.at_end, p).gap;
+    if (gap.distance < 0.0) p -= gap.distance * gap.normal;
     if (contact.surfaces) {
       const std::optional<SmoothTouch> touch = contact.surfaces->touch(i, p);
       if (touch && touch->gap < 0.0) p -= touch->gap * touch->normal;

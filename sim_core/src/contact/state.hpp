@@ -92,6 +92,13 @@ struct Norms {
   void count(double force_squared);
 };
 
+// What a node sees of the bodies: the nearest, or, in a corner, the fillet between it and another.
+struct Bearing {
+  Gap gap;
+  int body = -1, other = -1;  // -1: none
+  double share = 0.0;         // of the other in what bears
+};
+
 class ContactState {
  public:
   explicit ContactState(int free_nodes, const ContactSettings& settings = {});
@@ -109,6 +116,8 @@ class ContactState {
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method
   // may else go to and fro between the two ways of slipping, where the law has it that they stick.
   bool hold_reversed = false;
+
+  Bearing bearing(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
 
   // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from contact.
   Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
@@ -129,7 +138,7 @@ class ContactState {
   void penalty(int node, double own, float* out) const;
 
  private:
-  ContactKinematics kinematics(int node, int body, const Gap& gap, const Buffer<double>& x, const Buffer<double>& start,
+  ContactKinematics kinematics(int node, const Bearing& on, const Buffer<double>& x, const Buffer<double>& start,
                                const Buffer<double>& residual, const std::vector<Body>& at_start,
                                const std::vector<Body>& at_end) const;
   void write(int node, const ContactLinearization& row);
@@ -140,7 +149,7 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   Kept kept_;
-  double penalty_, turning_max_;
+  double penalty_, turning_max_, fillet_;
 };
 
 }  // namespace sim_core

@@ -136,6 +136,17 @@ class TestBodies:
         assert (cloth.contacts == 1).any()
 
     @pytest.mark.physics
+    @pytest.mark.parametrize("slope", [0.5, 1.0, 1.4])
+    def test_trough_carries(self, slope: float) -> None:
+        """Two planes: vertices in their corner bear on both, by a fillet of 1 mm."""
+        limp = Cloth(PATCH, isotropic(0.2, 200.0, 1e-8), CERTIFIED)
+        limp.set_state(np.column_stack([PATCH.rest, 0.004 + slope * np.abs(PATCH.rest[:, 0])]))
+        for _ in range(60):
+            limp.step(0.02, bodies=[plane(0.2, normal=(side * slope, 0.0, 1.0)) for side in (1.0, -1.0)], damping=5.0)
+        assert limp.total.unconverged == 0
+        assert limp.reactions[:, 2].sum() == pytest.approx(limp.masses.sum() * GRAVITY, rel=0.01)
+        assert 0.99e-3 * (np.hypot(1.0, slope) - 1.0) < limp.positions[:, 2].min() < 1.5e-3
+
     def test_box_carries(self) -> None:
         cloth = self.fall([plane(0.5), box(0.5, (0.06, 0.06, 0.1))])
         assert cloth.positions[:, 2].max() == pytest.approx(0.05, abs=2e-3)

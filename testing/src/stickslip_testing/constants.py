@@ -140,6 +140,16 @@ def edges(preset: SolverSettings) -> Cloth:
     return cloth
 
 
+def trough(preset: SolverSettings) -> Cloth:
+    """A sheet falls into a trough of two planes, in whose corner vertices bear on both."""
+    mesh = meshes.grid(0.08, 0.08, 8, 8)
+    cloth = Cloth(mesh, fabric(FABRIC), preset)
+    cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 0.045)]))
+    for _ in range(25):
+        cloth.step(STEP, bodies=[plane(0.2, normal=(x, 0.0, 1.0)) for x in (1.0, -1.0)])
+    return cloth
+
+
 def strip(preset: SolverSettings) -> Cloth:
     """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's choice."""
     mesh = meshes.grid(0.02, 0.12, 3, 16)
@@ -174,12 +184,13 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
         "ball": ball,
         "strip": strip,
         "edges": edges,
+        "trough": trough,
         "push": lambda preset: controlled(crumple(1, preset), 0.15),
         "let down": lambda preset: controlled(folding(9, preset), 1.0),
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
-within its plane, one on a ball, one that slides, one on edges; the crumple and the fold by steps of the controller's
+within its plane, one on a ball, one that slides, one on edges, one in a trough; the crumple and the fold by steps of the controller's
 choice."""
 
 
