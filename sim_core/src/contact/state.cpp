@@ -180,8 +180,8 @@ void ContactState::penalty(int node, double own, float* out) const {
 
 // With normals n_1, n_2, c = n_1 . n_2 and a_i what gap i lacks of the fillet's radius, the least way out to where both
 // gaps are that radius is l_1 n_1 + l_2 n_2 with l_1 = (a_1 - c a_2)/(1 - c^2), and l_2 alike; the fillet's gap is the
-// radius less its length. Corners of less than 66 degrees have a smaller fillet, and those
-// of less than 53 none: cloth comes out of such a cusp where the rounded edge of a box lies on a floor.
+// radius less its length. Corners of less than 66 degrees have a smaller fillet, and those of less than 53 none: cloth
+// comes out of such a cusp where the rounded edge of a box lies on a floor.
 Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p) const {
   Bearing on{{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()}};
   Gap next = on.gap;
