@@ -20,7 +20,7 @@ MOVED = {
     "let down": 1e-3,
     "ball": 0.01,
     "edges": 0.01,
-    "trough": 2e-3,
+    "valley": 2e-3,
     "crumple": 0.04,
     "push": 0.04,
 }
@@ -38,7 +38,8 @@ CASES: dict[str, str] = {
             contact.transfer_radius contact.length_tolerance contact.stall_ratio contact.stall_up_to contact.mean_share
             factor.hold_change factor.hold_least factor.missing_share factor.stiffening_change
             newton.halving_iterations newton.hops newton.linear_share newton.reversals_from newton.nearly
-            newton.rounds_max newton.cuts_max newton.window contact.penalty path.rest path.floor path.keep path.margin""",
+            newton.rounds_max newton.cuts_max newton.window contact.penalty path.rest path.floor path.keep
+            path.margin""",
         "squeeze": "contact.surface_share",
         "crumple": """contact.detection_range contact.penalty_max contact.smooth_proximal contact.stiff_mean_share
             smooth.body_first path.rounds_max
@@ -50,7 +51,7 @@ CASES: dict[str, str] = {
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
-        "trough": "contact.fillet",
+        "valley": "contact.fillet",
         "push": "stepping.near_patience stepping.strained_soon",
         "let down": "control.halvings",
     }.items()

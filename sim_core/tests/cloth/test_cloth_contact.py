@@ -137,7 +137,7 @@ class TestBodies:
 
     @pytest.mark.physics
     @pytest.mark.parametrize("slope", [0.5, 1.0, 1.4])
-    def test_trough_carries(self, slope: float) -> None:
+    def test_valley_carries(self, slope: float) -> None:
         """Two planes: vertices in their corner bear on both, by a fillet of 1 mm."""
         limp = Cloth(PATCH, isotropic(0.2, 200.0, 1e-8), CERTIFIED)
         limp.set_state(np.column_stack([PATCH.rest, 0.004 + slope * np.abs(PATCH.rest[:, 0])]))

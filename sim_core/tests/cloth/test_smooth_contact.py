@@ -307,8 +307,10 @@ class TestCloth:
         ring = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         i, j = np.arange(12), (np.arange(12) + 1) % 12
         sides = np.concatenate([np.stack([i, j, 12 + i], 1), np.stack([j, 12 + j, 12 + i], 1)])
-        cloth = over(Surface(sides, np.concatenate([ring - [0.0, 0.0, 0.05], ring + [0.0, 0.0, 0.2]]), 0.2), 1e-4)
-        cloth.set_state(cloth.positions + [0.135, 0.0, 0.0])
+        cloth = over(
+            Surface(sides, np.concatenate([np.add(ring, [0, 0, -0.05]), np.add(ring, [0, 0, 0.2])]), 0.2), 1e-4
+        )
+        cloth.set_state(np.add(cloth.positions, [0.135, 0.0, 0.0]))
         for gravity in ([-5.0, 0.0, -GRAVITY], [0.0, 0.0, GRAVITY]):
             cloth.gravity, speed = np.tile(gravity, (len(SHEET.rest), 1)), np.zeros(0)
             for _ in range(40):

@@ -140,8 +140,8 @@ def edges(preset: SolverSettings) -> Cloth:
     return cloth
 
 
-def trough(preset: SolverSettings) -> Cloth:
-    """A sheet falls into a trough of two planes, in whose corner vertices bear on both."""
+def valley(preset: SolverSettings) -> Cloth:
+    """A sheet falls into a valley of two planes, in whose corner vertices bear on both."""
     mesh = meshes.grid(0.08, 0.08, 8, 8)
     cloth = Cloth(mesh, fabric(FABRIC), preset)
     cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), 0.045)]))
@@ -184,14 +184,14 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
         "ball": ball,
         "strip": strip,
         "edges": edges,
-        "trough": trough,
+        "valley": valley,
         "push": lambda preset: controlled(crumple(1, preset), 0.15),
         "let down": lambda preset: controlled(folding(9, preset), 1.0),
     }
 )
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
-within its plane, one on a ball, one that slides, one on edges, one in a trough; the crumple and the fold by steps of the controller's
-choice."""
+within its plane, one on a ball, one that slides, one on edges, one in a valley; the crumple and the fold by steps of
+the controller's choice."""
 
 
 def main(out: Path) -> None:
