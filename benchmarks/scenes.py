@@ -1,13 +1,12 @@
 """How many samples of each built-in scene are valid, and what they cost.
 
-    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--coarser] [--defaults] [--keep DIR]
+    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--defaults] [--keep DIR]
                                 [--out FILE]
 
 Simulates each scene at the mesh and the preset of its file. All parameters vary together: numbers over their declared
 ranges as a Sobol sequence, fabrics over all that are built in. No more samples of a scene begin once it has cost
-`--seconds` of CPU. `--coarser` takes every second row and column of the meshes of files, and `--defaults` gives the
-first sample the default parameters. DIR gets the arrays of each sample. Writes a row for each scene as soon as it is
-done, and keeps the rows of other scenes that FILE has.
+`--seconds` of CPU. `--defaults` gives the first sample the default parameters. DIR gets the arrays of each sample.
+Writes a row for each scene as soon as it is done, and keeps the rows of other scenes that FILE has.
 """
 
 import argparse
@@ -25,14 +24,10 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from stickslip_schemas.base import referred, sha256
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.scene.files import counts_of, read_obj
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
-from stickslip_schemas.scene.parts import FileMesh
 from stickslip_schemas.spec.axes import SobolAxis, drawn_values
 from stickslip_schemas.spec.names import Material
-from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes import cloth_scene
 
@@ -40,30 +35,9 @@ OUT = Path(__file__).parent / "results/scenes.json"
 COMMAND = "python benchmarks/scenes.py"
 
 
-def coarser(data: bytes) -> bytes:
-    """Return every second row and column of a square mesh of an OBJ file, with diagonals that alternate."""
-    vertices, _, flat = read_obj(data)
-    assert flat is not None
-    side = round(len(vertices) ** 0.5)
-    kept = np.arange(side * side).reshape(side, side)[::2, ::2].ravel()
-    cells = side // 2
-    mesh = meshes.grid(1.0, 1.0, cells, cells)
-    lines = [f"v {x} {y} {z}" for x, y, z in vertices[kept].tolist()]
-    lines += [f"vt {u} {v}" for u, v in flat[kept].tolist()]
-    lines += ["f " + " ".join(f"{corner}/{corner}" for corner in face) for face in (mesh.triangles + 1).tolist()]
-    return "\n".join([*lines, ""]).encode()
-
-
-def spec(name: str, samples: int, files: dict[str, bytes], *, coarse: bool, defaults: bool) -> Any:
-    """Return the spec of a scene in which all parameters vary; `files` has the files that it names, by digest."""
+def spec(name: str, samples: int, *, defaults: bool) -> Any:
+    """Return the spec of a scene in which all parameters vary."""
     scene = load_scene(name)
-    values: dict[str, Any] = {}
-    for key, sheet in scene.sheets.items():
-        if coarse and isinstance(sheet.mesh, FileMesh):
-            data = coarser(files[str(referred(sheet.mesh.file))])
-            files[sha256(data)] = data
-            mesh = {"type": "file", "file": f"sha256:{sha256(data)}", "counts": list(counts_of(data) or ())}
-            values[f"sheets.{key}.mesh"] = mesh
     axes: dict[str, Any] = {}
     for dimension, (parameter, given) in enumerate(scene.parameters.items()):
         default = scene.default(parameter)
@@ -82,7 +56,6 @@ def spec(name: str, samples: int, files: dict[str, bytes], *, coarse: bool, defa
             "kind": "cloth_scene",
             "scene": name,
             "combine": "zip",
-            "set": values,
             "frames": 2,
             "allow_uncertified": True,
             "axes": axes | looks,
@@ -138,10 +111,10 @@ def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> di
     return {"code": outcome.code if outcome.reason else "", "reason": outcome.reason, "cpu": cpu, "layer": layer}
 
 
-def row(name: str, samples: int, seconds: float, *, coarse: bool, defaults: bool, keep: Path | None) -> dict[str, Any]:
+def row(name: str, samples: int, seconds: float, *, defaults: bool, keep: Path | None) -> dict[str, Any]:
     """Simulate samples of a scene, and return its row."""
     files, measured = dict(built_in_files()), commit()
-    made = spec(name, samples, files, coarse=coarse, defaults=defaults)
+    made = spec(name, samples, defaults=defaults)
     stage = made.stage
     found: list[dict[str, Any]] = []
     for point in made.grid():
@@ -185,13 +158,12 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", choices=[[], *scene_names()], metavar="SCENE", default=[])
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=4000.0)
-    parser.add_argument("--coarser", action="store_true")
     parser.add_argument("--defaults", action="store_true")
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
     for name in args.scenes or scene_names():
-        made = row(name, args.samples, args.seconds, coarse=args.coarser, defaults=args.defaults, keep=args.keep)
+        made = row(name, args.samples, args.seconds, defaults=args.defaults, keep=args.keep)
         old = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
         rows = sorted([*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"])
         said = {
