@@ -132,17 +132,26 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
 }
 
 // Of each node that touches a body, the work R . (change of gap n + slip): contact only takes energy from the motion
-// against a body. The gap's change stands for the normal part of the motion, for a round face turns on the way.
+// against a body. The gap's change stands for the normal part of the motion, for a round face turns on the way. On a
+// fillet, n = w_1 n_1 + w_2 n_2, it is w_1 times that of one gap and w_2 times that of the other.
 void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& out) const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const int b = newton.contact.touched[i];
     if (b < 0 || b >= static_cast<int>(step.at_end.size())) continue;
     const Vector3d from = at_node(step.start, i), to = at_node(step.x, i), force = at_node(newton.residual, i);
-    const Gap gap = gap_of(step.at_end[b], to);
-    Vector3d slip = to - carried(step.at_start[b], step.at_end[b], from);
-    slip -= slip.dot(gap.normal) * gap.normal;
-    const double change = gap.distance - gap_of(step.at_start[b], from).distance;
-    out.contact_work += std::max(0.0, force.dot(change * gap.normal + slip));
+    const Gap own = gap_of(step.at_end[b], to);
+    Bearing on = newton.contact.bearing(step.at_end, to);
+    if (on.body != b) on = {own, b};
+    const auto change = [&](int body, double now) { return now - gap_of(step.at_start[body], from).distance; };
+    double way = change(b, own.distance);
+    if (on.other >= 0) {
+      const Gap other = gap_of(step.at_end[on.other], to);
+      const double c = own.normal.dot(other.normal), one = on.gap.normal.dot(own.normal);
+      const double two = on.gap.normal.dot(other.normal);
+      way = ((one - c * two) * way + (two - c * one) * change(on.other, other.distance)) / (1.0 - c * c);
+    }
+    const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
+    out.contact_work += std::max(0.0, force.dot(way * on.gap.normal + slip));
   }
 }
 

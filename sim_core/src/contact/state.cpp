@@ -280,20 +280,25 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
   return true;
 }
 
+Vector3d ContactState::slip(const Bearing& on, const Vector3d& before, const Vector3d& p,
+                            const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
+  Vector3d u = p - carried(at_start[on.body], at_end[on.body], before);
+  if (on.other >= 0) u += on.share * (p - carried(at_start[on.other], at_end[on.other], before) - u);
+  return u - u.dot(on.gap.normal) * on.gap.normal;
+}
+
 ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Buffer<double>& x,
                                            const Buffer<double>& start, const Buffer<double>& residual,
                                            const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
-  const Vector3d before = at_node(start, node), p = at_node(x, node);
-  const bool is_body = on.body < static_cast<int>(at_end.size());
-  Vector3d u =
-      is_body ? Vector3d(p - carried(at_start[on.body], at_end[on.body], before)) : surfaces->slip(node, before, p);
-  double mu_here = is_body ? at_end[on.body].mu_of(sheet[node]) : surfaces->mu(node);
-  if (on.other >= 0) {
-    u += on.share * (p - carried(at_start[on.other], at_end[on.other], before) - u);
-    mu_here += on.share * (at_end[on.other].mu_of(sheet[node]) - mu_here);
+  const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
+  const Vector3d force = at_node(residual, node);
+  if (on.body >= static_cast<int>(at_end.size())) {
+    const Vector3d u = surfaces->slip(node, before, p);
+    return {on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
   }
-  u -= u.dot(on.gap.normal) * on.gap.normal;
-  return {on.gap.distance, on.gap.normal, u, at_node(residual, node), mu_here, stiffness[node]};
+  double mu_here = at_end[on.body].mu_of(sheet[node]);
+  if (on.other >= 0) mu_here += on.share * (at_end[on.other].mu_of(sheet[node]) - mu_here);
+  return {on.gap.distance, n, slip(on, before, p, at_start, at_end), force, mu_here, stiffness[node]};
 }
 
 void ContactState::write(int node, const ContactLinearization& row) {

@@ -118,6 +118,9 @@ class ContactState {
   bool hold_reversed = false;
 
   Bearing bearing(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
+  // Way over the bodies of a node that was at `before` when the step began, in the plane of contact, m.
+  static Eigen::Vector3d slip(const Bearing& on, const Eigen::Vector3d& before, const Eigen::Vector3d& p,
+                              const std::vector<Body>& at_start, const std::vector<Body>& at_end);
 
   // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from contact.
   Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,

@@ -147,6 +147,21 @@ class TestBodies:
         assert limp.reactions[:, 2].sum() == pytest.approx(limp.masses.sum() * GRAVITY, rel=0.01)
         assert 0.99e-3 * (np.hypot(1.0, slope) - 1.0) < limp.positions[:, 2].min() < 1.5e-3
 
+    def test_wall_pushes_over_a_floor(self) -> None:
+        """In the corner both bear: the wall's work is its own, and no gain of contact; the floor rubs with mu."""
+        cloth = laid()
+        gravity = np.tile([0.0, 0.0, -GRAVITY], (len(PATCH.rest), 1))
+
+        def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
+            wall = plane(0.0, normal=(1.0, 0.0, 0.0), origin=(-0.051 + 0.05 * time, 0.0, 0.0))
+            return gravity, np.empty((0, 3)), [plane(0.3), wall]
+
+        cloth.advance(0.6, motion)
+        assert cloth.positions[:, 0].min() > -0.051 + 0.05 * 0.6 - 1e-6
+        assert (cloth.positions[:, 0].max() + 0.021) == pytest.approx(0.1, abs=5e-3)
+        assert cloth.total.unconverged == 0
+        assert cloth.total.seen.contact_work < 1e-6 * cloth.total.seen.flow
+
     def test_box_carries(self) -> None:
         cloth = self.fall([plane(0.5), box(0.5, (0.06, 0.06, 0.1))])
         assert cloth.positions[:, 2].max() == pytest.approx(0.05, abs=2e-3)
