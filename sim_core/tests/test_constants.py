@@ -62,8 +62,8 @@ CASES: dict[str, str] = {
 DEARER = {("stepping.strained_soon", 0.5): 20.0}
 """Factors of the cost beyond COST."""
 
-OTHERWISE = {("newton.cuts_max", 0.5), ("contact.penalty", 2.0)}
-"""Changes with which the fold falls another way."""
+OTHERWISE = {("newton.cuts_max", 0.5), ("contact.penalty", 2.0), ("control.grow_at", 2.0)}
+"""Changes with which the fold falls, or the strip buckles, another way."""
 
 
 def test_every_constant_has_a_case() -> None:
@@ -119,7 +119,7 @@ def test_halved_and_doubled(name: str, factor: float) -> None:
     assert scene in SCENES
     found = change(scene, name, factor)
     assert found.unconverged == default(scene).unconverged == 0
-    assert found.moved < (0.2 if (name, factor) in OTHERWISE else MOVED[scene])
+    assert found.moved < (0.25 if (name, factor) in OTHERWISE else MOVED[scene])
     limit = DEARER.get((name, factor), COST)
     assert max(found.newton, found.krylov) < limit
     # Half the share that pairs with surfaces keep is half the distance; nodes that miss a surface are left to these.
