@@ -22,7 +22,7 @@ std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, co
 }
 
 // In place of a triangle: the node is left to pairs.
-constexpr int by_pairs = -2;
+constexpr int left_to_pairs = -2;
 
 bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double distance_max) {
   return std::any_of(bodies.begin(), bodies.end(),
@@ -84,8 +84,8 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   track_ = kept_;
   for (int i = 0; i < free_nodes_; ++i) {
     const Vector3d p = at_node(start, i);
-    const bool came = track_.triangle[i] == by_pairs, near = began_near(at_start, p, settings_.body_first);
-    if (near) track_.triangle[i] = by_pairs;
+    const bool came = track_.triangle[i] == left_to_pairs, near = began_near(at_start, p, settings_.body_first);
+    if (near) track_.triangle[i] = left_to_pairs;
     if (near || track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const double kept = thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
     const double reach = kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
@@ -94,7 +94,7 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
     track_.triangle[i] = found.triangle;
     if (found.triangle < 0) continue;
     track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
-    if (came && !forced(i, p, 0.0).isZero()) track_.triangle[i] = by_pairs;
+    if (came && !forced(i, p, 0.0).isZero()) track_.triangle[i] = left_to_pairs;
   }
 }
 
