@@ -107,8 +107,8 @@ class TestLanguage:
 
     def test_frames_within_a_step_do_not_cross_where_its_ends_do_not(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A cloth is thrown on a peg; a cubic between the ends of a step reaches through a fold that it hits."""
-        document = load_scene("peg").model_dump(mode="json") | {"duration": 0.8, "frame_rate": 500}
-        document["sheets"]["cloth"]["mesh"]["cells"] = [10, 10]
+        document = load_scene("peg").model_dump(mode="json") | {"duration": 0.6, "frame_rate": 500}
+        document["sheets"]["cloth"]["mesh"]["cells"] = [8, 8]
         made = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
         run = made.run()
         assert run.valid, run.reason

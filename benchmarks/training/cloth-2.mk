@@ -2,8 +2,9 @@
 #
 #     make -f benchmarks/training/cloth-2.mk -j2 [OUT=cloth-2] [MODEL=friction.safetensors]
 #
-# 60 simulations of ten fabrics, and 600 clips over five floors, a fifth of them in the light of a room. Never train on
-# these seeds. OUT keeps all of it; a call goes on where another stopped, after `rm OUT/runs/*.claim`. About an hour of CPU.
+# It has 60 simulations of ten fabrics and 600 clips over five floors, a fifth of them in the light of a room. It takes
+# about an hour of CPU. Never train on these seeds. OUT keeps everything, so a second call goes on where the first
+# stopped. Before that, remove each .claim file in OUT/runs that has no .npz file of the same name.
 PY ?= .venv/bin/python
 BLENDER_PY ?= .venv-blender/bin/python
 OUT ?= cloth-2
@@ -11,25 +12,21 @@ MODEL ?= training/src/stickslip_training/cloth/friction.safetensors
 HERE := benchmarks/training
 RUNS := $(PY) $(HERE)/cloth_runs.py $(OUT)/runs --runs 6 --seed 12101 --vertices 41 --preset certified \
   --self-friction 0.5 --density 0.9 1.1 --bending 0.9 1.1 --frames 221
-FLOORS := matt patterned bright oak room
-SHADE = $(BLENDER_PY) $(HERE)/blender_clips.py $< $@ --textures 2 --clips 60 --segmentation
+matt := --seed 12111
+patterned := --seed 12112 --albedo 0.3 0.7 --grain 0.4
+bright := --seed 12113 --albedo 0.5 0.85 --grain 0.1
+oak := --seed 12114 --substrate light-oak
+room := --seed 12115 --substrate white-table --lighting room
+CLIPS := $(patsubst %,$(OUT)/%.npz,matt patterned bright oak room)
 export OMP_NUM_THREADS := 1
 .DELETE_ON_ERROR:
 
-$(OUT)/scores.json: $(MODEL) $(OUT)/runs.npz $(FLOORS:%=$(OUT)/%.npz)
+$(OUT)/scores.json: $(MODEL) $(OUT)/runs.npz $(CLIPS)
 	$(PY) $(HERE)/world_set.py $^ --record $@
 $(OUT)/runs.npz: $(OUT)/first $(OUT)/second
 	$(PY) $(HERE)/cloth_runs.py $(OUT)/runs --pack $@
 $(OUT)/first $(OUT)/second: # two processes share a folder
-	mkdir -p $(OUT)/runs
+	mkdir -p $(OUT)
 	$(RUNS) > $@.log && mv $@.log $@
-$(OUT)/matt.npz: $(OUT)/runs.npz
-	$(SHADE) --seed 12111
-$(OUT)/patterned.npz: $(OUT)/runs.npz
-	$(SHADE) --seed 12112 --albedo 0.3 0.7 --grain 0.4
-$(OUT)/bright.npz: $(OUT)/runs.npz
-	$(SHADE) --seed 12113 --albedo 0.5 0.85 --grain 0.1
-$(OUT)/oak.npz: $(OUT)/runs.npz
-	$(SHADE) --seed 12114 --substrate light-oak
-$(OUT)/room.npz: $(OUT)/runs.npz
-	$(SHADE) --seed 12115 --substrate white-table --lighting room
+$(CLIPS): $(OUT)/%.npz: $(OUT)/runs.npz
+	$(BLENDER_PY) $(HERE)/blender_clips.py $< $@ --textures 2 --clips 60 --segmentation $($*)
