@@ -2,7 +2,7 @@
 
     .venv/bin/python tools/dataset_sheet.py DATASET OUT.webp --rows material --columns mu [--only texture=floral ...]
 
-It made docs/figures/cloth-friction.webp and cloth-textures.webp from what `examples/thesis_cloth_clips.py` makes.
+docs/figures/cloth-friction.webp and cloth-textures.webp are such sheets; `examples/thesis_cloth_clips.py` makes data.
 --only takes several values of a label, as in mu=0.1,0.5.
 """
 
