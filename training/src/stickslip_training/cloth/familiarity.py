@@ -4,7 +4,7 @@ The network sees a silhouette in every frame, pooled to 4 x 4 pixels. The six of
 distance of x from the nearest clip of dragged cloth that was trained on, and b that from the nearest clip that holds no
 answer (cloth that hangs free, is glued down, is of another size, or moves out of phase), the oddness of x is
 
-    s = d^2 / b
+    s = d^3 / b
 
 and its familiarity is the share of good validation clips that are at least as odd. A clip of a familiarity below
 `ALARMS` has no answer. Distances are along the principal components of the known silhouettes [Pearson 1901].
@@ -133,7 +133,7 @@ class Familiarity:
         seen = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
         far = cdist(seen, self.known)
         good, bad = (far[:, chosen].min(axis=1) for chosen in (self.sort == 0, self.sort > 0))
-        return good**2 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]
+        return good**3 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]
 
     def judge(self, silhouettes: SingleFloats) -> tuple[Floats, list[str | None]]:
         """Return the familiarity of silhouettes (clips, F, 18, 22), and why a clip has no answer, or None."""

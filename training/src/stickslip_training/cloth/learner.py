@@ -271,7 +271,8 @@ class FrictionLearner(Learner):
         log_p = log_histograms(net, features(net, good))
         of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
         of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
-        known = Familiarity.of(train, settings.instants, settings.seed + 1, silhouettes(net, good), settings.device)
+        seen = silhouettes(net, Clips.joined([clips, varied]))
+        known = Familiarity.of(train, settings.instants, settings.seed + 1, seen, settings.device)
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),
