@@ -1,5 +1,4 @@
 import json
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
-from stickslip_training.cloth.model import WEIGHTS, load_friction, mean_model, save_friction
+from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
 from stickslip_training.cloth.posterior import MU_BINS
 
 SMALL = ClothTraining(steps=6, epoch=6, batch_size=2, width=48)
@@ -269,15 +268,3 @@ def test_clips_of_files_are_parted_by_simulation_and_those_of_others_are_refused
     with pytest.raises(ValueError, match="clips must show simulations to train on or to validate: 2 of 2 do not"):
         training_clips([str(tmp_path / "c.npz")], train, validation)
     assert len(Clips.joined([alone, alone[np.array([1])]])) == 3
-
-
-@pytest.mark.physics
-def test_several_starts_give_their_mean(first):
-    other = replace(first, net=deepcopy(first.net))
-    with torch.no_grad():
-        for parameter in other.net.parameters():
-            parameter += 1.0
-    for name, tensor in weights(mean_model([first, other])).items():
-        torch.testing.assert_close(tensor, weights(first)[name] + 0.5)
-    with pytest.raises(ValueError, match="the models to start from must know the same materials"):
-        mean_model([first, replace(first, materials=first.materials[:1])])

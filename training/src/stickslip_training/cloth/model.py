@@ -1,8 +1,8 @@
 """The network that measures friction, trained and calibrated, and its file."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -152,16 +152,6 @@ def log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats,
     with torch.inference_mode():
         material, mu = net.read(torch.from_numpy(seen).to(next(net.parameters()).device))
     return material.cpu().numpy(), mu.cpu().numpy()
-
-
-def mean_model(models: Sequence[FrictionModel]) -> FrictionModel:
-    """Return the first model with the mean weights of all [Wortsman et al. 2022]; they must know the same materials."""
-    first, states = models[0], [model.net.state_dict() for model in models]
-    if any((each.materials, each.net.sizes) != (first.materials, first.net.sizes) for each in models):
-        raise ValueError("the models to start from must know the same materials, and be of the same sizes")
-    net = PosteriorNet(**first.net.sizes)
-    net.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
-    return replace(first, net=net.eval())
 
 
 def save_friction(path: Path, model: FrictionModel) -> None:
