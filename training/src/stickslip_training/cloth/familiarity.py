@@ -6,8 +6,9 @@ answer (cloth that hangs free, is glued down, is of another size, or moves out o
 
     s = d^3 / b
 
-and its familiarity is the share of good validation clips that are at least as odd. A clip of a familiarity below
-`ALARMS` has no answer. Distances are along the principal components of the known silhouettes [Pearson 1901].
+and its familiarity is the share of good validation clips, as they are and with other exposures and places, that are at
+least as odd. A clip of a familiarity below `ALARMS` has no answer. Distances are along the principal components of the
+known silhouettes [Pearson 1901].
 """
 
 from collections.abc import Callable
