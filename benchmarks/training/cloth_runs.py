@@ -8,7 +8,7 @@ Each run is a file of RUNS, and a call goes on where another stopped; two may sh
 [0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. With a range of factors the
 numbers of each run's fabric are multiplied by a factor of its own, spread evenly over the logarithm: further dimensions
 of the same sequence. `--pack` writes all runs of the folder into one file, as `stickslip_training.cloth.runs` reads it:
-positions in whole steps of 10 um.
+positions in whole steps of 10 um. Runs of finer meshes are packed at the vertices of the coarsest, by cubic splines.
 """
 
 import argparse
@@ -17,17 +17,19 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 for _library in ("OMP", "OPENBLAS", "MKL"):  # threads that wait for one another count as CPU time
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
+from scipy.interpolate import make_interp_spline  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 from stickslip_schemas.spec.arrays import shown_frames  # noqa: E402
 from stickslip_sim_core import build_info, fabric_names  # noqa: E402
 from stickslip_sim_core import fabric as fabric_named  # noqa: E402
 from stickslip_sim_core.scenes import cloth_drag  # noqa: E402
-from stickslip_training.cloth.runs import STEP  # noqa: E402
+from stickslip_training.cloth.runs import STEP, grid_order  # noqa: E402
 
 SHOWN = 30  # frames of a clip
 FRAMES = 300  # of a simulation
@@ -106,6 +108,19 @@ def simulate(
     }
 
 
+def at_vertices(run: dict[str, Any], rest: Any) -> Any:
+    """Return the positions of a run at the vertices of a mesh that is as fine or coarser, (frames, V, 3)."""
+    if np.array_equal(run["rest"], rest):
+        return run["positions"]
+    order = grid_order(rest)
+    grid, places = run["positions"][:, grid_order(run["rest"])], np.linspace(0, 1, len(order))
+    for axis in (1, 2):
+        grid = make_interp_spline(np.linspace(0, 1, grid.shape[axis]), grid, axis=axis)(places)
+    at = np.empty((len(grid), len(rest), 3), np.int16)
+    at[:, order] = np.round(grid)
+    return at
+
+
 def pack(folder: Path, file: Path) -> None:
     """Write the valid runs of a folder into one file."""
     runs = []
@@ -113,9 +128,11 @@ def pack(folder: Path, file: Path) -> None:
         with np.load(path) as run:
             if json.loads(str(run["about"]))["valid"]:
                 runs.append({name: run[name] for name in run.files})
-    first = runs[0]
-    if any(not np.array_equal(run[name], first[name]) for run in runs for name in ("triangles", "instants")):
-        raise ValueError(f"the runs in {folder} must have one mesh and as many frames: pack a folder for each")
+    first = min(runs, key=lambda run: len(run["rest"]))
+    if any(not np.array_equal(run["instants"], first["instants"]) for run in runs):
+        raise ValueError(f"the runs in {folder} must have as many frames: pack a folder for each")
+    for run in runs:
+        run["positions"] = at_vertices(run, first["rest"])
     # Positions are whole steps of `STEP`. Differences of consecutive instants, low and high bytes apart, pack best.
     differences = np.diff(np.stack([run["positions"] for run in runs]), axis=1, prepend=np.int16(0))
     bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)

@@ -91,6 +91,15 @@ def test_the_weights_of_the_package_load_and_say_what_they_are():
     assert set(model.card) >= {"settings", "runs", "made_from", "certificate", "tested", "limits"}
 
 
+def test_a_clip_and_its_mirror_image_have_the_same_answer(few):
+    model, clips = load_friction(), render_clips(few[2], 1, 0)
+    direction = clips.direction * torch.tensor([1.0, -1.0, 1.0])
+    mirrored = model.estimate(replace(clips, crops=clips.crops.flip(3), direction=direction))
+    np.testing.assert_allclose(mirrored.joint, model.estimate(clips).joint, atol=1e-6)
+    turned = model.estimate(replace(clips, direction=direction))
+    assert np.abs(turned.joint - mirrored.joint).max() > 1e-3
+
+
 def test_what_is_no_model_is_refused(tmp_path):
     (tmp_path / "none.safetensors").write_bytes(b"no")
     with pytest.raises(ValueError, match="must be a model of `stickslip-train cloth train`"):

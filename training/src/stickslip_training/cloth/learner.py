@@ -27,7 +27,7 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.crop import Cameras, holder_crops
 from stickslip_training.cloth.familiarity import Familiarity, pooled
-from stickslip_training.cloth.model import FrictionModel, PosteriorNet, features, log_histograms, silhouettes
+from stickslip_training.cloth.model import MIRRORED, FrictionModel, PosteriorNet, log_histograms, silhouettes
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between
@@ -209,7 +209,7 @@ class FrictionLearner(Learner):
         parts = zip(*([part[at % count] for part in drawn[at // count]] for at in places), strict=True)
         crops, direction, material, mu, silhouettes = map(torch.stack, parts)
         turned = torch.from_numpy(random.random(count) < 0.5)[:, None].to(self.settings.device)
-        direction = torch.where(turned, direction * direction.new_tensor([1.0, -1.0, 1.0]), direction)
+        direction = torch.where(turned, direction * direction.new_tensor(MIRRORED), direction)
         crops, silhouettes = (torch.where(turned[:, None, None], part.flip(3), part) for part in (crops, silhouettes))
         return crops, direction, material, mu, silhouettes
 
@@ -252,8 +252,7 @@ class FrictionLearner(Learner):
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        clips, seen = self.validation, features(net, self.validation)
-        log_p = log_histograms(net, seen)
+        clips, log_p = self.validation, log_histograms(net, self.validation)
         # Overconfidence does not count: temperatures correct it in the end.
         temperature = likeliest_temperatures(*log_p, clips.material, clips.mu, MU_BINS)
         posterior = Posterior.of(*log_p, self.train.materials, MU_BINS, temperature)
@@ -268,7 +267,7 @@ class FrictionLearner(Learner):
         generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
         varied = replace(clips, crops=jittered(clips.crops, generator))
         good = Clips.joined([varied, self.render(self.judged, 6, settings.seed + 2)])
-        log_p = log_histograms(net, features(net, good))
+        log_p = log_histograms(net, good)
         of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
         of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
         seen = silhouettes(net, Clips.joined([clips, varied]))

@@ -1,6 +1,7 @@
 """The network that measures friction, trained and calibrated, and its file."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
@@ -23,6 +24,8 @@ from stickslip_training.cloth.posterior import Bins, Posterior
 WEIGHTS = Path(__file__).with_name("friction.safetensors")
 """A trained model that comes with the package; its card names its training data and its errors."""
 
+MIRRORED = (1.0, -1.0, 1.0)
+"""Of a direction of view, where a picture is mirrored."""
 
 _SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames have its size there
 
@@ -118,17 +121,30 @@ class FrictionModel:
     """Training runs, settings, measured errors and limits."""
 
     def estimate(self, clips: Clips) -> Posterior:
-        seen = features(self.net, clips)
-        return Posterior.of(*log_histograms(self.net, seen), self.materials, self.bins, self.temperature)
+        return Posterior.of(*log_histograms(self.net, clips), self.materials, self.bins, self.temperature)
 
     def judge(self, clips: Clips) -> tuple[Floats, list[str | None]]:
         """Return the familiarity of every clip, (clips,), and why it has no answer, or None: see `familiarity`."""
         return self.familiarity.judge(silhouettes(self.net, clips))
 
 
-def features(net: PosteriorNet, clips: Clips) -> SingleFloats:
-    """Return the last features of clips, (clips, n)."""
-    return _in_chunks(net, clips, net.features)
+def log_histograms(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, SingleFloats]:
+    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K), of clips.
+
+    The scene is symmetric, so the mirror image x' of a clip x is a second reading of it:
+
+        p(m, mu) = (p(m, mu | x) + p(m, mu | x')) / 2
+    """
+
+    def joint(crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        readings = [(crops, direction), (crops.flip(3), direction * direction.new_tensor(MIRRORED))]
+        pairs = [net.read(net.features(*reading)) for reading in readings]
+        both = torch.stack([material[:, :, None] + mu for material, mu in pairs])
+        return both.logsumexp(dim=0) - math.log(len(readings))
+
+    log_p = torch.from_numpy(_in_chunks(net, clips, joint))
+    material = log_p.logsumexp(dim=2)
+    return material.numpy(), (log_p - material[:, :, None]).numpy()
 
 
 def silhouettes(net: PosteriorNet, clips: Clips) -> SingleFloats:
@@ -145,13 +161,6 @@ def _in_chunks(
         chunks = [slice(first, first + CHUNK) for first in range(0, len(clips), CHUNK)]
         parts = [of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu() for some in chunks]
     return np.asarray(torch.cat(parts).numpy())
-
-
-def log_histograms(net: PosteriorNet, seen: SingleFloats) -> tuple[SingleFloats, SingleFloats]:
-    """Return log p(m), (clips, M), and log p(mu | m), (clips, M, K), of features (clips, n)."""
-    with torch.inference_mode():
-        material, mu = net.read(torch.from_numpy(seen).to(next(net.parameters()).device))
-    return material.cpu().numpy(), mu.cpu().numpy()
 
 
 def save_friction(path: Path, model: FrictionModel) -> None:
