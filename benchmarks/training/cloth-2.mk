@@ -2,7 +2,7 @@
 #
 #     make -f benchmarks/training/cloth-2.mk -j2 [OUT=cloth-2] [MODEL=friction.safetensors] [SET=131]
 #
-# SET 131 is cloth-2. SET 121 was cloth-2 until 27 November 2026; it now validates the weights that the package holds.
+# SET 131 is cloth-2. SET 121 was cloth-2 until 27 November 2026; it has validated the weights of the package since.
 # It has 60 simulations of ten fabrics and 600 clips over five floors, a fifth of them in the light of a room. It takes
 # about an hour of CPU. Never train on these seeds. OUT keeps everything, so a second call goes on where the first
 # stopped. Before that, remove each .claim file in OUT/runs that has no .npz file of the same name.

@@ -1,4 +1,5 @@
 import json
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.familiarity import Familiarity
 from stickslip_training.cloth.learner import ClothTraining, FrictionLearner, train_friction
-from stickslip_training.cloth.model import WEIGHTS, load_friction, save_friction
+from stickslip_training.cloth.model import WEIGHTS, load_friction, mean_model, save_friction
 from stickslip_training.cloth.posterior import MU_BINS
 
 SMALL = ClothTraining(steps=6, epoch=6, batch_size=2, width=48)
@@ -183,13 +184,13 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, first
 
 
 @pytest.mark.physics
-def test_a_quarter_of_each_batch_is_of_the_clips(few):
+def test_half_of_each_batch_is_of_the_clips(few):
     clips = some_clips(few)
     known = replace(clips.train, mu=np.full(18, 9.0))
     learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16), RenderedClips(known, clips.validation))
     crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 16
-    assert (mu == 9.0).tolist() == [False] * 12 + [True] * 4
+    assert (mu == 9.0).tolist() == [False] * 8 + [True] * 8
 
 
 @pytest.mark.physics
@@ -277,3 +278,15 @@ def test_clips_of_files_are_parted_by_simulation_and_those_of_others_are_refused
     with pytest.raises(ValueError, match="clips must show simulations to train on or to validate: 2 of 2 do not"):
         training_clips([str(tmp_path / "c.npz")], train, validation)
     assert len(Clips.joined([alone, alone[np.array([1])]])) == 3
+
+
+@pytest.mark.physics
+def test_several_starts_give_their_mean(first):
+    other = replace(first, net=deepcopy(first.net))
+    with torch.no_grad():
+        for parameter in other.net.parameters():
+            parameter += 1.0
+    for name, tensor in weights(mean_model([first, other])).items():
+        torch.testing.assert_close(tensor, weights(first)[name] + 0.5)
+    with pytest.raises(ValueError, match="the models to start from must know the same materials"):
+        mean_model([first, replace(first, materials=first.materials[:1])])

@@ -1,7 +1,6 @@
 """The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -39,7 +38,9 @@ def train(
         list[str] | None,
         typer.Option(help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"),
     ] = None,
-    start: Annotated[Path | None, typer.Option(help="a friction.safetensors whose weights are the first")] = None,
+    start: Annotated[
+        list[Path] | None, typer.Option(help="a friction.safetensors whose weights are the first; of several, the mean")
+    ] = None,
     rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
 ) -> None:
@@ -48,7 +49,7 @@ def train(
 
     from stickslip_training.cloth.clips import training_clips, training_runs
     from stickslip_training.cloth.learner import ClothTraining, train_friction
-    from stickslip_training.cloth.model import load_friction, save_friction
+    from stickslip_training.cloth.model import load_friction, mean_model, save_friction
     from stickslip_training.engine.fit import write_report
 
     console = Console()
@@ -56,12 +57,11 @@ def train(
         settings = ClothTraining(
             steps=steps, batch_size=batch, width=width, learning_rate=rate, seed=seed, threads=threads, device=device
         )
-        first = None if start is None else load_friction(start)
+        first = mean_model([load_friction(path) for path in start]) if start else None
         if first is not None:
-            # The network knows the order of mu: its targets are as narrow as at the end.
-            settings = replace(settings, smoothing=(settings.smoothing[1],) * 2)
+            settings = settings.going_on()
         source, learned, judged = training_runs(runs, validation)
-        source["start"] = None if start is None else sha256(start.read_bytes())
+        source["start"] = [sha256(path.read_bytes()) for path in start or []]
         source["clips"], rendered = training_clips(clips, learned, judged) if clips else (None, None)
         model = train_friction(
             learned,

@@ -1,8 +1,8 @@
 """Whether a clip has an answer: how close its silhouettes come to those of training.
 
 The network sees a silhouette in every frame, pooled to 4 x 4 pixels. The six of a clip are one point, x. With d the
-distance of x from the nearest clip of dragged cloth that was trained on, and b that from the nearest clip that holds no
-answer (cloth that hangs free, is glued down, is of another size, or moves out of phase), the oddness of x is
+mean distance of x from the `NEAREST` clips of dragged cloth that were trained on, and b that from the `NEAREST` clips
+without an answer (cloth that hangs free, is glued down, is of another size, or moves out of phase), the oddness of x is
 
     s = d^3 / b
 
@@ -25,6 +25,9 @@ from stickslip_training.cloth.runs import Runs
 
 ALARMS = 0.05
 """Share of good validation clips without an answer."""
+
+NEAREST = 4
+"""Clips whose distances are averaged: single ones are known by chance."""
 
 COMPONENTS = 64
 """Principal components of six silhouettes that are kept: 0.99 of the variance."""
@@ -107,7 +110,7 @@ class Familiarity:
     """(clips, COMPONENTS)"""
     sort: Integers
     """(clips,): 0 for dragged cloth, or the place in `WITHOUT_ANSWER` from 1 on."""
-    oddness: Floats
+    good_oddness: Floats
     """(validation clips,): ascending."""
 
     @staticmethod
@@ -127,18 +130,19 @@ class Familiarity:
         sort = np.repeat(np.arange(len(sorts)), [len(each) for each in shown])
         known = ((pixels - mean) @ components.T).astype(np.float16)
         found = Familiarity(mean, components.astype(np.float16), known, sort, np.zeros(1))
-        return replace(found, oddness=np.sort(found.measure(good)[0]))
+        return replace(found, good_oddness=np.sort(found.measure(good)[0]))
 
     def measure(self, silhouettes: SingleFloats) -> tuple[Floats, Integers]:
         """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest known clip."""
         seen = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
         far = cdist(seen, self.known)
-        good, bad = (far[:, chosen].min(axis=1) for chosen in (self.sort == 0, self.sort > 0))
+        parts = (far[:, chosen] for chosen in (self.sort == 0, self.sort > 0))
+        good, bad = (np.partition(part, NEAREST - 1)[:, :NEAREST].mean(axis=1) for part in parts)
         return good**3 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]
 
     def judge(self, silhouettes: SingleFloats) -> tuple[Floats, list[str | None]]:
         """Return the familiarity of silhouettes (clips, F, 18, 22), and why a clip has no answer, or None."""
         odd, sort = self.measure(silhouettes)
-        share = 1.0 - np.searchsorted(self.oddness, odd) / len(self.oddness)
+        share = 1.0 - np.searchsorted(self.good_oddness, odd) / len(self.good_oddness)
         reasons = [WITHOUT_ANSWER[place - 1][0] if place else UNKNOWN for place in sort.tolist()]
         return share, [reason if low else None for reason, low in zip(reasons, share < ALARMS, strict=True)]

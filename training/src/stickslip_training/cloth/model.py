@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -139,8 +139,7 @@ def log_histograms(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, Singl
     def joint(crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
         readings = [(crops, direction), (crops.flip(3), direction * direction.new_tensor(MIRRORED))]
         pairs = [net.read(net.features(*reading)) for reading in readings]
-        both = torch.stack([material[:, :, None] + mu for material, mu in pairs])
-        return both.logsumexp(dim=0) - math.log(len(readings))
+        return torch.stack([material[:, :, None] + mu for material, mu in pairs]).logsumexp(dim=0) - math.log(2)
 
     log_p = torch.from_numpy(_in_chunks(net, clips, joint))
     material = log_p.logsumexp(dim=2)
@@ -161,6 +160,16 @@ def _in_chunks(
         chunks = [slice(first, first + CHUNK) for first in range(0, len(clips), CHUNK)]
         parts = [of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu() for some in chunks]
     return np.asarray(torch.cat(parts).numpy())
+
+
+def mean_model(models: Sequence[FrictionModel]) -> FrictionModel:
+    """Return the first model with the mean weights of all [Wortsman et al. 2022]; they must know the same materials."""
+    first, states = models[0], [model.net.state_dict() for model in models]
+    if len({(each.materials, str(each.net.sizes)) for each in models}) > 1:
+        raise ValueError("the models to start from must know the same materials, and be of the same sizes")
+    net = PosteriorNet(**first.net.sizes)
+    net.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
+    return replace(first, net=net.eval())
 
 
 def save_friction(path: Path, model: FrictionModel) -> None:
