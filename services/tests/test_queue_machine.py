@@ -71,6 +71,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.planner = Planner(self.context)
         self.workers: dict[str, PretendWorker] = {}
         self.holders: dict[str, tuple[str, int, float]] = {}  # task -> worker id, token, expiry
+        self.seen: dict[str, float] = {}  # worker id -> when it beat or reported last
         self.tokens: dict[str, int] = {}
         self.settled: set[str] = set()
         self.manifests: dict[tuple[str, int], str] = {}
@@ -104,6 +105,7 @@ class QueueMachine(RuleBasedStateMachine):
         if old is not None:
             self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
         self.workers[name] = worker
+        self.seen[worker.id] = self.clock()
 
     @rule(target=leases, name=st.sampled_from(("a", "b")), count=st.integers(1, 3), pause=st.sampled_from((0.0, 31.0)))
     def lease(self, name: str, count: int, pause: float) -> Any:
@@ -111,8 +113,8 @@ class QueueMachine(RuleBasedStateMachine):
         worker = self.workers.get(name)
         if worker is None:
             return multiple()
-        granted = worker.lease(simulate=count, render=count, pack=count, publish=count)
         self._forget_expired()
+        granted = worker.lease(simulate=count, render=count, pack=count, publish=count)
         for lease in granted:
             assert lease.task_id not in self.holders, "leased twice"
             assert lease.task_id not in self.settled, "leased although it has a result"
@@ -126,6 +128,13 @@ class QueueMachine(RuleBasedStateMachine):
     def heartbeat(self, held: Held, started: bool) -> None:
         worker, lease = held
         dropped = worker.beat(lease, started=started)
+        self.seen[worker.id] = now = self.clock()
+        # A lease that has had its duration, and that its worker does not list, was lost on the way.
+        self.holders = {
+            task: held
+            for task, held in self.holders.items()
+            if task == lease.task_id or held[0] != worker.id or held[2] > now
+        }
         if dropped:
             # Either it was not the worker's, or no job needs it: then it is nobody's now.
             if self._holds(worker, lease):
@@ -146,6 +155,7 @@ class QueueMachine(RuleBasedStateMachine):
         }
         result = worker.result(lease.task) if how == "well" else bad[how]
         verdict = worker.report((lease, result))
+        self.seen[worker.id] = self.clock()
         assert verdict == (["accepted"] if mine else ["stale"])
         if mine:
             del self.holders[lease.task_id]
@@ -158,6 +168,7 @@ class QueueMachine(RuleBasedStateMachine):
         worker, lease = held
         before = dict(self.holders)
         assert worker.report((lease, failure())) in (["duplicate"], ["stale"])
+        self.seen[worker.id] = self.clock()
         assert self.holders == before
 
     @rule(job=jobs)
@@ -263,7 +274,11 @@ class QueueMachine(RuleBasedStateMachine):
         return held is not None and held[:2] == (worker.id, lease.token)
 
     def _forget_expired(self) -> None:
-        self.holders = {task: held for task, held in self.holders.items() if held[2] > self.clock()}
+        """Forget leases that have had their duration, of workers that have been silent for as long."""
+        now, seconds = self.clock(), self.settings.lease_seconds
+        self.holders = {
+            task: held for task, held in self.holders.items() if held[2] > now or self.seen[held[0]] > now - seconds
+        }
 
 
 @contextmanager
