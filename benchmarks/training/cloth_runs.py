@@ -129,9 +129,15 @@ def pack(folder: Path, file: Path) -> None:
             if json.loads(str(run["about"]))["valid"]:
                 runs.append({name: run[name] for name in run.files})
     first = min(runs, key=lambda run: len(run["rest"]))
-    if any(not np.array_equal(run["instants"], first["instants"]) for run in runs):
-        raise ValueError(f"the runs in {folder} must have as many frames: pack a folder for each")
     for run in runs:
+        finer = len(run["rest"]) > len(first["rest"])
+        corners, wanted = (np.stack([mesh["rest"].min(axis=0), mesh["rest"].max(axis=0)]) for mesh in (run, first))
+        if not (
+            np.allclose(corners, wanted, atol=1e-6)
+            and np.array_equal(run["instants"], first["instants"])
+            and (finer or np.array_equal(run["triangles"], first["triangles"]))
+        ):
+            raise ValueError(f"the runs in {folder} must be of one square and as many frames: pack a folder for each")
         run["positions"] = at_vertices(run, first["rest"])
     # Positions are whole steps of `STEP`. Differences of consecutive instants, low and high bytes apart, pack best.
     differences = np.diff(np.stack([run["positions"] for run in runs]), axis=1, prepend=np.int16(0))

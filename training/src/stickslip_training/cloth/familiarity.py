@@ -27,7 +27,7 @@ ALARMS = 0.05
 """Share of good validation clips without an answer."""
 
 NEAREST = 4
-"""Clips whose distances are averaged: single ones are known by chance."""
+"""Clips whose distances are averaged: one clip may be near by chance."""
 
 COMPONENTS = 64
 """Principal components of six silhouettes that are kept: 0.99 of the variance."""

@@ -27,7 +27,7 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.crop import Cameras, holder_crops
 from stickslip_training.cloth.familiarity import Familiarity, pooled
-from stickslip_training.cloth.model import MIRRORED, FrictionModel, PosteriorNet, log_histograms, silhouettes
+from stickslip_training.cloth.model import FrictionModel, PosteriorNet, log_histograms, mirrored, silhouettes
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between
@@ -76,8 +76,7 @@ class ClothTraining(FitSettings):
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
     clip_share: float = 0.5
-    """Of a batch, where there are clips of another renderer: at least 2,000, or a long training learns them by
-    heart."""
+    """Of a batch, where there are clips of another renderer. A long training needs 2,000: it learned 512 by heart."""
     worlds: bool = True
     """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
     instants: tuple[int, ...] = INSTANTS
@@ -181,8 +180,7 @@ class FrictionLearner(Learner):
                     f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
                     f"{', '.join(start.materials)}, and is {start.net.sizes}"
                 )
-            first = self.net.state_dict()  # heads that the start lacks begin anew
-            self.net.load_state_dict(first | {n: t for n, t in start.net.state_dict().items() if n in first})
+            self.net.load_state_dict(start.net.state_dict())
         self.settled, self.seen = start is not None, self.net.seen_silhouettes
         self.net.silhouette.requires_grad_(not self.settled)
         self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
@@ -217,9 +215,9 @@ class FrictionLearner(Learner):
         drawn, places = list(self.drawn.values()), random.integers(len(last) * count, size=count).tolist()
         parts = zip(*([part[at % count] for part in drawn[at // count]] for at in places), strict=True)
         crops, direction, material, mu, silhouettes = map(torch.stack, parts)
-        turned = torch.from_numpy(random.random(count) < 0.5)[:, None].to(self.settings.device)
-        direction = torch.where(turned, direction * direction.new_tensor(MIRRORED), direction)
-        crops, silhouettes = (torch.where(turned[:, None, None], part.flip(3), part) for part in (crops, silhouettes))
+        turned = torch.from_numpy(random.random(count) < 0.5).to(self.settings.device)
+        crops[turned], direction[turned] = mirrored(crops[turned], direction[turned])
+        silhouettes[turned] = silhouettes[turned].flip(3)
         return crops, direction, material, mu, silhouettes
 
     def batch(self, number: int) -> tuple[torch.Tensor, ...]:

@@ -24,8 +24,6 @@ from stickslip_training.cloth.posterior import Bins, Posterior
 WEIGHTS = Path(__file__).with_name("friction.safetensors")
 """A trained model that comes with the package; its card names its training data and its errors."""
 
-MIRRORED = (1.0, -1.0, 1.0)
-"""Of a direction of view, where a picture is mirrored."""
 
 _SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames have its size there
 
@@ -137,13 +135,17 @@ def log_histograms(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, Singl
     """
 
     def joint(crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        readings = [(crops, direction), (crops.flip(3), direction * direction.new_tensor(MIRRORED))]
-        pairs = [net.read(net.features(*reading)) for reading in readings]
+        pairs = [net.read(net.features(*reading)) for reading in ((crops, direction), mirrored(crops, direction))]
         return torch.stack([material[:, :, None] + mu for material, mu in pairs]).logsumexp(dim=0) - math.log(2)
 
     log_p = torch.from_numpy(_in_chunks(net, clips, joint))
     material = log_p.logsumexp(dim=2)
     return material.numpy(), (log_p - material[:, :, None]).numpy()
+
+
+def mirrored(crops: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return crops (B, F, H, W) and directions of view (B, 3) as a mirror along y shows them."""
+    return crops.flip(3), direction * direction.new_tensor([1.0, -1.0, 1.0])
 
 
 def silhouettes(net: PosteriorNet, clips: Clips) -> SingleFloats:
