@@ -12,7 +12,7 @@ from pathlib import Path
 FOLDERS = ("schemas/src", "services/src", "workers", "training/src", "sim_core/src", "sim_core/python")
 ENDINGS = (".py", ".pyi", ".cpp", ".hpp", ".html", ".js", ".css")
 
-MAX_SOURCE_LINES = 49_900
+MAX_SOURCE_LINES = 49_884
 """The goal is 50,000. Lower this with every change that removes lines; never raise it.
 
 It was raised once, from 53,500, for scenes as data and the checks of cloth: later changes must pay it back."""

@@ -58,8 +58,7 @@ def train(
             steps=steps, batch_size=batch, width=width, learning_rate=rate, seed=seed, threads=threads, device=device
         )
         first = mean_model([load_friction(path) for path in start]) if start else None
-        if first is not None:
-            settings = settings.going_on()
+        settings = settings if first is None else settings.going_on()
         source, learned, judged = training_runs(runs, validation)
         source["start"] = [sha256(path.read_bytes()) for path in start or []]
         source["clips"], rendered = training_clips(clips, learned, judged) if clips else (None, None)

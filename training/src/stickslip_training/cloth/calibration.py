@@ -11,21 +11,18 @@ from stickslip_training.arrays import Floats, Integers, SingleFloats
 from stickslip_training.cloth.posterior import SHARE, Bins, Posterior, estimates, softmax
 
 
-def likeliest_temperature(log_p: SingleFloats, place: Integers) -> float:
-    """Return the temperature of histograms (clips, bins) at which the true bins `place` (clips,) are likeliest."""
-    tried = np.geomspace(0.4, 4.0, 47)
-    rows = np.arange(len(place))
-    losses = [float(-np.log(softmax(log_p / t)[rows, place] + 1e-12).mean()) for t in tried]
-    return float(tried[int(np.argmin(losses))])
-
-
 def likeliest_temperatures(
     material: SingleFloats, mu: SingleFloats, true_material: Integers, true_mu: Floats, bins: Bins
 ) -> tuple[float, float]:
     """Return the temperatures of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at which the truth is the most
     likely."""
-    given = mu[np.arange(len(true_mu)), true_material]
-    return likeliest_temperature(material, true_material), likeliest_temperature(given, bins.place(true_mu))
+    rows, tried = np.arange(len(true_mu)), np.geomspace(0.4, 4.0, 47)
+
+    def likeliest(log_p: SingleFloats, place: Integers) -> float:
+        losses = [float(-np.log(softmax(log_p / t)[rows, place] + 1e-12).mean()) for t in tried]
+        return float(tried[int(np.argmin(losses))])
+
+    return likeliest(material, true_material), likeliest(mu[rows, true_material], bins.place(true_mu))
 
 
 def covering_temperature(

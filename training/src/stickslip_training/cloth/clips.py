@@ -7,7 +7,7 @@ They are rendered from simulations (`render_clips`), or read from a dataset (`re
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,16 +72,15 @@ class Clips(Truth):
         return len(self.mu)
 
     def __getitem__(self, chosen: Integers | NDArray[np.bool_]) -> "Clips":
-        values = {field.name: getattr(self, field.name) for field in fields(Clips)}
         parts: dict[str, Any] = {
             name: value[torch.from_numpy(np.asarray(chosen))] if torch.is_tensor(value) else value[chosen]
-            for name, value in values.items()
+            for name, value in vars(self).items()
         }
         return Clips(**parts)
 
     @staticmethod
     def joined(parts: "Sequence[Clips]") -> "Clips":
-        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Clips)}
+        columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
         whole: dict[str, Any] = {
             name: torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each)
             for name, each in columns.items()

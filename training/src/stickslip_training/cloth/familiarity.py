@@ -11,8 +11,8 @@ least as odd. A clip of a familiarity below `ALARMS` has no answer. Distances ar
 known silhouettes [Pearson 1901].
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -66,34 +66,25 @@ def glued(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
     return np.where(first[..., 2:] < _LYING, first, meshes)
 
 
-def sized(factor: float) -> Callable[[SingleFloats, SingleFloats], SingleFloats]:
-    """Return what makes cloth of another size, on a floor as high."""
-
-    def made(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
-        other = held + np.float32(factor) * (meshes - held)
-        other[..., 2] = np.maximum(other[..., 2], 1e-3)
-        return np.asarray(other)
-
-    return made
+def sized(meshes: SingleFloats, held: SingleFloats, factor: float) -> SingleFloats:
+    """Return cloth of another size, on a floor as high."""
+    other = held + np.float32(factor) * (meshes - held)
+    other[..., 2] = np.maximum(other[..., 2], 1e-3)
+    return np.asarray(other)
 
 
-def reordered(*frames: int) -> Callable[[SingleFloats, SingleFloats], SingleFloats]:
-    """Return what shows the shapes of other frames at the holders."""
-
-    def made(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
-        order = list(frames)
-        return meshes[:, order] - held[order] + held
-
-    return made
+def reordered(meshes: SingleFloats, held: SingleFloats, frames: list[int]) -> SingleFloats:
+    """Return the shapes of other frames at the holders."""
+    return meshes[:, frames] - held[frames] + held
 
 
 WITHOUT_ANSWER = (
     ("never touches the floor", hanging),
     ("does not slide", glued),
-    ("is not a square of 20 cm", sized(0.8)),
-    ("is not a square of 20 cm", sized(1.25)),
-    ("moves out of phase", reordered(2, 3, 0, 1, 2, 3)),
-    ("moves out of phase", reordered(5, 4, 3, 2, 1, 0)),
+    ("is not a square of 20 cm", partial(sized, factor=0.8)),
+    ("is not a square of 20 cm", partial(sized, factor=1.25)),
+    ("moves out of phase", partial(reordered, frames=[2, 3, 0, 1, 2, 3])),
+    ("moves out of phase", partial(reordered, frames=[5, 4, 3, 2, 1, 0])),
 )
 """Sorts of clips that hold no answer: the reason, and how they are made from runs."""
 

@@ -135,8 +135,7 @@ def train_friction(
         train, validation = (runs.named(start.materials) for runs in (train, validation))
     with torch_threads(settings.threads):
         learner = FrictionLearner(train, validation, settings, clips, start)
-        compared = {name: value for name, value in asdict(settings).items() if name not in ("threads", "device")}
-        identity = (identity or {}) | compared
+        identity = (identity or {}) | {n: v for n, v in asdict(settings).items() if n not in ("threads", "device")}
         return learner.calibrated(fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch))
 
 

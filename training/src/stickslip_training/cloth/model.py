@@ -24,7 +24,6 @@ from stickslip_training.cloth.posterior import Bins, Posterior
 WEIGHTS = Path(__file__).with_name("friction.safetensors")
 """A trained model that comes with the package; its card names its training data and its errors."""
 
-
 _SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames have its size there
 
 
