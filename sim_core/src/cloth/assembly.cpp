@@ -209,13 +209,15 @@ void Assembly::set_diagonal(double dt, double damping) {
 
 double Assembly::own_stiffness(int node) const {
   const float* block = &blocks_[12L * membrane_diagonal_[node]];
-  return diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
+  const double own = diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
+  return std::max(own, static_cast<double>(diagonal_[node]));
 }
 
 Eigen::Matrix3d Assembly::own_block(int node) const {
   const Eigen::Map<const Eigen::Matrix3f, 0, Eigen::OuterStride<4>> block(&blocks_[12L * membrane_diagonal_[node]]);
   const double alike = diagonal_[node] + scalars_[bending_diagonal_[node]];
-  return alike * Eigen::Matrix3d::Identity() + block.cast<double>();
+  const Eigen::Matrix3d own = alike * Eigen::Matrix3d::Identity() + block.cast<double>();
+  return own + std::max(0.0, diagonal_[node] - own.trace() / 3.0) * Eigen::Matrix3d::Identity();
 }
 
 ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbers) {
