@@ -1,4 +1,3 @@
-#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <cmath>
@@ -133,23 +132,20 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
 
 // Of each node that touches a body, the work R . (change of gap n + slip): contact only takes energy from the motion
 // against a body. The gap's change stands for the normal part of the motion, for a round face turns on the way. On a
-// fillet, n = w_1 n_1 + w_2 n_2, it is w_1 times that of one gap and w_2 times that of the other.
+// fillet, n = sum w_i n_i, it is sum w_i times those of the gaps.
 void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& out) const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const int b = newton.contact.touched[i];
     if (b < 0 || b >= static_cast<int>(step.at_end.size())) continue;
     const Vector3d from = at_node(step.start, i), to = at_node(step.x, i), force = at_node(newton.residual, i);
-    const Gap own = gap_of(step.at_end[b], to);
     Bearing on = newton.contact.bearing(step.at_end, to);
-    if (on.body != b) on = {own, b};
-    const auto change = [&](int body, double now) { return now - gap_of(step.at_start[body], from).distance; };
-    double way = change(b, own.distance);
-    if (on.other >= 0) {
-      const Gap other = gap_of(step.at_end[on.other], to);
-      const double c = own.normal.dot(other.normal), one = on.gap.normal.dot(own.normal);
-      const double two = on.gap.normal.dot(other.normal);
-      way = ((one - c * two) * way + (two - c * one) * change(on.other, other.distance)) / (1.0 - c * c);
-    }
+    if (on.body != b) on = {gap_of(step.at_end[b], to), b};
+    if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
+    const auto share = [&](int body) { return gap_of(step.at_end[body], to).normal.dot(on.gap.normal); };
+    const auto change = [&](int body) {
+      return gap_of(step.at_end[body], to).distance - gap_of(step.at_start[body], from).distance;
+    };
+    const double way = on.mean(change) / on.mean(share);
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
     out.contact_work += std::max(0.0, force.dot(way * on.gap.normal + slip));
   }

@@ -122,13 +122,13 @@ double Body::half_thickness() const {
 
 Gap gap_of(const Body& body, const Vector3d& x) {
   const Vector3d local = body.rotation.transpose() * (x - body.origin);
-  if (body.shape == Body::plane) return {local.z(), body.rotation.col(2)};
+  if (body.shape == Body::plane) return {local.z(), body.rotation.col(2), true};
   const Vector3d beyond = local.cwiseAbs() - body.core, outside = beyond.cwiseMax(0.0);
   const double r = outside.norm();
   Vector3d normal = Vector3d::Zero();
   if (r > 0.0) {
     for (int c = 0; c < 3; ++c) normal[c] = std::copysign(outside[c] / r, local[c]);
-    return {r - body.radius, body.rotation * normal};
+    return {r - body.radius, body.rotation * normal, normal.cwiseAbs().maxCoeff() == 1.0 && body.core.minCoeff() > 0.0};
   }
   int axis = 0;
   beyond.maxCoeff(&axis);

@@ -25,10 +25,11 @@ struct Body {
   double mu_of(int sheet) const { return mu.size() == 1 ? mu[0] : mu[sheet]; }
 };
 
-// Signed distance of a point from a body [m], negative inside, and the outward normal there.
+// Signed distance of a point from a body [m], negative inside; the outward normal there, and whether the face is flat.
 struct Gap {
   double distance;
   Eigen::Vector3d normal;
+  bool flat = false;
 };
 Gap gap_of(const Body& body, const Eigen::Vector3d& x);
 

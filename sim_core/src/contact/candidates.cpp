@@ -1,6 +1,5 @@
 #include <Eigen/Geometry>
 #include <algorithm>
-#include <cmath>
 
 #include "contact/path.hpp"
 

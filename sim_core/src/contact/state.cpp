@@ -178,33 +178,48 @@ void ContactState::penalty(int node, double own, float* out) const {
   }
 }
 
-// With normals n_1, n_2, c = n_1 . n_2 and a_i what gap i lacks of the fillet's radius, the least way out to where both
-// gaps are that radius is l_1 n_1 + l_2 n_2 with l_1 = (a_1 - c a_2)/(1 - c^2), and l_2 alike; the fillet's gap is the
-// radius less its length. Corners of less than 66 degrees have a smaller fillet, and those of less than 53 none: cloth
-// comes out of such a cusp where the rounded edge of a box lies on a floor.
+// With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way out to where all
+// gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two bodies, n_3 = n_1 x n_2 and a_3 = 0. The
+// gap of the fillet is the radius less |w|, and the smallest gap counts. Round faces make corners of less than 66
+// degrees smaller and none below 53, for cloth comes out of the cusp under a box's edge; flat ones below 26 degrees.
 Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p) const {
   Bearing on{{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()}};
-  Gap next = on.gap;
+  std::array<Bearing, 6> near;  // those whose fillets may reach here, the nearest first
+  int count = 0;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     if (by_pairs(b)) continue;
-    const Gap one = gap_of(bodies[b], p);
-    if (one.distance < on.gap.distance) {
-      next = on.gap, on.other = on.body;
-      on.gap = one, on.body = static_cast<int>(b);
-    } else if (one.distance < next.distance) {
-      next = one, on.other = static_cast<int>(b);
+    Bearing one{gap_of(bodies[b], p), static_cast<int>(b)};
+    if (one.gap.distance < on.gap.distance) on = one;
+    if (!(one.gap.distance < 2.0 * fillet_)) continue;
+    for (int k = 0; k < count; ++k) {
+      if (one.gap.distance < near[k].gap.distance) std::swap(one, near[k]);
+    }
+    if (count < static_cast<int>(near.size())) near[count++] = one;
+  }
+  const auto radius_of = [&](const Gap& a, const Gap& b) {
+    const double c = a.normal.dot(b.normal);
+    return fillet_ * std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
+  };
+  const auto lay = [&](int i, int j, int k) {
+    const Gap &one = near[i].gap, &two = near[j].gap, &other = near[k].gap;
+    const bool all = k != j;
+    const double radius =
+        std::min(radius_of(one, two), all ? std::min(radius_of(one, other), radius_of(two, other)) : fillet_);
+    Matrix3d normals;
+    normals << one.normal, two.normal, all ? other.normal : one.normal.cross(two.normal);
+    if (!(std::abs(normals.determinant()) > 1e-6)) return;  // parallel
+    const Vector3d lacks(radius - one.distance, radius - two.distance, all ? radius - other.distance : 0.0);
+    const Matrix3d inverse = normals.inverse();
+    const Vector3d way = inverse.transpose() * lacks, parts = inverse * way, share = parts / parts.sum();
+    const Gap laid{radius - way.norm(), way.normalized()};
+    if (!(parts.head(all ? 3 : 2).minCoeff() > 0.0 && laid.distance < on.gap.distance)) return;
+    on = {laid, near[i].body, {near[j].body, all ? near[k].body : -1}, {share[1], share[2]}};
+  };
+  for (int k = 1; k < count; ++k) {
+    for (int j = 1; j <= k; ++j) {
+      for (int i = 0; i < j; ++i) lay(i, j, k);
     }
   }
-  const double c = on.gap.normal.dot(next.normal), radius = fillet_ * std::clamp(3.0 + 5.0 * c, 0.0, 1.0);
-  const double first = radius - on.gap.distance - c * (radius - next.distance);
-  const double other = radius - next.distance - c * (radius - on.gap.distance);
-  if (next.distance >= radius || !(other > 0.0)) {
-    on.other = -1;
-    return on;
-  }
-  const Vector3d way = (first * on.gap.normal + other * next.normal) / (1.0 - c * c);
-  on.gap = {radius - way.norm(), way.normalized()};
-  on.share = other / (first + other);
   return on;
 }
 
@@ -282,8 +297,7 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
 
 Vector3d ContactState::slip(const Bearing& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
-  Vector3d u = p - carried(at_start[on.body], at_end[on.body], before);
-  if (on.other >= 0) u += on.share * (p - carried(at_start[on.other], at_end[on.other], before) - u);
+  const Vector3d u = on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
@@ -296,8 +310,7 @@ ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Bu
     const Vector3d u = surfaces->slip(node, before, p);
     return {on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
   }
-  double mu_here = at_end[on.body].mu_of(sheet[node]);
-  if (on.other >= 0) mu_here += on.share * (at_end[on.other].mu_of(sheet[node]) - mu_here);
+  const double mu_here = on.mean([&](int b) { return at_end[b].mu_of(sheet[node]); });
   return {on.gap.distance, n, slip(on, before, p, at_start, at_end), force, mu_here, stiffness[node]};
 }
 

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <array>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -92,11 +93,20 @@ struct Norms {
   void count(double force_squared);
 };
 
-// What a node sees of the bodies: the nearest, or, in a corner, the fillet between it and another.
+// What a node sees of the bodies: the nearest, or, in a corner, the fillet between two or three.
 struct Bearing {
   Gap gap;
-  int body = -1, other = -1;  // -1: none
-  double share = 0.0;         // of the other in what bears
+  int body = -1;                      // -1: none
+  std::array<int, 2> others{-1, -1};  // the same
+  std::array<double, 2> share{};      // of the others in what bears
+
+  template <class Of>
+  auto mean(const Of& of) const {
+    const auto own = of(body);
+    auto out = own;
+    for (int k = 0; k < 2 && others[k] >= 0; ++k) out += share[k] * (of(others[k]) - own);
+    return out;
+  }
 };
 
 class ContactState {

@@ -136,7 +136,7 @@ class TestBodies:
         assert (cloth.contacts == 1).any()
 
     @pytest.mark.physics
-    @pytest.mark.parametrize("slope", [0.5, 1.0, 1.4])
+    @pytest.mark.parametrize("slope", [0.5, 1.0, 1.4, 1.732])
     def test_valley_carries(self, slope: float) -> None:
         """Two planes: vertices in their corner bear on both, by a fillet of 1 mm."""
         limp = Cloth(PATCH, isotropic(0.2, 200.0, 1e-8), CERTIFIED)
