@@ -174,6 +174,25 @@ def sticks(cells: int) -> str:
     return code or ("right" if abs(found) < 1e-3 else f"wrong: slides with {found:.3g} m/s^2")
 
 
+def slides_into_corner(cells: int) -> str:
+    """A corner of a floor and two walls, turned until all three bear, carries the corner of a napkin within 5 %."""
+    along, up = np.array([1.0, -1.0, 0.0]) / 2.0, np.array([-1.0, -1.0, 1.0]) / 6.0**0.5
+    axes = np.column_stack([up - along, up + along, np.array([1.0, 1.0, 2.0]) / 6.0**0.5])
+    code, cloth = _run(
+        cells,
+        lambda _: [plane(0.1, normal=axis, origin=-0.055 * axis * (i < 2)) for i, axis in enumerate(axes.T)],
+        height=1e-4,
+        seconds=1.0,
+        damping=2.0,
+        turn=axes,
+    )
+    share = cloth.contact_force()[2] / (cloth.masses.sum() * GRAVITY)
+    nearest = float((cloth.positions @ axes[:, :2]).max(axis=1).min() + 0.055)
+    if abs(share - 1.0) > 0.05 or not 0.0 < nearest < 1e-3:
+        return code or f"wrong: bears {share:.3g} of the weight, {nearest:.3g} m from the walls"
+    return code or "right"
+
+
 def stretched_rim(cells: int) -> str:
     """A rim that grows by 40 %."""
     rim = _rim(cells).astype(int)
@@ -252,6 +271,7 @@ EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingPr
             (lifted, ("right",)),
             (slides_down, ("right",)),
             (sticks, ("right",)),
+            (slides_into_corner, ("right",)),
             (paddle, ("right",)),
             (pushed_ball, ("right", "missed", "stretch")),
             (thrown_ball, ("right", "missed", "stretch", "penetration", "passages")),
