@@ -13,7 +13,6 @@
 #include <memory>
 #include <string>
 #include <tuple>
-#include <vector>
 
 #include "build_constants.hpp"
 #include "kernel_levels.hpp"

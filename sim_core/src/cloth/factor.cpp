@@ -1,7 +1,6 @@
 #include "cloth/factor.hpp"
 
 #include <algorithm>
-#include <cmath>
 
 namespace sim_core {
 namespace {

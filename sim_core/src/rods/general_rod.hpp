@@ -7,8 +7,6 @@
 // An element takes kappa_bar at its middle, which keeps the scheme symmetric and its error even in h.
 #pragma once
 
-#include <vector>
-
 #include "rods/levels.hpp"
 
 namespace sim_core {

@@ -44,7 +44,6 @@ SEALED_NAMES = (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
 
 MANIFEST_ATTRIBUTE = "manifest_sha256"
 
-
 SECTION_SAMPLES = 10_000
 """Samples of a section, rounded down to whole shards. A smaller version has no sections."""
 

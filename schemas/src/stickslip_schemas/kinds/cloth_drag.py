@@ -30,7 +30,6 @@ SELF_FRICTION = 0.5
 """Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011] measured none; this is the
 middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
-
 VIEWPOINTS = tuple(camera.name for camera in load_rig(RIG))
 """The first is calibrated on the real stage. The last twelve, to test with, are it, turned about what it looks at by 5,
 10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes of the label `viewpoint`."""

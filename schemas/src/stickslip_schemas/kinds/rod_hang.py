@@ -13,7 +13,6 @@ from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render, SeedRul
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
 
-
 Gamma = Annotated[
     float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
 ]

@@ -189,7 +189,6 @@ class MeshBody(Document):
 
 Body = Annotated[Plane | Sphere | Cylinder | Capsule | Box | MeshBody, Field(discriminator="type")]
 
-
 Cells = Annotated[Int, Field(ge=1, le=1000)]
 Factor = Annotated[Float, Field(ge=0.1, le=10)]
 Vertex = Annotated[Int, Field(ge=0)]

@@ -23,7 +23,6 @@ from stickslip_services.units import duration, size
 
 STATIC = Path(__file__).parent / "static"
 
-
 _POLICY = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "

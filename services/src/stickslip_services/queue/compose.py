@@ -29,7 +29,6 @@ UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError,
 Publish = Callable[[bytes], Sha256]
 """Stores an artifact and returns its digest."""
 
-
 STORED_TASK = [*TASK, *(tasks.c[name] for name in ("key", "build", "payload", "preview"))]
 """Columns of a task from which its document is composed."""
 

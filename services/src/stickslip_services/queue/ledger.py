@@ -71,7 +71,6 @@ class Task(NamedTuple):
 
 TASK = [tasks.c[name] for name in Task._fields]
 
-
 _OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
 _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)

@@ -15,7 +15,6 @@ ORTHONORMAL = 1e-6
 MU_MAX = 10.0
 """Largest coefficient of friction."""
 
-
 ROUNDING = 5e-3
 """Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest edge. Cells of up to
 twice the radius slide over such an edge."""
@@ -151,15 +150,12 @@ def box(
 THICKNESS = 5e-4
 """Default thickness of cloth in self-contact or in contact with a surface [m]."""
 
-
 CREASE = float(np.radians(40.0))
 """Default angle from which edges of a surface stay sharp [rad]."""
-
 
 SELF_FRICTION = 0.5
 """Default coefficient of friction of a cloth with itself in a scene: the mean of the two of the thesis's shawls, 0.3
 and 0.7 [thesis, Fig. 4.16]."""
-
 
 BEARING: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"all": (1.0, 1.0), "vertices": (0.9, 1.0), "first": (0.9, 0.9)}

@@ -29,7 +29,6 @@ EXTENT_MAX = 20.0
 GRAVITY = 9.81
 """[m/s^2]"""
 
-
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
 """From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies."""
 

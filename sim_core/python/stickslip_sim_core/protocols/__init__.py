@@ -109,7 +109,6 @@ CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
 )
 """By preset; "rods" stands for the rod solver, which has none."""
 
-
 __all__ = [
     "CERTIFICATION",
     "PROTOCOLS",

@@ -84,7 +84,6 @@ def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
 DISTINCT = 1e-3
 """Largest centreline distance [L] at which two equilibria count as one: 100 times the solver's error."""
 
-
 MIRROR = np.array([-1.0, -1.0, 1.0])
 """What the mirror of world y does to (twist, bend about d2, bend about d3)."""
 
