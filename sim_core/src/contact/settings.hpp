@@ -38,8 +38,9 @@ struct ContactSettings {
   // tripled; with more they grew by a tenth. Over law_stiffness it also bounds the stiffness of turning friction:
   // beyond, a node is as good as stuck.
   double penalty = 100.0;
-  // Radius of the fillet of a corner between two bodies, m: twice a usual thickness. A vertex has one contact, and in a
-  // corner without a fillet goes to and fro between two.
+  // Radius of the fillet of a corner between bodies, m: twice a usual thickness. A vertex has one contact, and goes to
+  // and fro in a corner without one. Sweep: half and twice as much move a valley by 1.1 and 0.5 mm, and take 23 and
+  // 37 % less.
   double fillet = 1e-3;
   // kappa/K and lambda/K. On an incline 100 took 76 iterations and 143 factors in place of 16 and 15. Sweep: 5 takes 83
   // % more on a ball, 20 takes 55 % more factors in a pile.
