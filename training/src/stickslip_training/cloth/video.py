@@ -138,6 +138,10 @@ def import_video(
     if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
         raise VideoError(f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}")
     registration, wanders = _register(times, tracks, camera.straight, start)
+    if holders is None and registration.start < times[0]:  # they have come down, and hide what was taken for them
+        came = holder_points(np.array([times[0] - registration.start]) * RATE)[0]
+        times, tracks = _follow(path, camera, camera.project(came)[0], frame_rate)
+        registration, wanders = _register(times, tracks, camera.straight, start)
     if reasons := registration.refusals():
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
@@ -183,7 +187,7 @@ def holder_points(instants: Array) -> Floats:
 
 
 def _follow(
-    path: str | Path, camera: Camera, holders: tuple[float, float, float, float] | None, frame_rate: float | None
+    path: str | Path, camera: Camera, holders: npt.ArrayLike | None, frame_rate: float | None
 ) -> tuple[Floats, Floats]:
     """Return times (N,), and places (N, 2, 2) of the held patches without distortion [px]."""
     try:
