@@ -32,7 +32,12 @@ START, FRAMES_A_SECOND, DISTORTION = 1.7, 9, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1.5 px after 95 s."""
 
-VARIANTS = {"whole": (0, 0, 1), "start cut by 0.5 s": (20, 0, 1), "end cut by 0.5 s": (0, 14, 1), "every second": (0, 0, 2)}
+VARIANTS = {
+    "whole": (0, 0, 1),
+    "start cut by 0.5 s": (20, 0, 1),
+    "end cut by 0.5 s": (0, 14, 1),
+    "every second": (0, 0, 2),
+}
 """Frames that are left out at the start and at the end, and of how many one is kept. The holders start in frame 15, and
 nine frames follow the last instant that is read."""
 

@@ -27,7 +27,7 @@ def silhouettes(clips):
 def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split_runs):
     train, judged, _ = split_runs(few, 0.3, 0.0)
     good = silhouettes(render_clips(judged, 8, 1, drawn_world=True))
-    known = Familiarity.of(train, INSTANTS, 2, good)
+    known = Familiarity.of(train, 2, good)
     share, reasons = known.judge(good)
     assert ((share >= 0) & (share <= 1)).all()
     assert np.mean([reason is not None for reason in reasons]) == pytest.approx(ALARMS, abs=0.03)

@@ -110,16 +110,14 @@ class RenderedClips:
             raise ValueError(f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}")
 
 
-def frames_at(
-    instants: Sequence[float] | Floats, wanted: tuple[int, ...] = INSTANTS
-) -> tuple[list[int], tuple[float, ...]]:
+def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[float, ...]]:
     """Return the frames that are nearest to the instants that a network sees, and their own instants.
 
     Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX` from any frame.
     """
     shown = np.asarray(instants, dtype=np.float64)
-    frames = [int(np.abs(shown - instant).argmin()) for instant in wanted]
-    for frame, instant in zip(frames, wanted, strict=True):
+    frames = [int(np.abs(shown - instant).argmin()) for instant in INSTANTS]
+    for frame, instant in zip(frames, INSTANTS, strict=True):
         if abs(shown[frame] - instant) > LATE_MAX * RATE:
             raise ValueError(
                 f"a clip must have a frame within {LATE_MAX:g} s of {instant / RATE:.2f} s after the start; its "
@@ -133,21 +131,14 @@ def training_cameras() -> tuple[Camera, ...]:
 
 
 def render_clips(
-    runs: Runs,
-    renders: int,
-    seed: int,
-    *,
-    spread: float = 0.0,
-    wanted: tuple[int, ...] = INSTANTS,
-    drawn_world: bool = False,
-    device: str = "cpu",
+    runs: Runs, renders: int, seed: int, *, spread: float = 0.0, drawn_world: bool = False, device: str = "cpu"
 ) -> Clips:
-    """Render every run `renders` times at the instants `wanted`, each with a look of its own, by the cameras in turn.
+    """Render every run `renders` times, each with a look of its own, by the cameras in turn.
 
     `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world` each picture has a
     world of its own, and a dark floor without. `device` renders.
     """
-    frames, instants = frames_at(runs.instants, wanted)
+    frames, instants = frames_at(runs.instants)
     number = np.repeat(np.arange(len(runs)), renders)
     crops, covers, directions = [], [], []
     with torch.device(device):

@@ -19,7 +19,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 from stickslip_training.arrays import Array, Floats, Integers, SingleFloats
-from stickslip_training.cloth.clips import frames_at, render_clips
+from stickslip_training.cloth.clips import INSTANTS, frames_at, render_clips
 from stickslip_training.cloth.crop import holder_path
 from stickslip_training.cloth.runs import Runs
 
@@ -105,14 +105,13 @@ class Familiarity:
     """(validation clips,): ascending."""
 
     @staticmethod
-    def of(train: Runs, instants: tuple[int, ...], seed: int, good: SingleFloats, device: str = "cpu") -> "Familiarity":
+    def of(train: Runs, seed: int, good: SingleFloats, device: str = "cpu") -> "Familiarity":
         """Render the known clips from runs; `good` are silhouettes that a network sees in good validation clips."""
-        frames, _ = frames_at(train.instants, instants)
-        runs = replace(train, positions=train.positions[:, frames], instants=instants)
-        held = holders_at(instants)
+        runs = replace(train, positions=train.positions[:, frames_at(train.instants)[0]], instants=INSTANTS)
+        held = holders_at(INSTANTS)
         sorts = [runs, *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER)]
         shown = [
-            render_clips(some, 1 if place else 4, seed + place, wanted=instants, drawn_world=True, device=device).cover
+            render_clips(some, 1 if place else 4, seed + place, drawn_world=True, device=device).cover
             for place, some in enumerate(sorts)
         ]
         pixels = pooled(torch.cat(shown)).flatten(1).numpy()

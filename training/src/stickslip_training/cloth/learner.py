@@ -15,7 +15,6 @@ from torch.nn import functional
 from stickslip_training.cloth.calibration import covering_temperature, likeliest_temperatures
 from stickslip_training.cloth.clips import (
     CHOICE,
-    INSTANTS,
     TRAINING,
     VALIDATION,
     Clips,
@@ -45,8 +44,14 @@ from stickslip_training.engine.fit import (
     torch_threads,
 )
 
-SILHOUETTES = 8
+SILHOUETTES = 16
 """Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
+
+SETTLED = 2 / 3
+"""Share of the steps that teach what cloth is, while the reader sees true silhouettes; then it sees found ones [1]."""
+
+FIRST = 8
+"""Batches over which the units of a new network are standardized. Without it mu is learned four times as slowly."""
 
 KEPT = 20
 """Batches of clips that a step chooses from, the last ones."""
@@ -79,8 +84,6 @@ class ClothTraining(FitSettings):
     """Of a batch, where there are clips of another renderer. A long training needs 2,000: it learned 512 by heart."""
     worlds: bool = True
     """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
-    instants: tuple[int, ...] = INSTANTS
-    """Of the frames that the network sees, of 300."""
     width: int = 96
 
     def __post_init__(self) -> None:
@@ -154,7 +157,7 @@ class FrictionLearner(Learner):
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
         self.settings = settings
-        self.frames, self.instants = frames_at(train.instants, settings.instants)
+        self.frames, self.instants = frames_at(train.instants)
         self.train = train
         self.judged = validation
         self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames])).to(settings.device)
@@ -164,8 +167,7 @@ class FrictionLearner(Learner):
         with torch.device(settings.device):
             self.rig = Cameras.of(training_cameras())
         self.clips = clips
-        wanted, worlds = settings.instants, settings.worlds
-        self.render = partial(render_clips, wanted=wanted, drawn_world=worlds, device=settings.device)
+        self.render = partial(render_clips, drawn_world=settings.worlds, device=settings.device)
         self.validation = (
             self.render(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
         )
@@ -180,9 +182,12 @@ class FrictionLearner(Learner):
                     f"{', '.join(start.materials)}, and is {start.net.sizes}"
                 )
             self.net.load_state_dict(start.net.state_dict())
-        self.settled, self.seen = start is not None, self.net.seen_silhouettes
-        self.net.silhouette.requires_grad_(not self.settled)
+        self.settled = 0 if start is not None else math.ceil(SETTLED * settings.steps / settings.repeats)
         self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
+        if start is None:
+            first = zip(*(self.batch(number) for number in range(FIRST)), strict=True)
+            crops, direction, _, _, cover = map(torch.cat, first)
+            self.net.to(settings.device).standardize(crops, direction, cover)
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -197,10 +202,10 @@ class FrictionLearner(Learner):
         deviation = first * (last / first) ** (step / self.settings.steps)
         target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / deviation) ** 2)
         target = target / target.sum(dim=1, keepdim=True)
-        log_material, log_mu = net.read(net.features(crops, direction, silhouettes if self.settled else None))
+        log_material, log_mu = net.read(net.features(crops, direction, silhouettes))
         rows = torch.arange(len(mu), device=mu.device)
         loss = -(log_material[rows, material] + (target * log_mu[rows, material]).sum(dim=1)).mean()
-        if not self.settled:
+        if step < self.settled * self.settings.repeats:
             found = net.silhouettes(crops[::SILHOUETTES])
             loss = loss + functional.binary_cross_entropy_with_logits(found, silhouettes[::SILHOUETTES])
         return torch.as_tensor(loss)
@@ -243,7 +248,7 @@ class FrictionLearner(Learner):
                 given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
                 parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
             *parts, cover = parts
-            return *parts, self.seen(parts[0]) if self.settled else pooled(cover)
+            return *parts, pooled(cover) if number < self.settled else self.net.seen_silhouettes(parts[0])
 
     def elsewhere(self, clips: Clips, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
         """Return clips of another renderer as part of a batch, each in a drawn world."""
@@ -277,7 +282,7 @@ class FrictionLearner(Learner):
         of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
         of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
         seen = silhouettes(net, Clips.joined([clips, varied]))
-        known = Familiarity.of(train, settings.instants, settings.seed + 1, seen, settings.device)
+        known = Familiarity.of(train, settings.seed + 1, seen, settings.device)
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),

@@ -59,6 +59,22 @@ class PosteriorNet(nn.Module):
         self.mu = nn.Linear(2 * width, materials * bins)
         self.silhouette = _silhouette_net()
 
+    @torch.no_grad()
+    def standardize(self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor) -> None:
+        """Scale and shift each linear unit to mean 0 and deviation 1 over clips [Mishkin & Matas 2016]."""
+
+        def scaled(layer: nn.Module, _: Any, found: torch.Tensor) -> torch.Tensor:
+            deviation, mean = torch.std_mean(found, dim=0)
+            layer.weight.div_(deviation[:, None])
+            layer.bias.sub_(mean).div_(deviation)
+            return (found - mean) / deviation
+
+        hooks = [layer.register_forward_hook(scaled) for layer in (self.frame[0], self.joined[0], self.joined[3])]
+        self.eval().features(crops, direction, silhouettes)
+        for hook in hooks:
+            hook.remove()
+        self.train()
+
     def features(
         self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor | None = None
     ) -> torch.Tensor:
