@@ -22,7 +22,7 @@ from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
-from stickslip_training.cloth.runs import SLIDING, Runs, landed_side, load_runs, runs_of_dataset
+from stickslip_training.cloth.runs import Runs, load_runs, runs_of_dataset
 from stickslip_training.cloth.world import draw_world
 from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine.fit import seed_of_step
@@ -160,7 +160,6 @@ def render_clips(
         direction=torch.cat(directions),
         material=shown.material,
         mu=shown.mu,
-        landed=shown.landed,
         run=number,
         cover=torch.cat(covers),
     )
@@ -210,7 +209,6 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
         direction=seen.rotation[:, 2],
         material=known[reader.label("material")[slots]],
         mu=reader.label("mu")[slots].astype(np.float64),
-        landed=_landed(reader, slots),
         run=simulations(reader, slots),
         cover=cover,
     )
@@ -250,10 +248,8 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
         ([part[clip : clip + 1, frames] for part in (video, classes)] for clip in range(len(video))), seen, instants
     )
     known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
-    mu, landed, run = (np.array([clip[name] for clip in about]) for name in ("mu", "landed_side", "run"))
-    clips = Clips(
-        crops=crops, direction=seen.rotation[:, 2], material=np.array(known), mu=mu, landed=landed, run=run, cover=cover
-    )
+    mu, run = (np.array([clip[name] for clip in about]) for name in ("mu", "run"))
+    clips = Clips(crops=crops, direction=seen.rotation[:, 2], material=np.array(known), mu=mu, run=run, cover=cover)
     return clips, about
 
 
@@ -308,18 +304,9 @@ def simulations(reader: DatasetReader, slots: Integers) -> Integers:
 
 
 def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:
-    """Return the true values of slots, but for the side to which the cloth fell."""
+    """Return the true values of slots."""
     return Truth(
         material=reader.label("material")[slots].astype(np.int64),
         mu=reader.label("mu")[slots].astype(np.float64),
-        landed=np.zeros(len(slots), np.int64),
         run=simulations(reader, slots),
     )
-
-
-def _landed(reader: DatasetReader, slots: Integers) -> Integers:
-    """Return the side to which each cloth fell; where no vertices are stored, the side to which it was pushed."""
-    if "positions" not in reader.arrays:
-        return reader.label("bias_side")[slots].astype(np.int64)
-    rest = reader.read("rest", slots[:1])[0]
-    return np.concatenate([landed_side(reader.read("positions", [slot])[:, SLIDING], rest) for slot in slots.tolist()])

@@ -61,7 +61,6 @@ class Scores:
     """Share of the clips whose likeliest material is the true one."""
     top_2: Measure
     bands: dict[str, Errors]
-    sides: dict[str, Errors]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,8 +69,6 @@ class Truth:
 
     material: Integers
     mu: Floats
-    landed: Integers
-    """The side along x to which the cloth fell, +1 or -1."""
     run: Integers
     """Number of the simulation: errors count simulations and not clips."""
 
@@ -93,7 +90,6 @@ def _scores(found: Estimates, material: Floats, truth: Truth) -> Scores:
         top_1=measure((rank < 1).astype(float), truth.run),
         top_2=measure((rank < 2).astype(float), truth.run),
         bands=parts({f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}),
-        sides=parts({f"{side:+d}": truth.landed == side for side in (-1, 1)}),
     )
 
 

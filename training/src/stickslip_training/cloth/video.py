@@ -146,13 +146,11 @@ def import_video(
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
     crops = _cut(path, camera, chosen, instants, np.asarray(registration.offset) + wanders[chosen])[None]
-    unknown = np.array([-1])
     clip = Clips(
         crops=crops,
         direction=torch.tensor(camera.rotation[2])[None],
-        material=unknown,
+        material=np.array([-1]),
         mu=np.array([math.nan]),
-        landed=unknown,
         run=np.array([0]),
         cover=torch.full_like(crops, math.nan),
     )
