@@ -146,6 +146,8 @@ class FrictionLearner(Learner):
     """Batches are runs, or meshes between two neighbours in mu, that are rendered anew; a step learns from clips of the
     last batches, half of them mirrored."""
 
+    net: PosteriorNet
+
     def __init__(
         self,
         train: Runs,

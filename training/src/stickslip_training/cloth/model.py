@@ -64,6 +64,7 @@ class PosteriorNet(nn.Module):
         """Scale and shift each linear unit to mean 0 and deviation 1 over clips [Mishkin & Matas 2016]."""
 
         def scaled(layer: nn.Module, _: Any, found: torch.Tensor) -> torch.Tensor:
+            assert isinstance(layer, nn.Linear)
             deviation, mean = torch.std_mean(found, dim=0)
             layer.weight.div_(deviation[:, None])
             layer.bias.sub_(mean).div_(deviation)
