@@ -84,7 +84,7 @@ class TestClothRun:
 
     def test_forces_carry_the_weight(self, dragged: ClothRun) -> None:
         weight = fabric("gray-interlock").density * 0.04 * GRAVITY
-        assert dragged.record["holder_force"][0] == pytest.approx([0.0, 0.0, weight], rel=1e-9)
+        assert dragged.holder_force[0] == pytest.approx([0.0, 0.0, weight], rel=1e-9)
         steady = (dragged.times > 22.0) & (dragged.times < 37.0)
         lifted = (dragged.holder_force + dragged.contact_force)[steady]
         assert lifted[:, 2] == pytest.approx(weight, rel=0.02)

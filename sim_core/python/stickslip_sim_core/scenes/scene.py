@@ -71,6 +71,11 @@ class ClothRun:
         """[N], see `record`."""
         return self.record["contact_force"]
 
+    @property
+    def holder_force(self) -> Floats:
+        """[N]: of the holders on the cloth, where there are holders."""
+        return self.record["holder_force"]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
