@@ -7,7 +7,7 @@
 RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: nine a second, from before
 the holders start. After them come the instants of a clip. Blender renders both with one look. `measure` makes an H.264
 film of the former, through a lens, as a hand holds a phone, and reads it as `cloth predict --camera` does. It reads the
-film again with half a second or two seconds cut off either end, and thinned to fewer frames.
+film again with half a second cut off either end.
 """
 
 import argparse
@@ -32,14 +32,9 @@ START, FRAMES_A_SECOND, DISTORTION = 1.7, 9, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1.5 px after 95 s."""
 
-VARIANTS = {
-    "whole": (0, 0, 1),
-    "start cut by 0.5 s": (20, 0, 1),
-    "end cut by 0.5 s": (0, 14, 1),
-    "every second": (0, 0, 2),
-}
-"""Frames that are left out at the start and at the end, and of how many one is kept. The holders start in frame 15, and
-nine frames follow the last instant that is read."""
+VARIANTS = {"whole": (0, 0), "start cut by 0.5 s": (20, 0), "end cut by 0.5 s": (0, 14)}
+"""Frames that are left out at the start and at the end. The holders start in frame 15, and nine frames follow the last
+instant that is read."""
 
 
 def meshes(source: Path, out: Path, only: list[int]) -> None:
@@ -73,13 +68,12 @@ def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel)
     def answer(clips: Any) -> dict[str, Any]:
         return {key: predictions(model.estimate(clips), [0], model.judge(clips))[0][key] for key in ("mu", "no_answer")}
 
-    for name, (first, last, every) in VARIANTS.items():
-        some = slice(first, len(frames) - last, every)
+    for name, (first, last) in VARIANTS.items():
+        some = slice(first, len(frames) - last)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
             moved = shake[some] - shake[first]
-            rate = FRAMES_A_SECOND / every
-            write_film(path, frames[some], camera, rate=int(rate), distortion=DISTORTION, shake=moved)
+            write_film(path, frames[some], camera, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=moved)
             try:
                 found, registration = import_video(path, lens)
             except ValueError as error:
