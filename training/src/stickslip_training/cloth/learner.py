@@ -51,8 +51,8 @@ SETTLED = 2 / 3
 """Share of the steps that teach what cloth is, while the reader sees true silhouettes; then it sees found ones [1]."""
 
 FIRST = 8
-"""Batches over which the units of a new network are standardized: 600 steps over dark floors learned mu to 0.08 with it,
-and to 0.14 without."""
+"""Batches that standardize the units of a new network. 600 steps over dark floors learned mu to 0.08 with it,
+and to 0.14 without it."""
 
 KEPT = 20
 """Batches of clips that a step chooses from, the last ones."""
