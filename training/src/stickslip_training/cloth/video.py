@@ -138,7 +138,7 @@ def import_video(
     if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
         raise VideoError(f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}")
     registration, wanders = _register(times, tracks, camera.straight, start)
-    if holders is None and registration.start < times[0]:  # they have come down, and hide what was taken for them
+    if holders is None and registration.start < times[0]:  # the film began when they had come down
         came = holder_points(np.array([times[0] - registration.start]) * RATE)[0]
         times, tracks = _follow(path, camera, camera.project(came)[0], frame_rate)
         registration, wanders = _register(times, tracks, camera.straight, start)
