@@ -178,19 +178,19 @@ class FrictionLearner(Learner):
         with seeded(settings.seed):
             sizes = {"materials": len(train.materials), "bins": MU_BINS.count, "frames": len(self.frames)}
             self.net = PosteriorNet(**sizes, width=settings.width, dropout=settings.dropout)
-        if start is not None:
-            if start.materials != train.materials or start.net.sizes != self.net.sizes:
-                raise ValueError(
-                    f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
-                    f"{', '.join(start.materials)}, and is {start.net.sizes}"
-                )
-            self.net.load_state_dict(start.net.state_dict())
-        self.settled = 0 if start is not None else math.ceil(SETTLED * settings.steps / settings.repeats)
         self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
+        self.settled = math.ceil(SETTLED * settings.steps / settings.repeats)  # batches that teach what cloth is
         if start is None:
-            first = zip(*(self.batch(number) for number in range(FIRST)), strict=True)
-            crops, direction, _, _, cover = map(torch.cat, first)
+            crops, direction, _, _, cover = map(torch.cat, zip(*map(self.batch, range(FIRST)), strict=True))
             self.net.to(settings.device).standardize(crops, direction, cover)
+        elif start.materials != train.materials or start.net.sizes != self.net.sizes:
+            raise ValueError(
+                f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
+                f"{', '.join(start.materials)}, and is {start.net.sizes}"
+            )
+        else:
+            self.settled = 0
+            self.net.load_state_dict(start.net.state_dict())
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -228,7 +228,7 @@ class FrictionLearner(Learner):
         return crops, direction, material, mu, silhouettes
 
     def batch(self, number: int) -> tuple[torch.Tensor, ...]:
-        """Return the crops, directions of view, materials, mu and silhouettes, as seen by a start or as they are."""
+        """Return the crops, directions of view, materials, mu and silhouettes: true ones before `settled`."""
         device, seeds = self.settings.device, (self.settings.seed, TRAINING, number)
         with torch.device(device):
             random, generator = np.random.default_rng(seeds), torch.Generator(device).manual_seed(seed_of_step(*seeds))
