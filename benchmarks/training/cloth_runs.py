@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,19 @@ def at_vertices(run: dict[str, Any], rest: Any) -> Any:
     return at
 
 
+def write_packed(file: Path, positions: Any, mesh: Mapping[str, Any], about: Sequence[str]) -> None:
+    """Write positions (runs, frames, V, 3) in whole steps of `STEP`; `mesh` has rest, triangles and instants."""
+    # Differences of consecutive instants, low and high bytes apart, pack best.
+    differences = np.diff(positions, axis=1, prepend=np.int16(0))
+    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
+    np.savez_compressed(
+        file,
+        differences=np.moveaxis(bytes_apart, -1, 0),  # (2, runs, frames, V, 3)
+        **{name: mesh[name] for name in ("rest", "triangles", "instants")},
+        about=np.array(about),
+    )
+
+
 def pack(folder: Path, file: Path) -> None:
     """Write the valid runs of a folder into one file."""
     runs = []
@@ -139,17 +153,8 @@ def pack(folder: Path, file: Path) -> None:
         ):
             raise ValueError(f"the runs in {folder} must be of one square and as many frames: pack a folder for each")
         run["positions"] = at_vertices(run, first["rest"])
-    # Positions are whole steps of `STEP`. Differences of consecutive instants, low and high bytes apart, pack best.
-    differences = np.diff(np.stack([run["positions"] for run in runs]), axis=1, prepend=np.int16(0))
-    bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
-    np.savez_compressed(
-        file,
-        differences=np.moveaxis(bytes_apart, -1, 0),  # (2, runs, frames, V, 3)
-        rest=first["rest"],
-        triangles=first["triangles"],
-        instants=first["instants"],
-        about=np.array([str(run["about"]) for run in runs]),
-    )
+    about = [str(run["about"]) for run in runs]
+    write_packed(file, np.stack([run["positions"] for run in runs]), first, about)
     print(f"{file}: {len(runs)} runs, {file.stat().st_size / 1e6:.2f} MB")
 
 

@@ -19,18 +19,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from cloth_runs import write_packed
 from stickslip_schemas.spec.cameras import Camera, load_rig
+from stickslip_schemas.store import write_durably
 from stickslip_testing.films import meshes_at, write_film
-from stickslip_training.cloth.clips import INSTANTS, RATE, RIG
+from stickslip_training.cloth.clips import INSTANTS, RATE, RIG, Clips
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
-from stickslip_training.cloth.evaluation import predictions
+from stickslip_training.cloth.evaluation import errors, predictions
 from stickslip_training.cloth.model import WEIGHTS, FrictionModel, load_friction
+from stickslip_training.cloth.posterior import Estimates
 from stickslip_training.cloth.runs import STEP, grid_order, load_runs
 from stickslip_training.cloth.video import import_video
 
 START, FRAMES_A_SECOND, DISTORTION = 1.7, 9, (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1.5 px after 95 s."""
+
+CLIP = "frames at the instants, without a phone"
 
 VARIANTS = {"whole": (0, 0), "start cut by 0.5 s": (20, 0), "end cut by 0.5 s": (0, 14)}
 """Frames that are left out at the start and at the end. The holders start in frame 15, and nine frames follow the last
@@ -43,30 +48,31 @@ def meshes(source: Path, out: Path, only: list[int]) -> None:
     film = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
     seconds = np.concatenate([film, np.array(INSTANTS) / RATE])
     positions = np.stack([meshes_at(runs[np.array([run])], seconds).reshape(len(seconds), -1, 3) for run in only])
-    steps = np.diff(np.rint(positions / STEP).astype(np.int16), axis=1, prepend=np.int16(0))
     with np.load(source) as file:
         order = grid_order(file["rest"]).ravel()
-        np.savez_compressed(
-            out,
-            differences=np.moveaxis(np.ascontiguousarray(steps)[..., None].view(np.uint8), -1, 0),
-            rest=file["rest"][order],
-            triangles=np.argsort(order)[file["triangles"]].astype(np.int16),
-            instants=np.arange(len(seconds), dtype=np.int16),
-            about=file["about"][only],
-        )
+        mesh = {
+            "rest": file["rest"][order],
+            "triangles": np.argsort(order)[file["triangles"]].astype(np.int16),
+            "instants": np.arange(len(seconds), dtype=np.int16),
+        }
+        write_packed(out, np.rint(positions / STEP).astype(np.int16), mesh, file["about"][only].tolist())
     print(f"{out}: {len(only)} runs, {len(film)} frames of a film and {len(INSTANTS)} of a clip each")
 
 
 def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel) -> dict[str, Any]:
-    """Return what the model says of a film, of its variants and of the clip that ends `video` (F, H, W, 3)."""
+    """Return what the model says of a film, of its variants and of the clip that ends `video` (F, H, W, 3).
+
+    An answer is mu with its interval, why there is none, or why the film is refused.
+    """
     camera = next(camera for camera in load_rig(RIG) if camera.name == true["viewpoint"])
     lens = Camera.model_validate({**camera.model_dump(), "distortion": DISTORTION})
     frames, clip = video[: -len(INSTANTS)], video[-len(INSTANTS) :]
     shake = np.random.default_rng(number).normal(0.0, SHAKE, (len(frames), 2)).cumsum(axis=0)
-    seen, told, imported = Cameras.of([camera]), dict(true), None
+    told, imported = {name: true[name] for name in ("viewpoint", "texture", "material", "mu")}, None
 
-    def answer(clips: Any) -> dict[str, Any]:
-        return {key: predictions(model.estimate(clips), [0], model.judge(clips))[0][key] for key in ("mu", "no_answer")}
+    def answer(clips: Clips) -> list[float] | str:
+        found = predictions(model.estimate(clips), [0], model.judge(clips))[0]
+        return found["no_answer"] or [found["mu"][name] for name in ("median", "low", "high")]
 
     for name, (first, last) in VARIANTS.items():
         some = slice(first, len(frames) - last)
@@ -75,16 +81,35 @@ def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel)
             moved = shake[some] - shake[first]
             write_film(path, frames[some], camera, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=moved)
             try:
-                found, registration = import_video(path, lens)
+                imported = import_video(path, lens)[0]
             except ValueError as error:
-                told[name] = {"refused": str(error)}
-                continue
-        told[name] = {**answer(found), "start": registration.start + first / FRAMES_A_SECOND}
-        imported = imported or found
+                told[name] = f"refused: {error}"
+            else:
+                told[name] = answer(imported)
     if imported is not None:
-        crops = cut(grey(torch.from_numpy(clip[None])), holder_crops(seen, tuple(map(float, INSTANTS))))
-        told["clip"] = answer(replace(imported, crops=crops, direction=seen.rotation[:, 2]))
+        seen = Cameras.of([camera])
+        crops = cut(grey(torch.from_numpy(clip[None])), holder_crops(seen, INSTANTS))
+        told[CLIP] = answer(replace(imported, crops=crops, direction=seen.rotation[:, 2]))
     return told
+
+
+def summary(told: list[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Return the errors of the answers to the films, to a variant of them or to the clips."""
+    said = [film.get(name, "refused: as the film") for film in told]
+    read = [place for place, each in enumerate(said) if not isinstance(each, str)]
+    refused = sum(isinstance(each, str) and each.startswith("refused") for each in said)
+    row: dict[str, Any] = {"clips of": name, "refused": refused, "no_answer": len(said) - len(read) - refused}
+    if read:
+        mu = np.array([told[place]["mu"] for place in read])
+        scores = errors(
+            Estimates(*np.array([said[place] for place in read]).T), mu, np.unique(mu, return_inverse=True)[1]
+        )
+        row |= {"clips": scores.clips, "simulations": scores.simulations}
+        row |= {each: round(getattr(scores, each).value, 3) for each in ("mae", "within_01", "coverage")}
+        whole = [(said[place][0], told[place]["whole"]) for place in read]
+        off = [abs(median - film[0]) for median, film in whole if not isinstance(film, str)]
+        row["from_whole"] = {"mean": round(float(np.mean(off)), 4), "largest": round(max(off), 4)}
+    return row
 
 
 def measure(films: list[Path], model: FrictionModel, record: Path | None) -> None:
@@ -94,28 +119,12 @@ def measure(films: list[Path], model: FrictionModel, record: Path | None) -> Non
         with np.load(path) as file:
             videos, about = file["video"], [json.loads(str(line)) for line in file["about"]]
         for video, true in zip(videos, about, strict=True):
-            told.append(answers(video, true | {"file": path.stem}, len(told), model))
+            told.append({"floor": path.stem} | answers(video, true, len(told), model))
             print(json.dumps(told[-1]), flush=True)
-    summary: dict[str, Any] = {"films": len(told)}
-    for name in [*VARIANTS, "clip"]:
-        read = [(each, each[name]["mu"]) for each in told if each.get(name, {}).get("mu")]
-        off = np.array([abs(mu["median"] - each["mu"]) for each, mu in read])
-        held = np.array([mu["low"] <= each["mu"] <= mu["high"] for each, mu in read])
-        part: dict[str, Any] = {
-            "refused": sum("refused" in each.get(name, {}) for each in told),
-            "no_answer": sum(bool(each.get(name, {}).get("no_answer")) for each in told),
-            "read": len(read),
-        }
-        if read:
-            part |= {"mae": round(float(off.mean()), 3), "within_01": round(float((off < 0.1).mean()), 3)}
-            part["coverage"] = round(float(held.mean()), 3)
-        both = [abs(mu["median"] - each["whole"]["mu"]["median"]) for each, mu in read if each["whole"].get("mu")]
-        if both and name != "whole":
-            part["from_whole"] = {"mean": round(float(np.mean(both)), 4), "largest": round(float(max(both)), 4)}
-        summary[name] = part
-    print(json.dumps(summary, indent=1))
+    rows = [summary(told, name) for name in [*VARIANTS, CLIP]]
+    print(json.dumps(rows, indent=1))
     if record is not None:
-        record.write_text(json.dumps({"summary": summary, "films": told}, indent=1) + "\n", encoding="utf-8")
+        write_durably(record, (json.dumps({"rows": rows + told}, indent=1) + "\n").encode())
 
 
 def main() -> None:
