@@ -93,12 +93,6 @@ def predict(
         float | None, typer.Option(help="when the holders start in a video [s]; found if not given")
     ] = None,
     frame_rate: Annotated[float | None, typer.Option(help="of a video [1/s]; its own times if not given")] = None,
-    holders: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            help="column and row of the middles of both held patches in the first frame [px], smaller y first"
-        ),
-    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="print a list of {slot, material, mu, familiarity, no_answer}")
     ] = False,
@@ -119,11 +113,11 @@ def predict(
             if split is not None:
                 raise ValueError(f"split must not be given with camera: a video has none, and it is {split!r}")
             calibration = load_camera(camera)
-            clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate, holders=holders)
+            clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate)
             Console(stderr=True).print(f"the video: {found_in}", soft_wrap=True)
             slots = [0]
         else:
-            for name, value in (("start", start), ("frame_rate", frame_rate), ("holders", holders)):
+            for name, value in (("start", start), ("frame_rate", frame_rate)):
                 if value is not None:
                     raise ValueError(f"{name} must come with --camera: clips of a dataset have times; it is {value}")
             with DatasetReader(source) as reader:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.filesize import decimal
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 from stickslip_schemas.format.selection import Selection
@@ -76,7 +77,7 @@ def info(
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {counts}" if counts else ""))
         files = list(reader.files())
-        size = _megabytes(sum(file.size for file in files))
+        size = decimal(sum(file.size for file in files))
         facts.add_row("files", f"{len(files)}, {size}" + (", verified" if verify else ""))
         console.print(facts)
         sizes: Counter[str] = Counter()
@@ -90,15 +91,11 @@ def info(
                 array.name,
                 array.dtype,
                 " × ".join(map(str, (len(reader), *array.shape))),
-                _megabytes(len(reader) * array.sample_bytes),
-                _megabytes(sizes[array.name]),
+                decimal(len(reader) * array.sample_bytes),
+                decimal(sizes[array.name]),
                 array.description,
             )
         console.print(arrays)
-
-
-def _megabytes(count: int) -> str:
-    return f"{count / 1e6:,.1f} MB" if count >= 1e5 else f"{count / 1e3:,.1f} kB"
 
 
 def export(

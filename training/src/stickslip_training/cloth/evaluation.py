@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stickslip_training.arrays import Array, Floats, Integers
+from stickslip_training.arrays import Floats, Integers
 from stickslip_training.cloth.posterior import SHARE, Estimates, Posterior, estimates
 
 BANDS = ((0.0, 0.4), (0.4, 0.8), (0.8, 1.2), (1.2, 1.6))
@@ -77,19 +77,16 @@ def _scores(found: Estimates, material: Floats, truth: Truth) -> Scores:
     """Return scores of estimates of mu and of probabilities of materials (clips, materials)."""
     of_true = material[np.arange(len(material)), truth.material][:, None]
     rank = (material >= of_true).sum(axis=1) - 1
-
-    def parts(masks: dict[str, Array]) -> dict[str, Errors]:
-        return {
-            name: errors(Estimates(found.median[one], found.low[one], found.high[one]), truth.mu[one], truth.run[one])
-            for name, one in masks.items()
-            if one.any()
-        }
-
+    inside = {f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
     return Scores(
         blind=errors(found, truth.mu, truth.run),
         top_1=measure((rank < 1).astype(float), truth.run),
         top_2=measure((rank < 2).astype(float), truth.run),
-        bands=parts({f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}),
+        bands={
+            name: errors(Estimates(found.median[one], found.low[one], found.high[one]), truth.mu[one], truth.run[one])
+            for name, one in inside.items()
+            if one.any()
+        },
     )
 
 
