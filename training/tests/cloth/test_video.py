@@ -8,6 +8,7 @@ import pytest
 import torch
 from stickslip_schemas.spec.cameras import load_rig
 from stickslip_testing.films import meshes_at, write_film
+from stickslip_training.cloth import video
 from stickslip_training.cloth.clips import INSTANTS, RATE
 from stickslip_training.cloth.crop import ANCHOR, Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
@@ -165,3 +166,17 @@ def test_reasons_name_rule_and_value(imported):
     wrong = replace(imported[1], residual=2.5, timing=math.nan)
     assert [reason.split(" must")[0] for reason in wrong.refusals()] == ["the holders", "the start"]
     assert "are 2.50 px off" in wrong.refusals()[0]
+
+
+def test_a_floor_that_moves_apart_from_the_holders_is_refused(shown, tmp_path, monkeypatch):
+    filmed(tmp_path / "film.mp4", shown[1], np.zeros((len(shown[0]), 2)))
+    found = video._register
+
+    def astray(*args):  # the patches slipped off the holders in the last third
+        registration, wanders = found(*args)
+        wanders[600:] += 2.3
+        return registration, wanders
+
+    monkeypatch.setattr(video, "_register", astray)
+    with pytest.raises(VideoError, match=r"one motion of the camera to within 2 px .*, and differ by 2\.\d"):
+        import_video(tmp_path / "film.mp4", LENS)

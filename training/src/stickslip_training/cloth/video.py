@@ -52,7 +52,7 @@ FLOOR_MAX = 0.08
 wide]: noise without marks has 0.09, and 24 films over six floors at most 0.073."""
 
 APART_MAX = 2.0
-"""Difference of that motion from that of the holders, at most, as above: cloth may be taken for a plain floor."""
+"""Difference of that motion from that of the holders, at most, as above."""
 
 CUT_MAX = 1.0
 """Latest time at which a video may begin after the start [s]: the holders have come 5 mm down by then."""
@@ -132,7 +132,12 @@ def import_video(
     first, *pictures = _pictures(path, camera, [0, *chosen])
     motions, deviations = map(np.array, zip(*(floor_motion(first, each) for each in pictures), strict=True))
     pixel, off = camera.width / 224, wanders[chosen]
-    if max(deviations) <= FLOOR_MAX and np.abs(motions - off / pixel).max() <= APART_MAX:
+    if max(deviations) <= FLOOR_MAX:
+        if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
+            raise VideoError(
+                f"the floor and the holders must show one motion of the camera to within {APART_MAX:g} px of a picture "
+                f"224 px wide, and differ by {apart:.1f}"
+            )
         off = motions * pixel
     registered = holder_crops(Cameras.of([camera.straight]), instants)
     place = Crops(registered.origin + torch.from_numpy(off.astype(np.float32))[None], registered.scale)
