@@ -76,13 +76,11 @@ def info(
         reasons = Counter(str(rejection.reason) for rejection in reader.rejections())
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {counts}" if counts else ""))
-        files = list(reader.files())
-        size = decimal(sum(file.size for file in files))
-        facts.add_row("files", f"{len(files)}, {size}" + (", verified" if verify else ""))
-        console.print(facts)
-        sizes: Counter[str] = Counter()
+        files, sizes = list(reader.files()), Counter[str]()
         for file in files:
             sizes[file.path.split("/")[0]] += file.size
+        facts.add_row("files", f"{len(files)}, {decimal(sizes.total())}" + (", verified" if verify else ""))
+        console.print(facts)
         arrays = Table(box=None, pad_edge=False, header_style="bold")
         for title in ("array", "type", "shape", "raw", "on disk", "what"):
             arrays.add_column(title, justify="right" if title in ("raw", "on disk") else "left")

@@ -130,14 +130,16 @@ def import_video(
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
     first, *pictures = _pictures(path, camera, [0, *chosen])
-    motions, deviations = map(np.array, zip(*(floor_motion(first, each) for each in pictures), strict=True))
     pixel, off = camera.width / 224, wanders[chosen]
-    if max(deviations) <= FLOOR_MAX:
+    found = [  # the holders may be lost, and a tripod does not move
+        min((floor_motion(first, picture, start) for start in (near, 0 * near)), key=lambda one: one[1])
+        for picture, near in zip(pictures, off / pixel, strict=True)
+    ]
+    if max(deviation for _, deviation in found) <= FLOOR_MAX:
+        motions = np.array([motion for motion, _ in found])
         if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
-            raise VideoError(
-                f"the floor and the holders must show one motion of the camera to within {APART_MAX:g} px of a picture "
-                f"224 px wide, and differ by {apart:.1f}"
-            )
+            rule = f"must show one motion of the camera to within {APART_MAX:g} px of a picture 224 px wide"
+            raise VideoError(f"the floor and the holders {rule}, and differ by {apart:.1f}")
         off = motions * pixel
     registered = holder_crops(Cameras.of([camera.straight]), instants)
     place = Crops(registered.origin + torch.from_numpy(off.astype(np.float32))[None], registered.scale)
@@ -277,10 +279,11 @@ def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.N
     return [cv2.undistort(found[number], matrix, np.array(camera.distortion)) for number in chosen]
 
 
-def floor_motion(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8]) -> tuple[Floats, float]:
+def floor_motion(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], near: Floats) -> tuple[Floats, float]:
     """Return how far what stays has moved between two pictures (H, W), (2,), and the standard deviation of that.
 
-    Both are in pixels of a picture 224 px wide. With A and B the pictures, less what is wider than 3 px, d minimizes
+    All are in pixels of a picture 224 px wide; `near` is within 2 px or so. With A and B the pictures, less what is
+    wider than 3 px, d minimizes
 
         sum_x r^2 / (1 + (e / e_f)^4),   r(x) = B(x + d) - A(x),   e^2 = r^2 within 3 px of x
 
@@ -297,7 +300,7 @@ def floor_motion(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8]) ->
     def inner(field: Any) -> Any:
         return np.asarray(field)[..., 8:-8, 8:-8].reshape(*np.shape(field)[:-2], -1)
 
-    motion, step, slopes = np.zeros(2), np.ones(2), inner(np.gradient(a)[::-1])
+    motion, step, slopes = np.array(near), np.ones(2), inner(np.gradient(a)[::-1])
     for _ in range(20):
         place = np.hstack([np.eye(2), motion[:, None]])
         moved = cv2.warpAffine(b, place, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
