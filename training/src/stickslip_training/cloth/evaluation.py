@@ -77,14 +77,14 @@ def _scores(found: Estimates, material: Floats, truth: Truth) -> Scores:
     """Return scores of estimates of mu and of probabilities of materials (clips, materials)."""
     of_true = material[np.arange(len(material)), truth.material][:, None]
     rank = (material >= of_true).sum(axis=1) - 1
-    inside = {f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
+    masks = {f"{a:g} to {b:g}": (truth.mu >= a) & (truth.mu < b + (b == BANDS[-1][1])) for a, b in BANDS}
     return Scores(
         blind=errors(found, truth.mu, truth.run),
         top_1=measure((rank < 1).astype(float), truth.run),
         top_2=measure((rank < 2).astype(float), truth.run),
         bands={
             name: errors(Estimates(found.median[one], found.low[one], found.high[one]), truth.mu[one], truth.run[one])
-            for name, one in inside.items()
+            for name, one in masks.items()
             if one.any()
         },
     )

@@ -41,6 +41,8 @@ MATCH_MAX = 1.0
 """Largest distance of a match with the kept frame from the sum of the steps since; beyond it another frame is kept
 [px]."""
 
+_WIDE = 224  # width of the pictures that limits are for [px]
+
 RESIDUAL_MAX = 1.0
 """[px of a picture 224 px wide]"""
 
@@ -48,11 +50,11 @@ TIMING_MAX = 0.1
 """Largest spread of the starts found in the whole video and in its two halves [s]."""
 
 FLOOR_MAX = 0.08
-"""Standard deviation of the motion of a floor, at most, that is taken for that of the camera [px of a picture 224 px
-wide]: noise without marks has 0.09, and 24 films over six floors at most 0.073."""
+"""Largest standard deviation of the floor's motion at which it counts as the camera's [px of a picture 224 px wide].
+Noise without marks has 0.09 or more, and 24 films over six floors have 0.073 or less."""
 
 APART_MAX = 2.0
-"""Difference of that motion from that of the holders, at most, as above."""
+"""Largest difference between the motions of floor and holders [px of a picture 224 px wide]."""
 
 CUT_MAX = 1.0
 """Latest time at which a video may begin after the start [s]: the holders have come 5 mm down by then."""
@@ -130,13 +132,10 @@ def import_video(
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
     first, *pictures = _pictures(path, camera, [0, *chosen])
-    pixel, off = camera.width / 224, wanders[chosen]
-    found = [  # the holders may be lost, and a tripod does not move
-        min((floor_motion(first, picture, start) for start in (near, 0 * near)), key=lambda one: one[1])
-        for picture, near in zip(pictures, off / pixel, strict=True)
-    ]
-    if max(deviation for _, deviation in found) <= FLOOR_MAX:
-        motions = np.array([motion for motion, _ in found])
+    pixel, off = camera.width / _WIDE, wanders[chosen]
+    found = [floor_motion(first, picture, near) for picture, near in zip(pictures, off / pixel, strict=True)]
+    motions, deviations = map(np.array, zip(*found, strict=True))
+    if max(deviations) <= FLOOR_MAX:
         if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
             rule = f"must show one motion of the camera to within {APART_MAX:g} px of a picture 224 px wide"
             raise VideoError(f"the floor and the holders {rule}, and differ by {apart:.1f}")
@@ -227,7 +226,8 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
 
 
 def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None) -> tuple[Registration, Floats]:
-    """Return the registration, and the common motion of both holders besides the path, (N, 2) [px]."""
+    """Return the registration, and the common motion of both holders besides the path, from the first frame on, (N, 2)
+    [px]."""
 
     def off(t0: float, some: slice = slice(None)) -> Floats:
         """Return tracks less the path, less their mean, (N, 2, 2)."""
@@ -250,24 +250,14 @@ def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None
         coarse = np.arange(times[0] - CUT_MAX, times[-1] - 30.0, 0.5)
         every = slice(None, None, max(1, len(times) // 600))
         near = float(coarse[np.argmin([np.abs(off(t, every)).sum() for t in coarse])])
-        t0 = found(slice(None), near)
-    else:
-        t0 = start
-    half = int(np.searchsorted(times, t0 + 0.5 * (times[-1] - t0)))
-    halves = [found(part, t0) for part in (slice(None, half), slice(half, None))]
-    path = camera.project(holder_points(np.maximum(times - t0, 0.0) * RATE))[0]
-    apart = tracks - path
-    wander = apart.mean(axis=1) - apart[0].mean(axis=0)
-    apart = apart - apart.mean(axis=1, keepdims=True)
-    apart = apart - apart.mean(axis=0)
-    return (
-        Registration(
-            start=t0,
-            timing=float(np.ptp([t0, *halves])),
-            residual=float(np.sqrt((apart**2).mean())) * 224.0 / camera.width,
-        ),
-        wander,
-    )
+        start = found(slice(None), near)
+    half = int(np.searchsorted(times, start + 0.5 * (times[-1] - start)))
+    halves = [found(part, start) for part in (slice(None, half), slice(half, None))]
+    apart = off(start)
+    common = apart.mean(axis=1)
+    difference = apart - common[:, None]
+    residual = float(np.sqrt(difference.var(axis=0).mean())) * _WIDE / camera.width
+    return Registration(start, float(np.ptp([start, *halves])), residual), common - common[0]
 
 
 def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.NDArray[np.uint8]]:
@@ -280,30 +270,38 @@ def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.N
 
 
 def floor_motion(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], near: Floats) -> tuple[Floats, float]:
-    """Return how far what stays has moved between two pictures (H, W), (2,), and the standard deviation of that.
+    """Return how far the floor has moved between two pictures (H, W), (2,), and the standard deviation of that.
 
-    All are in pixels of a picture 224 px wide; `near` is within 2 px or so. With A and B the pictures, less what is
-    wider than 3 px, d minimizes
-
-        sum_x r^2 / (1 + (e / e_f)^4),   r(x) = B(x + d) - A(x),   e^2 = r^2 within 3 px of x
-
-    by Gauss-Newton steps with the weights of the step before. A fifth of the picture has an e below e_f: that is floor,
-    and not cloth. Only slopes that both pictures have make d certain.
+    All are in pixels of a picture 224 px wide. The motion is looked for within 2 px or so of `near`, which the holders
+    tell, and of 0, since they may be lost and a tripod does not move. The surer of both is returned.
     """
     import cv2
 
-    size = (224, round(224 * before.shape[0] / before.shape[1]))
+    size = (_WIDE, round(_WIDE * before.shape[0] / before.shape[1]))
     small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) for picture in (before, after)]
     a, b = (cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in small)
-    rounded = 1 / 12  # variance of grey levels that are rounded to whole ones
+    return min((_aligned(a, b, start) for start in (near, np.zeros(2))), key=lambda found: found[1])
+
+
+def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:
+    """Return the motion d from picture A to B, (H, W) each without what is wider than 3 px, and its deviation [px].
+
+    From `start` on, Gauss-Newton steps with the weights of the step before minimize
+
+        sum_x r^2 / (1 + (e / e_f)^4),   r(x) = B(x + d) - A(x),   e^2 = r^2 within 3 px of x
+
+    A fifth of the picture has an e below e_f: that is floor, and not cloth. Only slopes of both make d certain.
+    """
+    import cv2
 
     def inner(field: Any) -> Any:
         return np.asarray(field)[..., 8:-8, 8:-8].reshape(*np.shape(field)[:-2], -1)
 
-    motion, step, slopes = np.array(near), np.ones(2), inner(np.gradient(a)[::-1])
+    rounded = 1 / 12  # variance of grey levels that are rounded to whole ones
+    motion, step, slopes = start.copy(), np.ones(2), inner(np.gradient(a)[::-1])
     for _ in range(20):
         place = np.hstack([np.eye(2), motion[:, None]])
-        moved = cv2.warpAffine(b, place, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        moved = cv2.warpAffine(b, place, a.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         energy = inner(cv2.GaussianBlur((moved - a) ** 2, (0, 0), 3.0))
         weight = 1 / (1 + (energy / max(rounded, np.quantile(energy, 0.2))) ** 2)
         if np.abs(step).max() < 0.01:
