@@ -3,9 +3,11 @@
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
     .venv-blender/bin/python benchmarks/clip_psnr.py /tmp/cloth.npz [--material gray-interlock] [--quality standard]
+        [--shown left matt drawn 21 [--shown ...]]
 
-Three clips of 30 frames, with eight textures each. The longer references are 3 x 128 paths per pixel and 6 x 128 of
-landed cloth, not denoised, at seven instants, for three of the textures; they share no noise with a clip's own.
+Each clip has 30 frames and eight textures. `--shown` names viewpoint, floor, lighting and seed of a clip; without it,
+three are shown. The longer references are 3 x 128 paths per pixel and 6 x 128 of landed cloth, not denoised, at seven
+instants, for three of the textures; they share no noise with a clip's own.
 """
 
 import argparse
@@ -23,7 +25,11 @@ from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
 from stickslip_schemas.spec.names import Texture
 
-SHOWN = (("left", "matt", 21), ("calibrated", "stainless-steel", 22), ("right", "cloth", 23))
+SHOWN = (
+    ("left", "matt", "drawn", "21"),
+    ("calibrated", "stainless-steel", "drawn", "22"),
+    ("right", "cloth", "drawn", "23"),
+)
 TEXTURES = tuple(map(str, Texture))[:8]
 LONG, INSTANTS = 32, [*range(2, 30, 4)]  # paths per pixel of a shading, four in each of a picture
 
@@ -34,13 +40,14 @@ def main() -> None:
     arguments.add_argument("--material", default="gray-interlock")
     arguments.add_argument("--quality", default="standard")
     arguments.add_argument("--measured", type=float, default=0.5)
-    arguments.add_argument("--clips", type=int, nargs="+", default=[0, 1, 2])
+    arguments.add_argument("--shown", nargs=4, action="append", metavar=("VIEWPOINT", "FLOOR", "LIGHTING", "SEED"))
     options = arguments.parse_args()
     with np.load(options.trajectory) as file:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
     pictures = {str(name): texture_image(name) for name in Texture}
-    for viewpoint, substrate, seed in (SHOWN[number] for number in options.clips):
+    for viewpoint, substrate, lighting, number in options.shown or SHOWN:
+        seed = int(number)
         look = ClothDragRender(
             rig="drag",
             rig_digest=rig_digest("drag"),
@@ -49,6 +56,7 @@ def main() -> None:
             texture=TEXTURES[0],
             viewpoint=viewpoint,
             substrate=substrate,
+            lighting=lighting,
             instants=shown_frames(30, len(track)),
             light_seed=seed,
             crease_seed=1,
@@ -66,7 +74,7 @@ def main() -> None:
         others = replace(clip, seed=seed + 5000)
         long = list(others.references([pictures[name] for name in groups[0]], INSTANTS, LONG))
         seconds = (made - start) / len(TEXTURES) / 30
-        print(f"{viewpoint}, {substrate}: {seconds:.4f} CPU s a frame and texture", end=", ")
+        print(f"{viewpoint}, {substrate}, {lighting}: {seconds:.4f} CPU s a frame and texture", end=", ")
         print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)
         for channel, name in enumerate(groups[0]):
             video = videos[TEXTURES.index(name)]
