@@ -100,7 +100,7 @@ def main() -> None:
     for (side, divisor), scene in scenes.items():
         steady = (scene.times > STEADY[0]) & (scene.times < STEADY[1])
         if steady.any():
-            force = scene.contact_force[steady]
+            force = scene.record["contact_force"][steady]
             ratio = np.hypot(force[:, 0], force[:, 1]) / force[:, 2]
             print(
                 f"  {side} dt/{divisor}: |Ft|/Fn over mu, steady drag: median {np.median(ratio) / args.mu - 1.0:+.2e}"

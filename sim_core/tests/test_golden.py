@@ -86,7 +86,8 @@ def dragged(material: str, mu: float, vertices: int, frames: int, preset: str) -
         material, mu, mesh=vertices, frames=frames, preset=preset, seed=1, self_friction=None
     ).run()
     counts = np.array([scene.labels["steps"], scene.labels["unconverged_steps"]])
-    return digest(scene.positions, scene.contact_force, scene.holder_force, scene.self_intersections, counts)
+    forces = (scene.record[name] for name in ("contact_force", "holder_force"))
+    return digest(scene.positions, *forces, scene.self_intersections, counts)
 
 
 def touching(scene: str) -> str:

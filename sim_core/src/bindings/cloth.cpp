@@ -96,8 +96,8 @@ void bind_cloth(nb::module_& m) {
           "__init__",
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, double tolerance,
-             int newton_max, int krylov_max, double krylov_tolerance, int refactor_after, int patience,
-             int halvings_max, double step_error, double longest_step, int finest, const std::string& kernel,
+             int newton_max, double krylov_tolerance, int refactor_after, int patience, int halvings_max,
+             double step_error, double longest_step, int finest, const std::string& kernel,
              const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share, double second_share,
              const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
              const Points3& surface_positions, const std::vector<double>& crease,
@@ -107,20 +107,19 @@ void bind_cloth(nb::module_& m) {
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, stretching, rigidity, damping});
             }
-            new (self) ClothSolver(
-                {rest,
-                 triangles,
-                 list,
-                 held,
-                 {tolerance, newton_max, krylov_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                 {step_error, longest_step, finest},
-                 kernel,
-                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share, second_share,
-                  constants.contact.surface_share},
-                 {surface_triangles, surface_of_vertex, surface_positions, crease},
-                 constants});
+            new (self) ClothSolver({rest,
+                                    triangles,
+                                    list,
+                                    held,
+                                    {tolerance, newton_max, krylov_tolerance, refactor_after, patience, halvings_max},
+                                    {step_error, longest_step, finest},
+                                    kernel,
+                                    {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share,
+                                     second_share, constants.contact.surface_share},
+                                    {surface_triangles, surface_of_vertex, surface_positions, crease},
+                                    constants});
           },
-          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a, "krylov_max"_a,
+          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
           "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a, "longest_step"_a,
           "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a, "surface_triangles"_a,
           "surface_of_vertex"_a, "surface_positions"_a, "crease"_a, "constants"_a = std::map<std::string, double>())

@@ -170,7 +170,7 @@ double FactorStorage::mark(const std::vector<char>& touched) {
   return some / all;
 }
 
-Factor FactorStorage::view() {
+Factor FactorStorage::view(bool half) {
   return {static_cast<int>(update_begin.size()),
           due.data(),
           pivot_begin.data(),
@@ -187,6 +187,7 @@ Factor FactorStorage::view() {
           entry_block.data(),
           entry_row.data(),
           entry_column.data(),
+          half,
           tiles.data(),
           panel.data(),
           updates.data(),
@@ -197,7 +198,7 @@ Factor FactorStorage::view() {
 
 StaleFactor::StaleFactor(const Numbering& numbering)
     : storage_(numbering.compact_bending, numbering.membrane, numbering.dissection),
-      view_(storage_.view()),
+      view_(storage_.view(true)),
       added_(6L * numbering.free_nodes, 0.0f),
       touched_(numbering.free_nodes, 0) {}
 

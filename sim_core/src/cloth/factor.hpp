@@ -33,7 +33,7 @@ struct FactorStorage {
   // Patterns in the numbers of the order of elimination; that of bending holds that of the membrane.
   FactorStorage(const Pattern& bending, const Pattern& membrane, const Dissection& dissection);
 
-  Factor view();
+  Factor view(bool half);
 
   // Marks fronts as due: all of them, or those pieces in which `touched` (free nodes) is set, and what they lead to.
   // The latter returns their share of the work.
@@ -52,7 +52,7 @@ class FactorAge {
   void spent(int iterations);
   // Whether a new one would have cost less, or may help.
   bool too_much(const ClothSettings& settings) const {
-    return excess_ > settings.refactor_after || last_ >= settings.krylov_max;
+    return excess_ > settings.refactor_after || last_ >= krylov_max;
   }
 
  private:
@@ -60,6 +60,7 @@ class FactorAge {
   int last_ = 0, fresh_ = -1, excess_ = 0;  // of the last solve, of the first, and beyond that
 };
 
+// In half precision: a solve takes as long as it takes to read the factor.
 class StaleFactor {
  public:
   explicit StaleFactor(const Numbering& numbering);

@@ -106,7 +106,7 @@ struct FrontRun {
   int row, count, place;
 };
 
-// A Cholesky factor in single precision by fronts (multifrontal). Front f eliminates nodes pivot_begin[f] ...
+// A Cholesky factor by fronts (multifrontal). Front f eliminates nodes pivot_begin[f] ...
 // pivot_begin[f + 1]; its other rows are rows[row_begin[f]] ... . Children come before parents, in postorder.
 //
 // A front's columns go into blocks of `tile_columns`. Of each block come the inverse of its triangle, as one tile, and
@@ -128,7 +128,8 @@ struct Factor {
   const int* entry_block;    // of a membrane block or -1
   const int* entry_row;      // place in the front, nodes
   const int* entry_column;
-  float* tiles;
+  bool half;  // whether tiles are of half precision, see kernels/vectors.hpp, or of floats
+  void* tiles;
   float* panel;  // the front that is being made
   float* updates;
   float* local;      // one front's right-hand side
@@ -147,10 +148,9 @@ struct ClothKernel {
   // `added`: (nodes, 6), xx xy xz yy yz zz, N/m. A node keeps its own stiffness, and in contact some more: the factor
   // need not be exact.
   void (*factor)(const Factor&, const ClothMatrix&, const float* added);
-  void (*solve)(const Factor&, int nodes, const float* b, float* x);
   // Returns the iterations.
   int (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x, float* work,
-                int iterations, double tolerance);
+                double tolerance);
 };
 
 // One for each instruction set that they are compiled for; kernels/kernel.cpp is the code of all of them.

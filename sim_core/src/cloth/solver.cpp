@@ -246,8 +246,7 @@ double ClothSolver::softest(const Points3& positions) {
     Buffer<float> force = v;
     for (int i = 0; i < free_nodes; ++i) at_node(force, i) *= static_cast<float>(assembly.mass[i]);
     std::fill(y.begin(), y.end(), 0.0f);
-    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(), work.data(), krylov_max,
-                           1e-3);
+    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(), work.data(), 1e-3);
     for (int i = 0; i < free_nodes; ++i) {
       growth += assembly.mass[i] * at_node(v, i).cast<double>().dot(at_node(y, i).cast<double>());
     }

@@ -141,13 +141,13 @@ void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& 
     Bearing on = newton.contact.bearing(step.at_end, to);
     if (on.body != b) on = {gap_of(step.at_end[b], to), b};
     if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
-    const auto share = [&](int body) { return gap_of(step.at_end[body], to).normal.dot(on.gap.normal); };
-    const auto change = [&](int body) {
-      return gap_of(step.at_end[body], to).distance - gap_of(step.at_start[body], from).distance;
-    };
-    const double way = on.mean(change) / on.mean(share);
+    // The change of a gap, and the share of its normal.
+    const Vector2d way = on.mean([&](int body) -> Vector2d {
+      const Gap gap = gap_of(step.at_end[body], to);
+      return {gap.distance - gap_of(step.at_start[body], from).distance, gap.normal.dot(on.gap.normal)};
+    });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
-    out.contact_work += std::max(0.0, force.dot(way * on.gap.normal + slip));
+    out.contact_work += std::max(0.0, force.dot(way[0] / way[1] * on.gap.normal + slip));
   }
 }
 

@@ -111,7 +111,7 @@ class TestOwnFabric:
         own = cloth_drag.scene(fabric("gray-interlock").scaled(), 0.5, mesh=7, frames=4).run()
         heavy = cloth_drag.scene(fabric("gray-interlock").scaled(density=2.0), 0.5, mesh=7, frames=4).run()
         assert own.positions.tobytes() == named.positions.tobytes()
-        assert heavy.holder_force[0, 2] == pytest.approx(2.0 * named.holder_force[0, 2])
+        assert heavy.record["holder_force"][0, 2] == pytest.approx(2.0 * named.record["holder_force"][0, 2])
 
     def test_damping_slows_a_fall(self) -> None:
         """By v = (g/c)(1 - exp(-c t)), to first order in the step."""

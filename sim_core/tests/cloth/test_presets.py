@@ -12,9 +12,9 @@ CERTIFIED = preset_named("certified")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"krylov_max": -3}, r"krylov_max: must be an integer, 1 \.\.\. 40, got -3"),
-        ({"krylov_max": 60}, r"krylov_max: must be an integer, 1 \.\.\. 40, got 60"),
-        ({"krylov_max": 10.5}, r"krylov_max: must be an integer, 1 \.\.\. 40, got 10.5"),
+        ({"patience": -3}, r"patience: must be an integer, 1 \.\.\. 1000, got -3"),
+        ({"patience": 1001}, r"patience: must be an integer, 1 \.\.\. 1000, got 1001"),
+        ({"patience": 10.5}, r"patience: must be an integer, 1 \.\.\. 1000, got 10.5"),
         ({"newton_max": 0}, r"newton_max: must be an integer, 1 \.\.\. 1000, got 0"),
         ({"halvings_max": 21}, r"halvings_max: must be an integer, 0 \.\.\. 20, got 21"),
         ({"refactor_after": -1}, r"refactor_after: must be an integer, 0 \.\.\. 10000, got -1"),

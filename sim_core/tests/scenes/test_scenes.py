@@ -76,7 +76,7 @@ class TestClothRun:
     def test_friction_in_the_steady_drag(self, dragged: ClothRun) -> None:
         """Against the motion, and mu times the normal force, from the balance of momentum."""
         steady = (dragged.times > 22.0) & (dragged.times < 37.0)
-        force = dragged.contact_force[steady]
+        force = dragged.record["contact_force"][steady]
         assert (force[:, 0] < 0.0).all()
         ratio = np.hypot(force[:, 0], force[:, 1]) / force[:, 2]
         assert np.median(ratio) == pytest.approx(0.5, rel=1e-3)
@@ -84,9 +84,9 @@ class TestClothRun:
 
     def test_forces_carry_the_weight(self, dragged: ClothRun) -> None:
         weight = fabric("gray-interlock").density * 0.04 * GRAVITY
-        assert dragged.holder_force[0] == pytest.approx([0.0, 0.0, weight], rel=1e-9)
+        assert dragged.record["holder_force"][0] == pytest.approx([0.0, 0.0, weight], rel=1e-9)
         steady = (dragged.times > 22.0) & (dragged.times < 37.0)
-        lifted = (dragged.holder_force + dragged.contact_force)[steady]
+        lifted = (dragged.record["holder_force"] + dragged.record["contact_force"])[steady]
         assert lifted[:, 2] == pytest.approx(weight, rel=0.02)
         assert np.abs(lifted[:, :2]).max() < 0.02 * weight
 
@@ -148,7 +148,7 @@ class TestClothRun:
     def test_rerun_is_bit_identical(self) -> None:
         first, second = (cloth_drag.scene("gray-interlock", 0.3, mesh=7, frames=30).run() for _ in range(2))
         assert first.positions.tobytes() == second.positions.tobytes()
-        assert first.contact_force.tobytes() == second.contact_force.tobytes()
+        assert first.record["contact_force"].tobytes() == second.record["contact_force"].tobytes()
 
     def test_other_meshes_and_presets(self) -> None:
         mesh = meshes.unstructured(cloth_drag.SIDE, cloth_drag.SIDE, 0.02, 1)

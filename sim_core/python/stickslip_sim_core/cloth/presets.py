@@ -31,9 +31,6 @@ class SolverSettings:
     newton_max: int = 40
     """Iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
 
-    krylov_max: int = 40
-    """Iterations of GMRES in one of those, 1 ... 40: the solver keeps a vector for each."""
-
     krylov_tolerance: float = 0.005
     """Residual over right-hand side at which GMRES stops, below 1."""
 
@@ -82,7 +79,6 @@ class SolverSettings:
                 raise ValueError(f"{name}: must be above 0 and at most 1, got {value}")
         for name, low, high in (
             ("newton_max", 1, 1000),
-            ("krylov_max", 1, 40),
             ("refactor_after", 0, 10_000),
             ("patience", 1, 1000),
             ("halvings_max", 0, 20),

@@ -17,7 +17,7 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that sets the level of the kernels."""
 
-PASSED_ON = ("newton_max", "krylov_max", "krylov_tolerance", "refactor_after", "patience", "halvings_max", "finest")
+PASSED_ON = ("newton_max", "krylov_tolerance", "refactor_after", "patience", "halvings_max", "finest")
 """Settings that the C++ solver takes as they are."""
 
 RESIDUAL_PATCH = 0.005**2

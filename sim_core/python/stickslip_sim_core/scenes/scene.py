@@ -66,16 +66,6 @@ class ClothRun:
     def valid(self) -> bool:
         return not self.code
 
-    @property
-    def contact_force(self) -> Floats:
-        """[N], see `record`."""
-        return self.record["contact_force"]
-
-    @property
-    def holder_force(self) -> Floats:
-        """[N]: of the holders on the cloth, where there are holders."""
-        return self.record["holder_force"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:

@@ -161,33 +161,34 @@ inline void add_floats(const float* from, float* to, int count) {
   *reinterpret_cast<Floats*>(to + i) += Floats(Integers(*reinterpret_cast<const Floats*>(from + i)) & inside);
 }
 
-inline void copy_rows(const float* from, float* to) {
-  for (int v = 0; v < tile_rows; v += CLOTH_FLOATS) {
-    *reinterpret_cast<Floats*>(to + v) = *reinterpret_cast<const Floats*>(from + v);
-  }
+template <class Kept>
+inline void keep_rows(const float* from, Kept* to) {
+  for (int v = 0; v < tile_rows; v += CLOTH_FLOATS) keep(wide(from + v), to + v);
 }
 
-// Writes the tiles of a block of columns that is done, and returns where they end.
-inline float* keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, float* tile) {
+// Writes the tiles of a block of columns that is done.
+template <class Kept>
+inline void keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, long begin) {
+  Kept* tile = static_cast<Kept*>(factor.tiles) + begin;
   const int first = j + width, own = size.columns - first, end = own + 3 * size.rows;
-  __builtin_memset(tile, 0, sizeof(float) * width * tile_rows);
-  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, tile);
-  tile += width * tile_rows;
+  float some[tile_columns * tile_rows] = {};
+  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, some);
+  for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(some + q * tile_rows, tile);
   // Pivot rows and other rows lie apart in the panel.
   const float *upper = factor.panel + j * size.ld + first, *lower = factor.panel + j * size.ld + size.pivot_rows - own;
   for (int i = 0; i < end; i += tile_rows) {
     if (i + tile_rows <= own || (i >= own && i + tile_rows <= end)) {
       const float* from = (i < own ? upper : lower) + i;
-      for (int q = 0; q < width; ++q, from += size.ld, tile += tile_rows) copy_rows(from, tile);
+      for (int q = 0; q < width; ++q, from += size.ld, tile += tile_rows) keep_rows(from, tile);
       continue;
     }
     for (int q = 0; q < width; ++q, tile += tile_rows) {
       for (int r = 0; r < tile_rows; ++r) {
-        tile[r] = i + r < own ? upper[q * size.ld + i + r] : i + r < end ? lower[q * size.ld + i + r] : 0.0f;
+        some[r] = i + r < own ? upper[q * size.ld + i + r] : i + r < end ? lower[q * size.ld + i + r] : 0.0f;
       }
+      keep_rows(some, tile);
     }
   }
-  return tile;
 }
 
 // Adds what waits of a child to those columns of its parent that are pivots, or to the others; column j of the parent
@@ -223,21 +224,15 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const float* added)
       const float* own = added + 6L * (pivot0 + i);
       const float mass = matrix.diagonal[pivot0 + i];
       float* at = panel + 3L * i * size.ld + 3L * i;
-      at[0] += own[0] + mass;
-      at[1] += own[1];
-      at[2] += own[2];
-      at += size.ld;
-      at[1] += own[3] + mass;
-      at[2] += own[4];
-      at += size.ld;
-      at[2] += own[5] + mass;
+      for (int c = 0; c < 3; ++c, at += size.ld) {
+        at[c] += mass;
+        for (int r = c; r < 3; ++r) at[r] += *own++;
+      }
     }
     for (long e = factor.entry_begin[front]; e < factor.entry_begin[front + 1]; ++e) {
       const float scalar = matrix.bending[factor.entry_slot[e]];
       float* at = panel + 3L * factor.entry_column[e] * size.ld + size.place(factor.entry_row[e]);
-      at[0] += scalar;
-      at[size.ld + 1] += scalar;
-      at[2 * size.ld + 2] += scalar;
+      for (int c = 0; c < 3; ++c) at[c * (size.ld + 1)] += scalar;
       if (factor.entry_block[e] >= 0) {
         const float* block = matrix.membrane + 12L * factor.entry_block[e];
         for (int c = 0; c < 3; ++c) {
@@ -248,12 +243,13 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const float* added)
     const int *child = factor.children + factor.child_begin[front],
               *last = factor.children + factor.child_begin[front + 1];
     for (const int* c = child; c < last; ++c) add_update(factor, *c, size, true, panel, size.ld);
-    float* tile = factor.tiles + factor.tile_begin[front];
+    long tile = factor.tile_begin[front];
     for (int j = 0; j < size.columns; j += tile_columns) {
       const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
       subtract_columns(panel, size.ld, j, width, int(size.ld));
       factor_columns(panel + j * size.ld + j, size.ld, width, int(size.ld) - j);
-      tile = keep_tiles(factor, size, j, width, tile);
+      factor.half ? keep_tiles<Half>(factor, size, j, width, tile) : keep_tiles<float>(factor, size, j, width, tile);
+      tile += tile_floats(width, size.columns - j - width + 3 * size.rows);
     }
     if (size.rows > 0) {
       negative_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows, 3 * size.rows);

@@ -8,7 +8,7 @@
 
 namespace sim_core {
 
-constinit const ClothKernel CLOTH_KERNEL = {KERNEL_LEVEL, membrane, membrane_lag, bending, bending_matrix,
-                                            apply,        factor,   solve,        krylov};
+constinit const ClothKernel CLOTH_KERNEL = {KERNEL_LEVEL,   membrane, membrane_lag, bending,
+                                            bending_matrix, apply,    factor,       krylov};
 
 }  // namespace sim_core

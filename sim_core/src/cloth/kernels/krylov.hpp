@@ -134,7 +134,7 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
 // Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `x`: the first guess, of which the
 // best multiple is taken, and the solution. `work`: 2 krylov_max + 1 vectors.
 int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b, float* x,
-           float* work, int iterations, double tolerance) {
+           float* work, double tolerance) {
   const FlushTiny flush;
   const long count = 4L * matrix.nodes;
   float* basis = work;
@@ -155,9 +155,8 @@ int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& c
   if (!(left > tolerance * size)) return 0;
   for (long i = 0; i < count; ++i) basis[i] = float(basis[i] / left);
   g[0] = left;
-  if (iterations > krylov_max) iterations = krylov_max;
   int k = 0;
-  while (k < iterations) {
+  while (k < krylov_max) {
     float *next = basis + (k + 1) * count, *z = images + k * count;
     solve(factor, matrix.nodes, basis + k * count, z);
     admit(contact, matrix.nodes, z);

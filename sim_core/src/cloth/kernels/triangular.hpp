@@ -16,14 +16,14 @@ inline float sum_of(Floats v) {
 }
 
 // y += T z or y -= T z, of the rows of a tile.
-template <int width, bool subtract>
-inline void add_tile(const float* tile, const float* z, float* y) {
+template <int width, bool subtract, class Kept>
+inline void add_tile(const Kept* tile, const float* z, float* y) {
   for (int v = 0; v < tile_vectors; ++v) {
     Floats* at = reinterpret_cast<Floats*>(y + CLOTH_FLOATS * v);
     Floats sum = *at, other{};
 #pragma GCC unroll 12
     for (int q = 0; q < width; ++q) {
-      const Floats part = *reinterpret_cast<const Floats*>(tile + q * tile_rows + CLOTH_FLOATS * v) * z[q];
+      const Floats part = wide(tile + q * tile_rows + CLOTH_FLOATS * v) * z[q];
       if (q % 2 == 0) {
         sum = subtract ? sum - part : sum + part;
       } else {
@@ -35,20 +35,20 @@ inline void add_tile(const float* tile, const float* z, float* y) {
 }
 
 // sum += T^T y.
-template <int width>
-inline void add_transposed(const float* tile, const float* y, Floats* sum) {
+template <int width, class Kept>
+inline void add_transposed(const Kept* tile, const float* y, Floats* sum) {
   for (int v = 0; v < tile_vectors; ++v) {
     const Floats at = *reinterpret_cast<const Floats*>(y + CLOTH_FLOATS * v);
 #pragma GCC unroll 12
     for (int q = 0; q < width; ++q) {
-      sum[q] += *reinterpret_cast<const Floats*>(tile + q * tile_rows + CLOTH_FLOATS * v) * at;
+      sum[q] += wide(tile + q * tile_rows + CLOTH_FLOATS * v) * at;
     }
   }
 }
 
 // A block of columns whose own rows begin at y: they are solved for, and leave the `below` rows after them.
-template <int width>
-inline void forward(const float* tile, float* y, int below) {
+template <int width, class Kept>
+inline void forward(const Kept* tile, float* y, int below) {
   float z[tile_rows];
   for (int v = 0; v < tile_vectors; ++v) reinterpret_cast<Floats*>(z)[v] = Floats{};
   add_tile<width, false>(tile, y, z);
@@ -57,11 +57,11 @@ inline void forward(const float* tile, float* y, int below) {
   for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows) add_tile<width, true>(tile, z, y + width + i);
 }
 
-template <int width>
-inline void backward(const float* tile, float* y, int below) {
+template <int width, class Kept>
+inline void backward(const Kept* tile, float* y, int below) {
   Floats sum[width];
   for (int q = 0; q < width; ++q) sum[q] = Floats{};
-  const float* other = tile + width * tile_rows;
+  const Kept* other = tile + width * tile_rows;
   for (int i = 0; i < below; i += tile_rows, other += width * tile_rows) {
     add_transposed<width>(other, y + width + i, sum);
   }
@@ -83,12 +83,13 @@ inline void with_width(int width, const Call& call) {
 }
 
 // In the factor's own order of nodes.
+template <class Kept>
 void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
   if (x != b) __builtin_memcpy(x, b, 16L * nodes);
   float* y = factor.local;
   for (int front = 0; front < factor.fronts; ++front) {
     const FrontSize size(factor, front);
-    const float* tile = factor.tiles + factor.tile_begin[front];
+    const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front];
     const int* rows = factor.rows + factor.row_begin[front];
     const int height = size.columns + 3 * size.rows;
     float* own = x + 4L * factor.pivot_begin[front];
@@ -112,7 +113,7 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
   }
   for (int front = factor.fronts - 1; front >= 0; --front) {
     const FrontSize size(factor, front);
-    const float* tile = factor.tiles + factor.tile_begin[front + 1];
+    const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front + 1];
     const int* rows = factor.rows + factor.row_begin[front];
     const int height = size.columns + 3 * size.rows;
     float* own = x + 4L * factor.pivot_begin[front];
@@ -138,11 +139,12 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
 
 // x = K^-1 b; `x` may be `b`.
 void solve(const Factor& factor, int nodes, const float* b, float* x) {
-  if (!factor.order) return solve_in_order(factor, nodes, b, x);
+  const auto solve_kept = factor.half ? solve_in_order<Half> : solve_in_order<float>;
+  if (!factor.order) return solve_kept(factor, nodes, b, x);
   const Node* from = reinterpret_cast<const Node*>(b);
   Node *ordered = reinterpret_cast<Node*>(factor.ordered), *to = reinterpret_cast<Node*>(x);
   for (int i = 0; i < nodes; ++i) ordered[i] = from[factor.order[i]];
-  solve_in_order(factor, nodes, factor.ordered, factor.ordered);
+  solve_kept(factor, nodes, factor.ordered, factor.ordered);
   for (int i = 0; i < nodes; ++i) to[factor.order[i]] = ordered[i];
 }
 
