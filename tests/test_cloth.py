@@ -72,8 +72,8 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
         assert np.array_equal(arrays["positions"][slot], run.positions.astype(np.float32))
         assert np.array_equal(arrays["rest"][slot], run.rest.astype(np.float32))
         assert np.array_equal(arrays["triangles"][slot], run.triangles)
-        assert np.array_equal(arrays["contact_force"][slot], run.contact_force.astype(np.float32))
-        assert np.array_equal(arrays["holder_force"][slot], run.holder_force.astype(np.float32))
+        assert np.array_equal(arrays["contact_force"][slot], run.record["contact_force"].astype(np.float32))
+        assert np.array_equal(arrays["holder_force"][slot], run.record["holder_force"].astype(np.float32))
         assert np.array_equal(arrays["self_intersections"][slot], run.self_intersections)
         for name in ("bias_side", "landed_side", "bias", "steps", "unconverged_steps", "worst_residual"):
             assert arrays[name][slot] == ({**vars(run), **run.labels})[name], name
