@@ -198,7 +198,7 @@ Factor FactorStorage::view(bool half) {
 
 StaleFactor::StaleFactor(const Numbering& numbering)
     : storage_(numbering.compact_bending, numbering.membrane, numbering.dissection),
-      view_(storage_.view(true)),
+      view_(storage_.view(storage_.tile_begin.back() >= half_from)),
       added_(6L * numbering.free_nodes, 0.0f),
       touched_(numbering.free_nodes, 0) {}
 

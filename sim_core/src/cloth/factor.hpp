@@ -60,7 +60,6 @@ class FactorAge {
   int last_ = 0, fresh_ = -1, excess_ = 0;  // of the last solve, of the first, and beyond that
 };
 
-// In half precision: a solve takes as long as it takes to read the factor.
 class StaleFactor {
  public:
   explicit StaleFactor(const Numbering& numbering);

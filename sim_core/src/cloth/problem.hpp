@@ -16,6 +16,7 @@ constexpr int front_padding = 16;
 
 // A factor is kept in tiles of so many rows, and of at most so many columns: three of each node.
 constexpr int tile_rows = 16, tile_columns = 12;
+constexpr long half_from = 4'000'000;  // floats, 16 MB, from which half precision is used: solves then wait for memory
 
 // Floats of a block of `width` columns with `below` rows under its triangle.
 constexpr long tile_floats(long width, long below) {

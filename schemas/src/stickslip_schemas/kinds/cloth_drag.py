@@ -130,7 +130,7 @@ class ClothDragSpec(ClipSpec):
         le=161,
         description="vertices along a side of the square mesh",
         json_schema_extra={
-            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 3 s, 41 takes 16 s, 81 takes 2 min"
+            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 4 s, 41 takes 18 s, 81 takes 2 min"
         },
     )
     self_friction: Float | None = Field(
