@@ -160,8 +160,8 @@ struct ControlSettings {
   // The same up to which steps grow: twice the step makes four times the error, and 4 x 0.3 stays well below 2. Sweep:
   // within 10 %.
   double grow_at = 0.3;
-  // Cost of a factor in iterations of GMRES: 18 at 81 x 81 vertices, 13 at 41 x 41, less where parts are made. Sweep:
-  // within 3 %.
+  // Cost of a factor in iterations of GMRES: 18 at 81 x 81 vertices, 12 at 41 x 41, 11 at 21 x 21, less where parts are
+  // made. Sweep: within 3 %.
   double factor_work = 9.0;
   // Cost of an evaluation in iterations of GMRES: 1.0 at 41 x 41 vertices, 3 at 21 x 21. Sweep: within 2 %.
   double newton_work = 1.5;
