@@ -16,7 +16,7 @@ from stickslip_services.errors import ConflictError, QuotaExceededError, Unknown
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, start, sweep
 from stickslip_services.queue.ids import task_key
-from stickslip_services.queue.lease import lease_tasks, renew_leases, sort_out
+from stickslip_services.queue.lease import lease_tasks, reconcile_leases, renew_leases
 from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
@@ -271,9 +271,9 @@ def test_heartbeats_that_wait_are_answered_together(context: Context, worker: Pr
         assert states is not None
         if drop is None:
             with pytest.raises(UnknownWorkerError):
-                sort_out(context, message, states)
+                reconcile_leases(context, message, states)
         else:
-            assert sort_out(context, message, states).drop == drop
+            assert reconcile_leases(context, message, states).drop == drop
     assert row(context, kept.task_id).owner == worker.id
 
 

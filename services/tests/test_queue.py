@@ -15,11 +15,11 @@ from stickslip_services.database.tables import jobs, tasks
 from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, give_up_waiting, pause_job, resume_job, start, sweep
+from stickslip_services.queue.control import cancel_job, pause_job, release_ended_jobs, resume_job, start, sweep
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
-from stickslip_services.queue.ledger import LIVE, holds_alone
 from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.transaction import LIVE, has_exclusive_lease
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_jobs, parsed, rods, show_job
@@ -679,7 +679,7 @@ class TestPausing:
 def test_a_cancelled_job_gives_up_its_tasks_in_pieces(
     context: Context, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stickslip_services.queue.ledger.PIECE_TASKS", 3)
+    monkeypatch.setattr("stickslip_services.queue.transaction.RELEASE_BATCH", 3)
     job = submit(context, gamma=(1.0, 2.0, 3.0))
     kept = submit(context, gamma=(3.0, 4.0))
     leases = worker.lease(simulate=1)
@@ -687,7 +687,7 @@ def test_a_cancelled_job_gives_up_its_tasks_in_pieces(
     with context.database.read() as connection:
         waiting = connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job))
     assert waiting is not None  # of a job with more tasks than one transaction takes
-    give_up_waiting(context)
+    release_ended_jobs(context)
     with context.database.read() as connection:
         assert connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job)) is None
         assert violations(connection) == []
@@ -705,7 +705,7 @@ def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings
     with context.database.read() as connection:
         if connection.dialect.name == "sqlite":
             event.listen(connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3])))
-            assert not holds_alone(connection, 1, LIVE)
+            assert not has_exclusive_lease(connection, 1, LIVE)
             statement, values = asked[0]
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
             assert "INDEX ix_tasks_leased" in str(plan)

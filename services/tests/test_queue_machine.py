@@ -17,8 +17,8 @@ from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job, start, sweep
-from stickslip_services.queue.ledger import RUNNABLE, live_jobs
 from stickslip_services.queue.submit import Planner, submit_job
+from stickslip_services.queue.transaction import RUNNABLE, live_jobs
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job

@@ -44,7 +44,7 @@ from stickslip_services.errors import CommandError
 from stickslip_services.local.supervisor import configure_logging, limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import give_up_waiting, scrub_when_idle, start, sweep
+from stickslip_services.queue.control import release_ended_jobs, scrub_when_idle, start, sweep
 from stickslip_services.queue.lease import renew_leases
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.submit import Planner
@@ -85,7 +85,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
             (partial(check_made_datasets, context), every),
             (partial(scrub_when_idle, context), every),
             (Planner(context).run, PLAN_SECONDS),
-            (partial(give_up_waiting, context), every),
+            (partial(release_ended_jobs, context), every),
             (delivery.run, every),
         ]
         running = [asyncio.create_task(_repeat(*service)) for service in services]

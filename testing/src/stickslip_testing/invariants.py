@@ -15,7 +15,7 @@ from stickslip_services.database.tables import (
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.ledger import LIVE, ON_LEASE, OVER, READY, RUNNABLE, holds_alone
+from stickslip_services.queue.transaction import FINISHED, IS_READY, LIVE, ON_LEASE, RUNNABLE, has_exclusive_lease
 
 
 def violations(connection: Connection) -> list[str]:
@@ -106,7 +106,7 @@ def _counter_faults(connection: Connection) -> list[str]:
     grouped = connection.execute(
         select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, func.count())
         .join(tasks, tasks.c.seq == job_tasks.c.task)
-        .where(job_tasks.c.job.in_(open_jobs), tasks.c.state.not_in(OVER))
+        .where(job_tasks.c.job.in_(open_jobs), tasks.c.state.not_in(FINISHED))
         .group_by(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
     )
     there_left = {(job, stage, group): count for job, stage, group, count in grouped}
@@ -129,12 +129,16 @@ def _job_faults(connection: Connection) -> list[str]:
         there = set(connection.scalars(own))
         if row.state == JobState.queued and there & {*ON_LEASE}:
             faults.append(f"job {row.seq} is queued and a task of it is on lease")
-        if row.state == JobState.pausing and not holds_alone(connection, row.seq, RUNNABLE):
+        if row.state == JobState.pausing and not has_exclusive_lease(connection, row.seq, RUNNABLE):
             faults.append(f"job {row.seq} is pausing and nothing runs for it alone")
-        if row.state == JobState.cancelling and row.given_up is None and not holds_alone(connection, row.seq, LIVE):
+        if (
+            row.state == JobState.cancelling
+            and row.given_up is None
+            and not has_exclusive_lease(connection, row.seq, LIVE)
+        ):
             faults.append(f"job {row.seq} is cancelling and nothing runs for it alone")
         is_blocked = TaskState.failed in there and not there & {*ON_LEASE, TaskState.soft_failed}
-        is_blocked &= connection.execute(own.where(READY).limit(1)).first() is None
+        is_blocked &= connection.execute(own.where(IS_READY).limit(1)).first() is None
         if row.state in (JobState.queued, JobState.running) and is_blocked:
             faults.append(f"job {row.seq} is {row.state} and only quarantined tasks of it are left")
     for row in connection.execute(

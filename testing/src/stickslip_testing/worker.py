@@ -52,7 +52,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.lease import lease_tasks, register_worker, renew_leases, sort_out
+from stickslip_services.queue.lease import lease_tasks, reconcile_leases, register_worker, renew_leases
 from stickslip_services.queue.report import report_results
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
@@ -74,7 +74,7 @@ def rejection(message: str = "it diverged") -> TaskResult:
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
     """Answer a heartbeat alone."""
     (left,) = renew_leases(context, [message])
-    return HeartbeatAnswer(drop=()) if left is None else sort_out(context, message, left)
+    return HeartbeatAnswer(drop=()) if left is None else reconcile_leases(context, message, left)
 
 
 class DirectApi:

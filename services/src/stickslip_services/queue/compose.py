@@ -20,8 +20,8 @@ from stickslip_services.database.database import Prepared, batches
 from stickslip_services.database.tables import samples, task_dependencies, tasks
 from stickslip_services.errors import ConflictError, DamagedRowsError, NotFoundError
 from stickslip_services.queue.ids import task_id, task_key
-from stickslip_services.queue.ledger import TASK
 from stickslip_services.queue.recompute import check_results, check_samples, read_plan
+from stickslip_services.queue.transaction import TASK_COLUMNS
 
 UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError, TypeError)
 """Errors that damaged rows cause."""
@@ -29,7 +29,7 @@ UNSOUND = (DamagedRowsError, ConflictError, NoResultFound, ValueError, KeyError,
 Publish = Callable[[bytes], Sha256]
 """Stores an artifact and returns its digest."""
 
-STORED_TASK = [*TASK, *(tasks.c[name] for name in ("key", "build", "payload", "preview"))]
+STORED_TASK = [*TASK_COLUMNS, *(tasks.c[name] for name in ("key", "build", "payload", "preview"))]
 """Columns of a task from which its document is composed."""
 
 

@@ -16,7 +16,7 @@ from stickslip_schemas.store import DirectoryStore, Store, open_store
 
 from stickslip_services.database.database import Clock, Database, Role
 from stickslip_services.database.opening import connect
-from stickslip_services.queue.ledger import Ledger, ledger
+from stickslip_services.queue.transaction import QueueTransaction, queue_transaction
 from stickslip_services.settings import Settings
 
 HOLD_SECONDS = 10.0
@@ -129,10 +129,10 @@ class Context:
         self.database.close()
 
     @contextmanager
-    def ledger(self) -> Iterator[Ledger]:
+    def transaction(self) -> Iterator[QueueTransaction]:
         """Open a write transaction with a ledger; notify watchers after the commit."""
-        with self.database.write() as connection, ledger(connection, self.clock()) as book:
-            yield book
+        with self.database.write() as connection, queue_transaction(connection, self.clock()) as tx:
+            yield tx
         self.notifier.notify()
 
     @property

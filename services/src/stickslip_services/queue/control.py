@@ -26,12 +26,12 @@ from stickslip_services.database.tables import dataset_versions, jobs, tasks, wo
 from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import find_job, has_runnable_job, show_job
-from stickslip_services.queue.ledger import HELD, RUNNABLE, Ledger, give_up, reassign_waiting
 from stickslip_services.queue.plan import begin_planning, insert_job
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, fail_damaged_jobs, read_plan
-from stickslip_services.queue.report import take_back
+from stickslip_services.queue.report import expire_leases
 from stickslip_services.queue.submit import plan_waiting_jobs, release_claims
-from stickslip_services.queue.workers import NO_WORKER, note_stranded
+from stickslip_services.queue.transaction import IS_LEASED, RUNNABLE, QueueTransaction, reassign_waiting, release_tasks
+from stickslip_services.queue.workers import NO_WORKER, update_unschedulable_jobs
 
 logger = logging.getLogger(__name__)
 
@@ -43,42 +43,42 @@ IDLE_RATE = 50e6
 
 def cancel_job(context: Context, job_id: str) -> JobDetail:
     """Cancel a job; one that is cancelled, or being cancelled, stays so. Raise ConflictError if it has ended."""
-    with _change(context, job_id, "job.cancel") as (book, job):
+    with _change(context, job_id, "job.cancel") as (tx, job):
         if job.state not in (JobState.cancelling, JobState.cancelled):
             if not JobState(job.state).is_open:
                 raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
             message = "tasks that are running are being stopped"
-            book.set_state(job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
-            give_up(book, job.seq)
+            tx.set_job_state(job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
+            release_tasks(tx, job.seq)
     return _shown(context, job.seq)
 
 
 _TO_GIVE_UP = Prepared(select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1))
 
 
-def give_up_waiting(context: Context) -> None:
+def release_ended_jobs(context: Context) -> None:
     """Give up the remaining waiting tasks of jobs that end, piece by piece, with pauses for other writers."""
     while not context.is_closing:
         with context.database.read() as connection:
             if not _TO_GIVE_UP.tuples(connection):
                 return
         began = time.monotonic()
-        with context.ledger() as book:
-            for job, after in _TO_GIVE_UP.tuples(book.connection):
-                give_up(book, job, after)
+        with context.transaction() as tx:
+            for job, after in _TO_GIVE_UP.tuples(tx.connection):
+                release_tasks(tx, job, after)
         time.sleep(time.monotonic() - began)
 
 
 def pause_job(context: Context, job_id: str) -> JobDetail:
     """Pause a job: no further tasks are leased, running ones finish. Raise ConflictError if it has ended."""
-    with _change(context, job_id, "job.pause") as (book, job):
+    with _change(context, job_id, "job.pause") as (tx, job):
         pausing = (JobState.pausing, JobState.paused)
         if job.state not in (*RUNNABLE, *pausing):
             raise ConflictError(
                 f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
             )
         if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
-            pause(book, job.seq, message="nothing more is started; tasks that are running finish")
+            pause(tx, job.seq, message="nothing more is started; tasks that are running finish")
     return _shown(context, job.seq)
 
 
@@ -89,39 +89,39 @@ def resume_job(context: Context, job_id: str) -> JobDetail:
     """
     if trouble := context.store_watch.trouble:
         raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
-    with _change(context, job_id, "job.resume") as (book, job):
-        resume(book, job)
+    with _change(context, job_id, "job.resume") as (tx, job):
+        resume(tx, job)
     plan_waiting_jobs(context)
-    note_stranded(context)
+    update_unschedulable_jobs(context)
     return _shown(context, job.seq)
 
 
 def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
     """Set the priority of a job. Raise ConflictError if it has ended."""
-    with _change(context, job_id, "job.prioritise", priority=priority) as (book, job):
+    with _change(context, job_id, "job.prioritise", priority=priority) as (tx, job):
         if not JobState(job.state).is_open:
             raise ConflictError(f"job {job_id} has ended ({job.state}); its priority cannot be changed")
-        book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
-        reassign_waiting(book, job.seq)
+        tx.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
+        reassign_waiting(tx, job.seq)
     return _shown(context, job.seq)
 
 
 @contextmanager
-def _change(context: Context, job_id: str, action: str, **details: Any) -> Iterator[tuple[Ledger, Row[Any]]]:
+def _change(context: Context, job_id: str, action: str, **details: Any) -> Iterator[tuple[QueueTransaction, Row[Any]]]:
     """Open a transaction that changes a job; yield its ledger and the job's row. It ends with an audit entry."""
-    with context.ledger() as book:
-        job = find_job(book.connection, job_id)
-        yield book, job
-        note(book.connection, action, job_id, book.now, **details)
+    with context.transaction() as tx:
+        job = find_job(tx.connection, job_id)
+        yield tx, job
+        note(tx.connection, action, job_id, tx.now, **details)
 
 
-def pause(book: Ledger, job: int, *, reason: Reason | None = None, message: str) -> None:
+def pause(tx: QueueTransaction, job: int, *, reason: Reason | None = None, message: str) -> None:
     """Start no further task of a job."""
-    book.set_state(job, JobState.pausing, reason=reason, message=message)
-    reassign_waiting(book, job)
+    tx.set_job_state(job, JobState.pausing, reason=reason, message=message)
+    reassign_waiting(tx, job)
 
 
-def resume(book: Ledger, job: Any) -> None:
+def resume(tx: QueueTransaction, job: Any) -> None:
     """Let a job, a row of `jobs`, go on; raise ConflictError if it has ended."""
     if job.state in RUNNABLE:
         return
@@ -131,8 +131,8 @@ def resume(book: Ledger, job: Any) -> None:
     if job.builds is not None and job.planned < job.sample_count:
         state = JobState.planning
     reason, message = (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
-    book.set_state(job.seq, state, reason=reason, message=message)
-    reassign_waiting(book, job.seq)
+    tx.set_job_state(job.seq, state, reason=reason, message=message)
+    reassign_waiting(tx, job.seq)
 
 
 def _shown(context: Context, job: int) -> JobDetail:
@@ -148,7 +148,7 @@ def start(context: Context) -> None:
         if context.database.is_alone(connection):  # no other coordinator could have taken a heartbeat
             now = context.clock()
             expires_at = now + context.settings.lease_seconds
-            connection.execute(update(tasks).where(HELD).values(expires_at=expires_at))
+            connection.execute(update(tasks).where(IS_LEASED).values(expires_at=expires_at))
             ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
             connection.execute(update(workers).where(ahead).values(last_seen_at=now))
             release_claims(connection)
@@ -160,8 +160,8 @@ def sweep(context: Context) -> None:
     fail_damaged_jobs(context)
     _watch_store(context)
     plan_waiting_jobs(context)
-    take_back(context)
-    note_stranded(context)
+    expire_leases(context)
+    update_unschedulable_jobs(context)
     check_made_datasets(context, at_most=CHECKED_AT_ONCE)
 
 
@@ -181,12 +181,12 @@ def _watch_store(context: Context) -> None:
         if not due.tuples(connection):
             return
     message = f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes results again"
-    with context.ledger() as book:
-        for job in due.rows(book.connection):
+    with context.transaction() as tx:
+        for job in due.rows(tx.connection):
             if trouble:
-                pause(book, job.seq, reason=Reason.store_unavailable, message=message)
+                pause(tx, job.seq, reason=Reason.store_unavailable, message=message)
             else:
-                resume(book, job)
+                resume(tx, job)
     logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
 
 
@@ -206,15 +206,15 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
         return None
     found = damaged_files(context.store, row.manifest, row.group_digest, rate=rate)
     damaged = [MANIFEST_NAME] if found is None else sorted(found)
-    with context.ledger() as book:
+    with context.transaction() as tx:
         own = update(dataset_versions).where(columns.publish_task == row.publish_task)
-        book.connection.execute(own.values(scrubbed_at=book.now, damaged=len(damaged)))
-        made = book.connection.execute(select(jobs).where(jobs.c.publish_task == row.publish_task)).all()
+        tx.connection.execute(own.values(scrubbed_at=tx.now, damaged=len(damaged)))
+        made = tx.connection.execute(select(jobs).where(jobs.c.publish_task == row.publish_task)).all()
         if damaged and made and not any(JobState(job.state).is_open for job in made):
             with suppress(DamagedRowsError):  # then it is only named
-                spec, terms = read_plan(book.connection, made[0].seq)
-                job = insert_job(book, spec, project=made[0].project)
-                begin_planning(book, job, terms)
+                spec, terms = read_plan(tx.connection, made[0].seq)
+                job = insert_job(tx, spec, project=made[0].project)
+                begin_planning(tx, job, terms)
     key, seal = context.settings.signing_key, seal_text(row.manifest, row.group_digest)
     if found is not None and key is not None and mend_signature(context.store, row.dataset, row.version, seal, key):
         damaged.append(SIGNATURE_NAME)

@@ -26,8 +26,8 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Frames, StageTimings, read_progress, rejected_samples
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.ledger import RUNNABLE
 from stickslip_services.queue.recompute import check_results, check_samples, terms_of
+from stickslip_services.queue.transaction import RUNNABLE
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
 _UNSETTLED = [state for state in TaskState if not state.is_settled]

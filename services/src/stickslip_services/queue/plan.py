@@ -32,15 +32,15 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, new_id, row_digest
-from stickslip_services.queue.ledger import (
-    FRESH,
+from stickslip_services.queue.transaction import (
+    FINISHED,
     JOB_COUNTS,
     JOB_GROUPS,
-    OVER,
+    RESET_ATTEMPTS,
     SETTLED,
-    TASK,
+    TASK_COLUMNS,
     TASK_COUNTS,
-    Ledger,
+    QueueTransaction,
     reassign,
 )
 from stickslip_services.queue.workers import builds_for
@@ -182,10 +182,10 @@ def _piece(spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[in
 _LOST = (TaskState.failed, TaskState.cancelled)
 
 
-def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str = "") -> int:
+def insert_job(tx: QueueTransaction, spec: JobSpec, *, priority: int = 0, project: str = "") -> int:
     """Insert a job without its tasks; return its `seq`."""
     text = spec.model_dump_json()
-    result = book.connection.execute(
+    result = tx.connection.execute(
         insert(jobs).values(
             id=new_id("job"),
             name=spec.name,
@@ -198,52 +198,52 @@ def insert_job(book: Ledger, spec: JobSpec, *, priority: int = 0, project: str =
             message="",
             rejected_count=0,
             priority=priority,
-            created_at=book.now,
+            created_at=tx.now,
         )
     )
     return int(result.inserted_primary_key[0])  # type: ignore[index]  # of one inserted row it is never None
 
 
-def begin_planning(book: Ledger, job: int, terms: Terms, plan: Plan | None = None) -> None:
+def begin_planning(tx: QueueTransaction, job: int, terms: Terms, plan: Plan | None = None) -> None:
     """Store the terms of a job, start its counters, and write its whole plan, or have it planned piece by piece."""
-    spec = book.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
+    spec = tx.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
     values = {"builds": terms.builds.model_dump_json(), "certificate": terms.certificate}
     digest = row_digest(spec, *values.values())
-    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest}))
+    tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest}))
     rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
-    insert_rows(book.connection, job_counts, ("job", "stage", "state", "count"), rows)
-    insert_rows(book.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
-    book.set_state(job, JobState.planning if plan is None else JobState.queued)
+    insert_rows(tx.connection, job_counts, ("job", "stage", "state", "count"), rows)
+    insert_rows(tx.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
+    tx.set_job_state(job, JobState.planning if plan is None else JobState.queued)
     if plan is not None:
-        write_plan(book, job, plan)
+        write_plan(tx, job, plan)
 
 
-def write_plan(book: Ledger, job: int, piece: Plan) -> None:
+def write_plan(tx: QueueTransaction, job: int, piece: Plan) -> None:
     """Insert the tasks of a piece of a job; the last piece makes a `planning` job `queued`.
 
     If its dataset exists already, the job ends once the dataset has been checked (`recompute`).
     """
-    last = _insert_plan(book, job, piece)
-    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(planned=piece.end))
+    last = _insert_plan(tx, job, piece)
+    tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(planned=piece.end))
     if not piece.is_last:
         return
-    publish_task = book.connection.scalar(select(tasks.c.seq).where(tasks.c.key == piece.publish_key))
+    publish_task = tx.connection.scalar(select(tasks.c.seq).where(tasks.c.key == piece.publish_key))
     done = {"publish_task": publish_task, "planner": None, "planner_until": None}
-    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
+    tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(done))
     if last == TaskState.succeeded:
         message = "the dataset exists already: its files are being checked"
-        book.set_state(job, JobState.queued, message=message)
-    elif book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == job)) == JobState.planning:
-        book.set_state(job, JobState.queued)
+        tx.set_job_state(job, JobState.queued, message=message)
+    elif tx.connection.scalar(select(jobs.c.state).where(jobs.c.seq == job)) == JobState.planning:
+        tx.set_job_state(job, JobState.queued)
 
 
-_KNOWN = [*TASK, *(tasks.c[name] for name in ("key", "reason", "message", "cost_group"))]
+_KNOWN = [*TASK_COLUMNS, *(tasks.c[name] for name in ("key", "reason", "message", "cost_group"))]
 """Columns of tasks that were in the database before the piece."""
 
 
-def _insert_plan(book: Ledger, job: int, plan: Plan) -> str:
+def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> str:
     """Insert the tasks of `job`; return the state of the last one."""
-    connection = book.connection
+    connection = tx.connection
     needed = {key for task in plan.tasks.values() for key in task.depends_on} - plan.tasks.keys()
     known = {}
     if connection.scalar(select(tasks.c.seq).limit(1)):
@@ -278,12 +278,12 @@ def _insert_plan(book: Ledger, job: int, plan: Plan) -> str:
     TASK_COUNTS.add(connection, overall)
     _add_counts(connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared))
     lost = [task for task in shared if task.state in _LOST]
-    book.move(lost, TaskState.pending, **FRESH)  # which changes the counts
+    tx.set_task_state(lost, TaskState.pending, **RESET_ATTEMPTS)  # which changes the counts
     for key, old in known.items():
         if old.state in _LOST and key in plan.tasks:  # its row may have been damaged
             values = {"payload": _payload(plan.tasks[key], job), "build": plan.tasks[key].build}
             connection.execute(update(tasks).where(tasks.c.seq == old.seq).values(values))
-    reassign(book, [task for task in shared if task.state not in SETTLED])
+    reassign(tx, [task for task in shared if task.state not in SETTLED])
     return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
 
 
@@ -339,7 +339,7 @@ def _add_counts(connection: Connection, job: int, held: Mapping[tuple[str, str, 
     counts, left, cached = Counter[Any](), Counter[Any](), Counter[str]()
     for (stage, group, state), count in held.items():
         counts[job, stage, state] += count
-        left[job, stage, group] += count * (state not in OVER)
+        left[job, stage, group] += count * (state not in FINISHED)
         cached[stage] += count * (state in SETTLED)
     JOB_COUNTS.add(connection, counts)
     JOB_GROUPS.add(connection, left)

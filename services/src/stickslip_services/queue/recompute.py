@@ -29,8 +29,18 @@ from stickslip_services.database.tables import dataset_versions, jobs, task_depe
 from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
-from stickslip_services.queue.ledger import FRESH, LIVE, OVER, SETTLED, TASK, Ledger, Task, charge, live_jobs
 from stickslip_services.queue.plan import Terms
+from stickslip_services.queue.transaction import (
+    FINISHED,
+    LIVE,
+    RESET_ATTEMPTS,
+    SETTLED,
+    TASK_COLUMNS,
+    QueueTransaction,
+    Task,
+    assign,
+    live_jobs,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -40,20 +50,20 @@ CHECKED_AT_ONCE = 64 * 2**20
 DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-def recompute(book: Ledger, consumer: int, digests: Collection[Sha256]) -> None:
+def recompute(tx: QueueTransaction, consumer: int, digests: Collection[Sha256]) -> None:
     """Reset the tasks that made `digests`, and let `consumer` wait for them."""
-    remake(book, consumer, _find_makers(book, consumer, set(digests)))
+    rerun_producers(tx, consumer, _find_makers(tx, consumer, set(digests)))
 
 
-def remake(book: Ledger, consumer: int, makers: Sequence[Any]) -> None:
+def rerun_producers(tx: QueueTransaction, consumer: int, makers: Sequence[Any]) -> None:
     """Reset tasks, and let `consumer` wait for them."""
     known = set(
-        book.connection.scalars(select(task_dependencies.c.depends_on).where(task_dependencies.c.task == consumer))
+        tx.connection.scalars(select(task_dependencies.c.depends_on).where(task_dependencies.c.task == consumer))
     )
     new = [maker for maker in makers if maker.seq not in known]
-    insert_rows(book.connection, task_dependencies, ("task", "depends_on"), ((consumer, maker.seq) for maker in new))
-    wait_for(book, {consumer: sum(maker.state not in SETTLED for maker in new)})
-    reopen(book, makers)
+    insert_rows(tx.connection, task_dependencies, ("task", "depends_on"), ((consumer, maker.seq) for maker in new))
+    add_dependencies(tx, {consumer: sum(maker.state not in SETTLED for maker in new)})
+    reset_to_pending(tx, makers)
 
 
 # Live jobs whose dataset existed before their submission, and has not been checked yet.
@@ -86,50 +96,50 @@ def check_made_datasets(context: Context, *, at_most: int | None = None) -> None
             except OSError as error:  # out of reach: the next sweep tries again
                 logger.warning("an existing dataset cannot be checked now: %s", error)
                 continue
-            with context.ledger() as book:
-                end_made(book, made, damaged)
+            with context.transaction() as tx:
+                end_made(tx, made, damaged)
 
 
-def end_made(book: Ledger, made: Any, damaged: Mapping[str, Sha256] | None) -> None:
+def end_made(tx: QueueTransaction, made: Any, damaged: Mapping[str, Sha256] | None) -> None:
     """End a job (a row of `_MADE_JOBS`) whose dataset is intact; otherwise reset the tasks that made the damaged files.
 
     `damaged` has the paths and digests of the damaged files; None if the manifest itself cannot be trusted.
     """
-    if made not in _MADE_JOBS.rows(book.connection):
+    if made not in _MADE_JOBS.rows(tx.connection):
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
         own = dataset_versions.c.publish_task == made.publish_task
-        book.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=book.now, damaged=0))
-        book.publish(made.seq, find_committed(book.connection, made.publish_task), "every result was cached")
+        tx.connection.execute(update(dataset_versions).where(own).values(scrubbed_at=tx.now, damaged=0))
+        tx.complete_job(made.seq, find_committed(tx.connection, made.publish_task), "every result was cached")
         return
     what = "its manifest was" if damaged is None else f"{len(damaged)} of its files were"
     message = f"the dataset was made before, but {what} damaged or lost in the store; missing files are recomputed"
-    book.set_state(made.seq, JobState.queued, message=message)
-    reopen(book, [Task(made.publish_task, Stage.publish, TaskState.succeeded)])
-    recompute(book, made.publish_task, damaged.values() if damaged else ())
+    tx.set_job_state(made.seq, JobState.queued, message=message)
+    reset_to_pending(tx, [Task(made.publish_task, Stage.publish, TaskState.succeeded)])
+    recompute(tx, made.publish_task, damaged.values() if damaged else ())
 
 
-def reopen(book: Ledger, makers: Iterable[Any]) -> None:
+def reset_to_pending(tx: QueueTransaction, makers: Iterable[Any]) -> None:
     """Let ended tasks that a live job needs run again, with all their tries. Their outputs stay until then."""
-    ended = [maker for maker in makers if maker.state in OVER]
-    job_of = live_jobs(book.connection, [maker.seq for maker in ended])
+    ended = [maker for maker in makers if maker.state in FINISHED]
+    job_of = live_jobs(tx.connection, [maker.seq for maker in ended])
     ended = [maker for maker in ended if maker.seq in job_of]
     settled = [maker.seq for maker in ended if maker.state in SETTLED]
-    edges = rows_with(book.connection, select(task_dependencies.c.task), task_dependencies.c.depends_on, settled)
-    wait_for(book, Counter(edge.task for edge in edges))
-    charge(book.connection, job_of)
-    book.move(ended, TaskState.pending, **FRESH)
+    edges = rows_with(tx.connection, select(task_dependencies.c.task), task_dependencies.c.depends_on, settled)
+    add_dependencies(tx, Counter(edge.task for edge in edges))
+    assign(tx.connection, job_of)
+    tx.set_task_state(ended, TaskState.pending, **RESET_ATTEMPTS)
 
 
-def _find_makers(book: Ledger, consumer: int, digests: set[Sha256]) -> list[Any]:
+def _find_makers(tx: QueueTransaction, consumer: int, digests: set[Sha256]) -> list[Any]:
     """Return the tasks that made `digests`, searched breadth-first among the dependencies of `consumer`."""
     edge = task_dependencies.c.depends_on == tasks.c.seq
-    needed = select(*TASK, tasks.c.output).join(task_dependencies, edge).distinct()
+    needed = select(*TASK_COLUMNS, tasks.c.output).join(task_dependencies, edge).distinct()
     makers: list[Any] = []
     level, seen = {consumer}, {consumer}
     while level and digests:
         below: set[int] = set()
-        for row in rows_with(book.connection, needed, task_dependencies.c.task, level):
+        for row in rows_with(tx.connection, needed, task_dependencies.c.task, level):
             made = digests.intersection(DIGEST.findall(row.output or ""))
             if row.seq not in seen and made:
                 makers.append(row)
@@ -145,9 +155,9 @@ _WAIT_FOR = Prepared(
 )
 
 
-def wait_for(book: Ledger, more: Mapping[int, int]) -> None:
+def add_dependencies(tx: QueueTransaction, more: Mapping[int, int]) -> None:
     """Add to the number of tasks that each task waits for."""
-    _WAIT_FOR.run_all(book.connection, [{"b_seq": task, "b_more": n} for task, n in more.items() if n])
+    _WAIT_FOR.run_all(tx.connection, [{"b_seq": task, "b_more": n} for task, n in more.items() if n])
 
 
 def terms_of(row: Any) -> tuple[JobSpec, Terms | None]:
@@ -189,12 +199,12 @@ def fail_damaged_jobs(context: Context) -> None:
         rows = connection.execute(select(jobs).where(jobs.c.state.in_(LIVE))).all()
     damaged = [row.seq for row in rows if row_digest(row.spec, row.builds, row.certificate) != row.digest]
     if damaged:
-        with context.ledger() as book:
+        with context.transaction() as tx:
             for job in damaged:
-                book.end(job, JobState.failed, Reason.storage_error, str(DamagedRowsError()))
+                tx.end_job(job, JobState.failed, Reason.storage_error, str(DamagedRowsError()))
 
 
-def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:
+def recompute_damaged_rows(tx: QueueTransaction, consumer: int, results: Sequence[int]) -> None:
     """Let tasks make their damaged results again, and `consumer` wait for them.
 
     A rejected simulation is repeated, too, since it rejects its renders.
@@ -202,9 +212,9 @@ def mend(book: Ledger, consumer: int, results: Sequence[int]) -> None:
     needed = select(task_dependencies.c.depends_on).where(task_dependencies.c.task.in_(results))
     rejecting = tasks.c.seq.in_(needed), tasks.c.state == TaskState.rejected
     makers = []
-    for row in book.connection.execute(select(tasks).where(or_(tasks.c.seq.in_(results), and_(*rejecting)))).all():
+    for row in tx.connection.execute(select(tasks).where(or_(tasks.c.seq.in_(results), and_(*rejecting)))).all():
         whole = [state for state in SETTLED if result_digest(row, state) == row.digest]
         state = [*whole, *(state for state in TaskState if state == row.state), TaskState.succeeded][0]
-        book.connection.execute(update(tasks).where(tasks.c.seq == row.seq).values(state=state))
+        tx.connection.execute(update(tasks).where(tasks.c.seq == row.seq).values(state=state))
         makers.append(Task(row.seq, row.stage, state))
-    remake(book, consumer, makers)
+    rerun_producers(tx, consumer, makers)

@@ -35,12 +35,20 @@ from stickslip_services.database.database import Prepared, batches
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest, task_id, task_key
-from stickslip_services.queue.ledger import HELD, LIVE, RUNNABLE, SETTLED, TASK, Ledger, reassign
-from stickslip_services.queue.recompute import recompute, wait_for
-from stickslip_services.queue.workers import find_worker, note_heard
+from stickslip_services.queue.recompute import add_dependencies, recompute
+from stickslip_services.queue.transaction import (
+    IS_LEASED,
+    LIVE,
+    RUNNABLE,
+    SETTLED,
+    TASK_COLUMNS,
+    QueueTransaction,
+    reassign,
+)
+from stickslip_services.queue.workers import find_worker, touch_workers
 from stickslip_services.settings import Settings
 
-HELD_TASK = [*TASK, *(tasks.c[name] for name in ("key", "tries", "losses", "token", "expires_at"))]
+LEASED_TASK_COLUMNS = [*TASK_COLUMNS, *(tasks.c[name] for name in ("key", "tries", "losses", "token", "expires_at"))]
 """Columns of a leased task, or of one whose lease has just ended."""
 
 Ended = tuple[Any, TaskResult]
@@ -53,7 +61,8 @@ _NOTE_REPORT = Prepared(
 )
 _FIND = Prepared(
     select(
-        *HELD_TASK, *(tasks.c[name] for name in ("kind", "cost_group", "owner", "reported_by", "reported_token"))
+        *LEASED_TASK_COLUMNS,
+        *(tasks.c[name] for name in ("kind", "cost_group", "owner", "reported_by", "reported_token")),
     ).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
 )
 _WRITTEN = ("state", "reason", "message", "output", "digest", "cpu_seconds", "wall_seconds", "finished_at")
@@ -73,28 +82,28 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
     """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
     versions: dict[str, Manifest] = {}
     reports = [_checked_in_store(context, report, versions) for report in batch.reports]
-    with context.ledger() as book:
-        worker = find_worker(book.connection, batch.worker_id)
-        note_heard(book.connection, [worker.id], book.now)
-        verdicts, released, ended = _judged(book, worker.id, reports, versions)
-        give_back(book, released)
+    with context.transaction() as tx:
+        worker = find_worker(tx.connection, batch.worker_id)
+        touch_workers(tx.connection, [worker.id], tx.now)
+        verdicts, released, ended = _judged(tx, worker.id, reports, versions)
+        requeue(tx, released)
         # Who reports a result has started the task, whether or not a heartbeat said so in between.
-        book.start([task for task, _ in ended if task.state == TaskState.leased])
+        tx.mark_started([task for task, _ in ended if task.state == TaskState.leased])
         ended = [(task._replace(state=TaskState.running), result) for task, result in ended]
-        _take_results(book, [(task, result) for task, result in ended if result.outcome != "failed"], versions)
+        _take_results(tx, [(task, result) for task, result in ended if result.outcome != "failed"], versions)
         charged: list[tuple[Any, Reason, str]] = []
         for task, result in ended:
             if result.reason is Reason.store_unavailable:
                 context.store_watch.note(f"worker {worker.name} cannot use the store: {result.message}")
-                give_back(book, [task])
+                requeue(tx, [task])
             elif result.reason is Reason.worker_lost:
-                lose(book, [task], context.settings, message=result.message)
+                requeue_lost(tx, [task], context.settings, message=result.message)
             elif result.outcome == "failed":
                 charged.append((task, result.reason or Reason.internal_error, result.message))
-        fail_tries(book, charged, context.settings)
+        record_failures(tx, charged, context.settings)
         for task, result in ended:
             if result.damaged_inputs:
-                recompute(book, task.seq, result.damaged_inputs)
+                recompute(tx, task.seq, result.damaged_inputs)
     for verdict in verdicts:
         if verdict.verdict == "accepted" and verdict.task_id in versions:
             with suppress(OSError):
@@ -132,7 +141,7 @@ def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
 
 
 def _judged(
-    book: Ledger, worker_id: str, reports: Sequence[Report], versions: dict[str, Manifest]
+    tx: QueueTransaction, worker_id: str, reports: Sequence[Report], versions: dict[str, Manifest]
 ) -> tuple[list[ReportVerdict], list[Any], list[Ended]]:
     """Judge each report; return the verdicts, the tasks that were given back, and those that have ended.
 
@@ -142,7 +151,7 @@ def _judged(
     released: list[Any] = []
     ended: list[Ended] = []
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
-    found = (row for batch in batches(keys) for row in _FIND.rows(book.connection, {"b_keys": batch}))
+    found = (row for batch in batches(keys) for row in _FIND.rows(tx.connection, {"b_keys": batch}))
     rows = {task_id(row.stage, row.key): row for row in found}
     for report in reports:
         row, mine = rows.get(report.task_id), (worker_id, report.token)
@@ -156,13 +165,13 @@ def _judged(
             if report.result is None:
                 released.append(row)
             else:
-                ended.append((row, _checked(book, row, report.result, versions)))
+                ended.append((row, _checked(tx, row, report.result, versions)))
     for batch in batches([*released, *(task for task, _ in ended)]):
-        _NOTE_REPORT.run(book.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
+        _NOTE_REPORT.run(tx.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
     return verdicts, released, ended
 
 
-def _checked(book: Ledger, task: Any, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
+def _checked(tx: QueueTransaction, task: Any, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
     """Return the result, or a failure where it does not fit the task."""
     if result.output is not None and result.output.stage != task.stage:
         wrong = f"the worker answered with the output of stage {result.output.stage}"
@@ -171,110 +180,112 @@ def _checked(book: Ledger, task: Any, result: TaskResult, versions: dict[str, Ma
         wrong = f"the worker rejected a {task.stage} task, which has no sample to reject: {result.message}"
         return _failed(result, Reason.internal_error, wrong)
     if result.output is not None and task.stage == Stage.publish:
-        reserved, version = find_reserved(book.connection, task.seq), versions.get(task_id(task.stage, task.key))
+        reserved, version = find_reserved(tx.connection, task.seq), versions.get(task_id(task.stage, task.key))
         if version is None or (version.dataset, version.version) != reserved:
             return _failed(result, Reason.storage_error, f"the manifest is not that of {reserved}")
     return result
 
 
-def _take_results(book: Ledger, settled: Sequence[Ended], versions: dict[str, Manifest]) -> None:
+def _take_results(tx: QueueTransaction, settled: Sequence[Ended], versions: dict[str, Manifest]) -> None:
     """Store results, release the tasks that depend on them, and commit versions."""
     written = []
     rejected: dict[int, tuple[Reason, str]] = {}
     for task, result in settled:
         output = None if result.output is None else result.output.model_dump_json()
         costs = {"b_cpu_seconds": result.cpu_seconds, "b_wall_seconds": result.wall_seconds}
-        written.append(_written(book, task, result.outcome, result.reason, result.message, output) | costs)
-        book.moved([task], TaskState(result.outcome))
-        book.ran(task, result)
+        written.append(_written(tx, task, result.outcome, result.reason, result.message, output) | costs)
+        tx.record_transition([task], TaskState(result.outcome))
+        tx.record_cost(task, result)
         if result.reason is not None:
             rejected[task.seq] = (result.reason, result.message)
-            book.tell(task, TaskState.rejected, *rejected[task.seq])
-    _SETTLE.run_all(book.connection, written)
-    _release_dependents(book, [task.seq for task, _ in settled], rejected)
+            tx.emit_task_event(task, TaskState.rejected, *rejected[task.seq])
+    _SETTLE.run_all(tx.connection, written)
+    _release_dependents(tx, [task.seq for task, _ in settled], rejected)
     for task, result in settled:
         if isinstance(result.output, RenderOutput) and result.output.preview is not None:
-            book.connection.execute(delete(previews).where(previews.c.task == task.seq))  # of an earlier run
-            book.connection.execute(insert(previews).values(task=task.seq, digest=result.output.preview))
+            tx.connection.execute(delete(previews).where(previews.c.task == task.seq))  # of an earlier run
+            tx.connection.execute(insert(previews).values(task=task.seq, digest=result.output.preview))
         elif isinstance(result.output, PublishOutput):
-            _commit(book, task.seq, versions[task_id(task.stage, task.key)], result.output)
+            _commit(tx, task.seq, versions[task_id(task.stage, task.key)], result.output)
 
 
-def _commit(book: Ledger, publish_task: int, manifest: Manifest, output: PublishOutput) -> None:
+def _commit(tx: QueueTransaction, publish_task: int, manifest: Manifest, output: PublishOutput) -> None:
     """Commit a version, and end the jobs that wait for it."""
-    connection = book.connection
-    of_task = (jobs.c.seq.in_(book.jobs_of(publish_task)), jobs.c.state.in_(LIVE))
+    connection = tx.connection
+    of_task = (jobs.c.seq.in_(tx.open_jobs_of(publish_task)), jobs.c.state.in_(LIVE))
     waiting = connection.execute(select(jobs.c.seq, jobs.c.name).where(*of_task).order_by(jobs.c.seq)).all()
     name = next((row.name for row in waiting if row.name is not None), None)
-    commit_version(connection, publish_task, manifest, output, name=name, now=book.now)
+    commit_version(connection, publish_task, manifest, output, name=name, now=tx.now)
     for row in waiting:
-        book.publish(row.seq, find_committed(connection, publish_task))
+        tx.complete_job(row.seq, find_committed(connection, publish_task))
 
 
 def _written(
-    book: Ledger, task: Any, state: str, reason: Reason | None, message: str, output: str | None
+    tx: QueueTransaction, task: Any, state: str, reason: Reason | None, message: str, output: str | None
 ) -> dict[str, Any]:
     """Return the parameters of `_SETTLE` for a task whose run took no time."""
     made = {"b_state": state, "b_reason": reason, "b_message": message, "b_output": output}
-    free = {"b_cpu_seconds": None, "b_wall_seconds": None, "b_finished_at": book.now}
+    free = {"b_cpu_seconds": None, "b_wall_seconds": None, "b_finished_at": tx.now}
     return {"b_seq": task.seq, **made, "b_digest": row_digest(task.key, *made.values()), **free}
 
 
-def _release_dependents(book: Ledger, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
+def _release_dependents(tx: QueueTransaction, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
     """Decrement `waiting_on` of dependents; a rejected simulation rejects its renders, which settles them in turn."""
-    edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.rows(book.connection, {"b_tasks": batch})]
+    edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.rows(tx.connection, {"b_tasks": batch})]
     if not edges:
         return
-    wait_for(book, {seq: -count for seq, count in Counter(edge.seq for edge in edges).items()})
+    add_dependencies(tx, {seq: -count for seq, count in Counter(edge.seq for edge in edges).items()})
     doomed = [
         edge
         for edge in edges
         if edge.stage == Stage.render and edge.depends_on in rejected and edge.state not in SETTLED
     ]
-    why = [_written(book, edge, TaskState.rejected, *rejected[edge.depends_on], None) for edge in doomed]
-    _SETTLE.run_all(book.connection, why)
-    book.moved(doomed, TaskState.rejected)
-    _release_dependents(book, [edge.seq for edge in doomed], {})
+    why = [_written(tx, edge, TaskState.rejected, *rejected[edge.depends_on], None) for edge in doomed]
+    _SETTLE.run_all(tx.connection, why)
+    tx.record_transition(doomed, TaskState.rejected)
+    _release_dependents(tx, [edge.seq for edge in doomed], {})
 
 
-_FIND_HELD = Prepared(select(*HELD_TASK).where(HELD, tasks.c.owner.in_(bindparam("b_owners", expanding=True))))
+_FIND_HELD = Prepared(
+    select(*LEASED_TASK_COLUMNS).where(IS_LEASED, tasks.c.owner.in_(bindparam("b_owners", expanding=True)))
+)
 
 
-def find_held(connection: Connection, owners: Sequence[str]) -> list[Any]:
+def leased_tasks_of(connection: Connection, owners: Sequence[str]) -> list[Any]:
     return _FIND_HELD.rows(connection, {"b_owners": owners})
 
 
-def give_back(book: Ledger, held: Sequence[Any], **values: Any) -> None:
+def requeue(tx: QueueTransaction, held: Sequence[Any], **values: Any) -> None:
     """Return tasks to `pending`, with other values of their columns; cancel those that no live job needs."""
-    book.move(reassign(book, held), TaskState.pending, **values)
+    tx.set_task_state(reassign(tx, held), TaskState.pending, **values)
 
 
-def lose(book: Ledger, held: Sequence[Any], settings: Settings, *, message: str) -> None:
+def requeue_lost(tx: QueueTransaction, held: Sequence[Any], settings: Settings, *, message: str) -> None:
     """Take back the leases of a lost worker. A task fails after `max_losses` lost workers."""
     started = [task for task in held if task.state == TaskState.running]
-    give_back(book, [task for task in held if task.state == TaskState.leased])
-    give_back(book, [task for task in started if task.losses + 1 < settings.max_losses], losses=tasks.c.losses + 1)
+    requeue(tx, [task for task in held if task.state == TaskState.leased])
+    requeue(tx, [task for task in started if task.losses + 1 < settings.max_losses], losses=tasks.c.losses + 1)
     for task in started:
-        if task.losses + 1 >= settings.max_losses and reassign(book, [task]):
-            _fail(book, task, Reason.worker_lost, message, task.losses + 1, settings)
+        if task.losses + 1 >= settings.max_losses and reassign(tx, [task]):
+            _fail(tx, task, Reason.worker_lost, message, task.losses + 1, settings)
 
 
-def fail_tries(book: Ledger, failures: Sequence[tuple[Any, Reason, str]], settings: Settings) -> None:
+def record_failures(tx: QueueTransaction, failures: Sequence[tuple[Any, Reason, str]], settings: Settings) -> None:
     """Count failed tries; each task is retried later, or fails for good."""
     for task, reason, message in failures:
         tries = task.tries + 1
-        if not reassign(book, [task]):
+        if not reassign(tx, [task]):
             continue
         if tries >= settings.max_tries:
-            _fail(book, task, reason, message, tries, settings)
+            _fail(tx, task, reason, message, tries, settings)
             continue
-        retry_at = book.now + settings.retry_seconds * 2 ** (tries - 1)
+        retry_at = tx.now + settings.retry_seconds * 2 ** (tries - 1)
         why: dict[str, Any] = {"reason": reason, "message": message}
-        book.move([task], TaskState.soft_failed, tries=tries, retry_at=retry_at, **why)
-        book.tell(task, TaskState.soft_failed, **why)
+        tx.set_task_state([task], TaskState.soft_failed, tries=tries, retry_at=retry_at, **why)
+        tx.emit_task_event(task, TaskState.soft_failed, **why)
 
 
-def _fail(book: Ledger, task: Any, reason: Reason, message: str, times: int, settings: Settings) -> None:
+def _fail(tx: QueueTransaction, task: Any, reason: Reason, message: str, times: int, settings: Settings) -> None:
     """Let a task fail for good after `times` failures or losses, and quarantine it or end its jobs."""
     name = task_id(task.stage, task.key)
     command = reproducer(name, settings)
@@ -283,20 +294,20 @@ def _fail(book: Ledger, task: Any, reason: Reason, message: str, times: int, set
     if is_quarantined := reason.ends_a_process:
         message = f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {command}"
         reason = Reason.quarantined
-    book.move([task], TaskState.failed, tries=tries, reason=reason, message=message)
-    book.tell(task, TaskState.failed, reason, message)
-    book.count()
-    for job in book.jobs_of(task.seq):
-        state, failed = book.connection.execute(_FAILED.where(jobs.c.seq == job)).one()
+    tx.set_task_state([task], TaskState.failed, tries=tries, reason=reason, message=message)
+    tx.emit_task_event(task, TaskState.failed, reason, message)
+    tx.flush_counters()
+    for job in tx.open_jobs_of(task.seq):
+        state, failed = tx.connection.execute(_FAILED.where(jobs.c.seq == job)).one()
         if is_quarantined and failed <= settings.max_quarantined:
             if state in RUNNABLE:
                 news = f"task {name} was {message}. The job goes on with the others"
-                book.set_state(job, JobState(state), reason=reason, message=news)
+                tx.set_job_state(job, JobState(state), reason=reason, message=news)
             continue
         if is_quarantined:
             why = f"{failed} of its tasks were quarantined, at last {name}: {message}"
         kept = "No further tasks are started; what is done is kept, and submitting the job again tries again"
-        book.end(job, JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}")
+        tx.end_job(job, JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}")
 
 
 _FAILED = (
@@ -307,29 +318,32 @@ _FAILED = (
 
 # A lease ends when it has had its duration, and nothing has been heard of its worker for as long.
 _EXPIRED = (
-    f"{HELD.text} AND tasks.expires_at <= :b_now "
+    f"{IS_LEASED.text} AND tasks.expires_at <= :b_now "
     "AND tasks.owner NOT IN (SELECT workers.id FROM workers WHERE workers.last_seen_at > :b_alive_since)"
 )
 _DUE = "tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now"
-_FIND_EXPIRED, _FIND_DUE = Prepared(select(*HELD_TASK).where(text(_EXPIRED))), Prepared(select(*TASK).where(text(_DUE)))
+_FIND_EXPIRED, _FIND_DUE = (
+    Prepared(select(*LEASED_TASK_COLUMNS).where(text(_EXPIRED))),
+    Prepared(select(*TASK_COLUMNS).where(text(_DUE))),
+)
 _IS_DUE = Prepared(f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) OR EXISTS (SELECT 1 FROM tasks WHERE {_DUE})")
 
 
-def is_sweep_due(connection: Connection, now: float, alive_since: float) -> bool:
+def is_expiry_due(connection: Connection, now: float, alive_since: float) -> bool:
     """Return whether a lease has expired or a retry is due, without taking the write lock."""
     return bool(_IS_DUE.scalar(connection, {"b_now": now, "b_alive_since": alive_since}))
 
 
-def take_back(context: Context) -> None:
+def expire_leases(context: Context) -> None:
     """Take back expired leases, and return tasks whose retry is due to `pending`."""
     with context.database.read() as connection:
-        if not is_sweep_due(connection, context.clock(), context.alive_since):
+        if not is_expiry_due(connection, context.clock(), context.alive_since):
             return
     seconds = context.settings.lease_seconds
-    with context.ledger() as book:
-        expired = _FIND_EXPIRED.rows(book.connection, {"b_now": book.now, "b_alive_since": book.now - seconds})
-        lose(book, expired, context.settings, message=f"no heartbeat for {seconds:g} s")
-        book.move(_FIND_DUE.rows(book.connection, {"b_now": book.now}), TaskState.pending)
+    with context.transaction() as tx:
+        expired = _FIND_EXPIRED.rows(tx.connection, {"b_now": tx.now, "b_alive_since": tx.now - seconds})
+        requeue_lost(tx, expired, context.settings, message=f"no heartbeat for {seconds:g} s")
+        tx.set_task_state(_FIND_DUE.rows(tx.connection, {"b_now": tx.now}), TaskState.pending)
 
 
 def reproducer(name: str, settings: Settings) -> str:

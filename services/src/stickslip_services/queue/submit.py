@@ -31,9 +31,9 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import show_job, unplanned_jobs
-from stickslip_services.queue.ledger import SETTLED, ledger
 from stickslip_services.queue.plan import Plan, Terms, begin_planning, expand, insert_job, pieces, terms_for, write_plan
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, terms_of
+from stickslip_services.queue.transaction import SETTLED, queue_transaction
 from stickslip_services.queue.workers import NO_WORKER, alive_workers, present_workers
 
 logger = logging.getLogger(__name__)
@@ -65,12 +65,12 @@ def submit_job(
             return replay
         check_quota(connection, project, spec.sample_count)
         terms, now = terms_for(connection, spec), context.clock()
-        with ledger(connection, now) as book:
-            job = insert_job(book, spec, priority=priority, project=project)
+        with queue_transaction(connection, now) as tx:
+            job = insert_job(tx, spec, priority=priority, project=project)
             if terms is None:
-                book.set_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
+                tx.set_job_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
             else:
-                begin_planning(book, job, terms, plan_at_once(context, spec, terms))
+                begin_planning(tx, job, terms, plan_at_once(context, spec, terms))
         shown = show_job(context, connection, job)
         details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
         note(connection, "job.submit", shown.id, now, **details)
@@ -197,18 +197,18 @@ def plan_waiting_jobs(context: Context) -> None:
         waiting = unplanned_jobs(connection)
         is_known = any(worker.builds for worker in present_workers(connection))
     for row in waiting if is_known else ():
-        with context.ledger() as book:
-            if row.seq not in {other.seq for other in unplanned_jobs(book.connection)}:
+        with context.transaction() as tx:
+            if row.seq not in {other.seq for other in unplanned_jobs(tx.connection)}:
                 continue  # cancelled, or planned by another coordinator
             try:
                 spec, _ = terms_of(row)
-                if (terms := terms_for(book.connection, spec)) is None:
+                if (terms := terms_for(tx.connection, spec)) is None:
                     return
-                begin_planning(book, row.seq, terms, plan_at_once(context, spec, terms))
+                begin_planning(tx, row.seq, terms, plan_at_once(context, spec, terms))
             except (KindNotAvailableError, PresetNotCertifiedError) as error:
                 is_preset = isinstance(error, PresetNotCertifiedError)
                 reason = Reason.preset_not_certified if is_preset else Reason.waiting_for_worker
-                book.set_state(row.seq, JobState.failed, reason=reason, message=str(error))
+                tx.set_job_state(row.seq, JobState.failed, reason=reason, message=str(error))
 
 
 def plan_at_once(context: Context, spec: JobSpec, terms: Terms) -> Plan | None:
@@ -290,21 +290,21 @@ class Planner:
         )
 
     def _write(self, job: int, piece: Plan) -> None:
-        with self._context.ledger() as book:
+        with self._context.transaction() as tx:
             still = (jobs.c.seq == job, jobs.c.state == JobState.planning, jobs.c.planner == self._name)
-            if book.connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
+            if tx.connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
                 self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
                 return
-            write_plan(book, job, piece)
+            write_plan(tx, job, piece)
         self._end = piece.end
         if piece.is_last or piece.end.bit_length() > piece.first.bit_length():  # at each power of two
             self._context.database.analyse()
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
         message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
-        with self._context.ledger() as book:
-            if book.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
-                book.end(row.seq, JobState.failed, Reason.internal_error, message)
+        with self._context.transaction() as tx:
+            if tx.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
+                tx.end_job(row.seq, JobState.failed, Reason.internal_error, message)
 
 
 def _pack_keys(connection: Connection, job: int) -> list[str]:

@@ -41,9 +41,9 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
-from stickslip_services.queue.ledger import TASK_COUNTS, Task, ledger
 from stickslip_services.queue.plan import Terms, begin_planning, insert_job, pieces, write_plan
 from stickslip_services.queue.recompute import DIGEST
+from stickslip_services.queue.transaction import TASK_COUNTS, Task, queue_transaction
 
 PIECE = 10_000
 """Size of the pieces of a plan [samples]."""
@@ -191,11 +191,11 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
         known = select(dataset_versions).filter_by(dataset=manifest.dataset, version=manifest.version)
         if connection.execute(known).first() is not None:
             return False
-        with ledger(connection, made_at) as book:
-            job = insert_job(book, manifest.spec)
-            begin_planning(book, job, terms)
+        with queue_transaction(connection, made_at) as tx:
+            job = insert_job(tx, manifest.spec)
+            begin_planning(tx, job, terms)
             for piece in pieces(manifest.spec, terms, size=PIECE):
-                write_plan(book, job, piece)
+                write_plan(tx, job, piece)
             task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
             assert task is not None
             connection.execute(
@@ -203,9 +203,9 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
                 .where(tasks.c.seq == task)
                 .values(state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at)
             )
-            book.moved([Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded)
+            tx.record_transition([Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded)
             reserve_number(connection, manifest.dataset, manifest.version, task)
             commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
-            for holder in book.jobs_of(task):
-                book.publish(holder, find_committed(connection, task), "found again in the store")
+            for holder in tx.open_jobs_of(task):
+                tx.complete_job(holder, find_committed(connection, task), "found again in the store")
     return True

@@ -19,7 +19,7 @@ from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import new_id, task_id
-from stickslip_services.queue.ledger import HELD, RUNNABLE
+from stickslip_services.queue.transaction import IS_LEASED, RUNNABLE
 
 NO_WORKER = "no worker has told its builds yet; the job is planned when one does (see the workers page)"
 
@@ -109,13 +109,13 @@ _HEARD = Prepared(
 )
 
 
-def note_heard(connection: Connection, ids: Collection[str], now: float) -> dict[str, WorkerCondition]:
+def touch_workers(connection: Connection, ids: Collection[str], now: float) -> dict[str, WorkerCondition]:
     """Store when workers were heard; return how they were, without those that a writer has locked or nobody knows."""
     rows = _HEARD.tuples(connection, {"b_ids": ids, "b_now": now})
     return {worker: WorkerCondition.model_validate_json(condition) for worker, condition in rows}
 
 
-def note_seen(connection: Connection, worker_id: str, now: float, condition: WorkerCondition) -> None:
+def record_condition(connection: Connection, worker_id: str, now: float, condition: WorkerCondition) -> None:
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
@@ -138,7 +138,7 @@ def running_tasks(
     rows = connection.execute(
         select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
-        .where(HELD, own(jobs.c.project))
+        .where(IS_LEASED, own(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
     found: dict[str, list[responses.RunningTask]] = {}
@@ -191,15 +191,15 @@ _PLANNED_JOBS = Prepared(
 )
 
 
-def note_stranded(context: Context) -> None:
+def update_unschedulable_jobs(context: Context) -> None:
     """Set reason and message of the jobs that no connected worker can run, and clear those of the others."""
     with context.database.read() as connection:
         if not _find_stranded(context, connection):
             return
-    with context.ledger() as book:
-        for (job, state), message in _find_stranded(context, book.connection).items():
+    with context.transaction() as tx:
+        for (job, state), message in _find_stranded(context, tx.connection).items():
             reason = Reason.waiting_for_worker if message else None
-            book.set_state(job, JobState(state), reason=reason, message=message)
+            tx.set_job_state(job, JobState(state), reason=reason, message=message)
 
 
 def _find_stranded(context: Context, connection: Connection) -> dict[tuple[int, str], str]:

@@ -18,7 +18,7 @@ from stickslip_services.api.routes.common import ContextDep, problem_responses
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.ledger import HELD
+from stickslip_services.queue.transaction import IS_LEASED
 from stickslip_services.queue.workers import alive_workers
 
 
@@ -33,7 +33,7 @@ class _QueueCollector(Collector):
             alive = alive_workers(self._context, connection)
             tasks = connection.execute(select(task_counts)).all()
             by_state = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
-            held = Counts(connection.scalars(select(tasks_.c.owner).where(HELD)).all())
+            held = Counts(connection.scalars(select(tasks_.c.owner).where(IS_LEASED)).all())
             count, size, bad, read_at = connection.execute(select(*sums).where(own.manifest.is_not(None))).one()
         age, room = self._context.clock() - read_at if count else 0.0, self._context.store.room()
         disk = () if room is None else (("free", room.free), ("used", room.used))

@@ -15,7 +15,7 @@ from stickslip_services.api.routes.common import ContextDep, JsonBody, json_cont
 from stickslip_services.api.routes.health import Metrics
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.lease import lease_tasks, register_worker, sort_out
+from stickslip_services.queue.lease import lease_tasks, reconcile_leases, register_worker
 from stickslip_services.queue.report import report_results
 from stickslip_services.queue.workers import show_workers
 
@@ -73,7 +73,7 @@ async def post_heartbeat(request: Request) -> Response:
     left = await request.app.state.renewals.add(message)
     answer = worker_api.HeartbeatAnswer(drop=())
     if left is not None:
-        answer = await asyncio.to_thread(sort_out, request.app.state.context, message, left)
+        answer = await asyncio.to_thread(reconcile_leases, request.app.state.context, message, left)
     return Response(answer.model_dump_json(), media_type="application/json")
 
 

@@ -46,18 +46,18 @@ WAITING = (TaskState.pending, TaskState.soft_failed)
 ON_LEASE = (TaskState.leased, TaskState.running)
 SETTLED = tuple(state for state in TaskState if state.is_settled)
 """States of a task with a result."""
-OVER = tuple(state for state in TaskState if state.is_over)
+FINISHED = tuple(state for state in TaskState if state.is_over)
 """States of a finished task."""
 
-READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")
+IS_READY = text("tasks.state = 'pending' AND tasks.waiting_on = 0")
 """The condition of tasks that can be leased, in the words of the partial index."""
-HELD = text("tasks.owner IS NOT NULL")
+IS_LEASED = text("tasks.owner IS NOT NULL")
 """The condition of tasks on lease, likewise."""
 
-PIECE_TASKS = 250
+RELEASE_BATCH = 250
 """Tasks of an ended job that one transaction gives up: it takes 10 to 30 ms, for which other writers wait."""
 
-FRESH: Mapping[str, Any] = {"reason": None, "message": "", "tries": 0, "losses": 0}
+RESET_ATTEMPTS: Mapping[str, Any] = {"reason": None, "message": "", "tries": 0, "losses": 0}
 """Values of a task that has all its tries."""
 
 
@@ -69,7 +69,7 @@ class Task(NamedTuple):
     state: str
 
 
-TASK = [tasks.c[name] for name in Task._fields]
+TASK_COLUMNS = [tasks.c[name] for name in Task._fields]
 
 _OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
 _HOLDERS = Prepared(
@@ -89,7 +89,7 @@ _ADD_TO_JOB_STAGES = Prepared(
 TASK_COUNTS, JOB_COUNTS, JOB_GROUPS = Counters(task_counts), Counters(job_counts), Counters(job_groups)
 
 
-class Ledger:
+class QueueTransaction:
     """The changes of one write transaction."""
 
     def __init__(self, connection: Connection, now: float) -> None:
@@ -97,41 +97,41 @@ class Ledger:
         self.now = now
         self._moves: list[tuple[Any, TaskState]] = []
         self._runs: list[tuple[Any, TaskResult]] = []
-        self.given_up: set[int] = set()
+        self.released_jobs: set[int] = set()
         """Jobs whose tasks this transaction gives up: their counters follow, also after they have ended."""
 
-    def move(self, rows: Collection[Any], state: TaskState, **values: Any) -> None:
+    def set_task_state(self, rows: Collection[Any], state: TaskState, **values: Any) -> None:
         """Put tasks into a state, and write other values of their columns."""
         if state not in ON_LEASE:
             values |= {"owner": None, "expires_at": None}
         if state is not TaskState.soft_failed:
             values["retry_at"] = None
-        values["finished_at"] = self.now if state in OVER else None
+        values["finished_at"] = self.now if state in FINISHED else None
         for batch in batches(rows):
             own = tasks.c.seq.in_([row.seq for row in batch])
             self.connection.execute(update(tasks).where(own).values(state=state, **values))
-        self.moved(rows, state)
+        self.record_transition(rows, state)
 
-    def moved(self, rows: Iterable[Any], state: TaskState) -> None:
+    def record_transition(self, rows: Iterable[Any], state: TaskState) -> None:
         """Note that tasks were put into a state by other means."""
         self._moves += [(row, state) for row in rows]
 
-    def start(self, rows: Collection[Any]) -> None:
+    def mark_started(self, rows: Collection[Any]) -> None:
         """Note that leased tasks have been started: from here on they may fail."""
-        self.move(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
+        self.set_task_state(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
 
-    def ran(self, task: Any, result: TaskResult) -> None:
+    def record_cost(self, task: Any, result: TaskResult) -> None:
         """Note the cost of a task, whose row has its kind and its cost group."""
         self._runs.append((task, result))
 
-    def tell(self, task: Any, state: TaskState, reason: Reason, message: str) -> None:
+    def emit_task_event(self, task: Any, state: TaskState, reason: Reason, message: str) -> None:
         """Store an event of a task, whose row has its `key`, for each of its open jobs."""
         name = task_id(task.stage, task.key)
         event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
-        for job in self.jobs_of(task.seq):
+        for job in self.open_jobs_of(task.seq):
             self._append_event(job, EventName.task_state, event)
 
-    def set_state(self, job: int, state: JobState, *, reason: Reason | None = None, message: str = "") -> None:
+    def set_job_state(self, job: int, state: JobState, *, reason: Reason | None = None, message: str = "") -> None:
         """Set the state of a job with its reason and message, and store the event."""
         values: dict[str, object] = {"state": state, "reason": reason, "message": message}
         if state is JobState.running:
@@ -141,7 +141,7 @@ class Ledger:
         self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
         self._append_event(job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message))
 
-    def publish(self, job: int, version: Any, note: str = "") -> None:
+    def complete_job(self, job: int, version: Any, note: str = "") -> None:
         """End a live job, whose dataset version, a row of `dataset_versions`, exists."""
         reference, lost = document_of(DatasetRef, version), version.sample_count - version.valid_count
         rejects = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
@@ -150,27 +150,27 @@ class Ledger:
             values = {**reference.model_dump(), "rejected_count": lost}
             self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
             self._append_event(job, EventName.dataset_published, DatasetPublishedEvent(dataset=reference))
-            self.end(job, state, None, ". ".join(filter(None, [note, rejects if lost else ""])))
+            self.end_job(job, state, None, ". ".join(filter(None, [note, rejects if lost else ""])))
 
-    def end(self, job: int, state: JobState, reason: Reason | None, message: str) -> None:
+    def end_job(self, job: int, state: JobState, reason: Reason | None, message: str) -> None:
         """End a job, unless it is not live any more, and give up what only it needs."""
         if not self._is_live(job):
             return
-        self.count()
-        self.set_state(job, state, reason=reason, message=message)
+        self.flush_counters()
+        self.set_job_state(job, state, reason=reason, message=message)
         waiting = (job_counts.c.job == job, job_counts.c.state.in_(WAITING), job_counts.c.count > 0)
         if self.connection.scalar(select(job_counts.c.count).where(*waiting).limit(1)):
-            give_up(self, job)
+            release_tasks(self, job)
 
     def _is_live(self, job: int) -> bool:
         query = select(jobs.c.seq).where(jobs.c.seq == job, jobs.c.state.in_(LIVE))
         return self.connection.scalar(query) is not None
 
-    def jobs_of(self, task: int) -> list[int]:
+    def open_jobs_of(self, task: int) -> list[int]:
         """Return the open jobs of a task."""
         return [holder.job for holder in self._holders([task]).get(task, ())]
 
-    def count(self) -> None:
+    def flush_counters(self) -> None:
         """Bring the counters up to date."""
         moves, self._moves = self._moves, []
         runs, self._runs = self._runs, []
@@ -183,7 +183,7 @@ class Ledger:
                 overall[task.stage, state] += change
                 for holder in holders.get(task.seq, ()):
                     by_job[holder.job, task.stage, state] += change
-                    left[holder.job, task.stage, holder.cost_group] += change * (state not in OVER)
+                    left[holder.job, task.stage, holder.cost_group] += change * (state not in FINISHED)
         TASK_COUNTS.add(self.connection, overall)
         JOB_COUNTS.add(self.connection, by_job)
         JOB_GROUPS.add(self.connection, {group: change for group, change in left.items() if change})
@@ -200,7 +200,7 @@ class Ledger:
         """Return the open jobs of each task, rows of `_HOLDERS`."""
         found: dict[int, list[Any]] = {}
         for batch in batches(task_seqs):
-            for row in _HOLDERS.rows(self.connection, {"b_tasks": batch, "b_given_up": list(self.given_up)}):
+            for row in _HOLDERS.rows(self.connection, {"b_tasks": batch, "b_given_up": list(self.released_jobs)}):
                 found.setdefault(row.task, []).append(row)
         return found
 
@@ -229,55 +229,55 @@ def live_jobs(connection: Connection, task_seqs: Iterable[int], states: Sequence
     return {task: job for task, (_, _, job) in found.items()}
 
 
-def charge(connection: Connection, job_of: Mapping[int, int]) -> None:
+def assign(connection: Connection, job_of: Mapping[int, int]) -> None:
     charges = [{"b_seq": task, "b_job": job} for task, job in job_of.items()]
     if charges:
         own = update(tasks).where(tasks.c.seq == bindparam("b_seq"))
         connection.execute(own.values(job=bindparam("b_job")), charges)
 
 
-def reassign(book: Ledger, rows: Sequence[Any]) -> list[Any]:
+def reassign(tx: QueueTransaction, rows: Sequence[Any]) -> list[Any]:
     """Charge unfinished tasks to the jobs that they will run for; cancel the needless, and return the others."""
-    job_of = live_jobs(book.connection, [row.seq for row in rows])
-    charge(book.connection, job_of)
-    cancel(book, [row for row in rows if row.seq not in job_of])
+    job_of = live_jobs(tx.connection, [row.seq for row in rows])
+    assign(tx.connection, job_of)
+    cancel(tx, [row for row in rows if row.seq not in job_of])
     return [row for row in rows if row.seq in job_of]
 
 
-def cancel(book: Ledger, rows: Collection[Any]) -> None:
+def cancel(tx: QueueTransaction, rows: Collection[Any]) -> None:
     """Cancel tasks, leased ones included."""
-    book.move(rows, TaskState.cancelled, reason=Reason.cancelled, message="no job needs it")
+    tx.set_task_state(rows, TaskState.cancelled, reason=Reason.cancelled, message="no job needs it")
 
 
-def reassign_waiting(book: Ledger, job: int) -> None:
+def reassign_waiting(tx: QueueTransaction, job: int) -> None:
     """Reassign the waiting tasks of a job that starts or stops being runnable, or that changes its priority."""
     kind = select(jobs.c.kind).where(jobs.c.seq == job).scalar_subquery()
     others = select(jobs.c.seq).where(jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE))
-    if book.connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
-        reassign(book, _waiting(book.connection, job_tasks.c.job == job))
+    if tx.connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
+        reassign(tx, _waiting(tx.connection, job_tasks.c.job == job))
 
 
-def give_up(book: Ledger, job: int, after: int = 0) -> None:
+def release_tasks(tx: QueueTransaction, job: int, after: int = 0) -> None:
     """Reassign the next `PIECE_TASKS` tasks of a job that is not live any more, and store where to go on."""
-    book.given_up.add(job)
+    tx.released_jobs.add(job)
     piece = select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task > after)
-    seqs = list(book.connection.scalars(piece.order_by(job_tasks.c.task).limit(PIECE_TASKS)))
-    reassign(book, _waiting(book.connection, job_tasks.c.job == job, job_tasks.c.task.in_(seqs)))
-    last = seqs[-1] if len(seqs) == PIECE_TASKS else None
-    book.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
+    seqs = list(tx.connection.scalars(piece.order_by(job_tasks.c.task).limit(RELEASE_BATCH)))
+    reassign(tx, _waiting(tx.connection, job_tasks.c.job == job, job_tasks.c.task.in_(seqs)))
+    last = seqs[-1] if len(seqs) == RELEASE_BATCH else None
+    tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(given_up=last))
 
 
 def _waiting(connection: Connection, *which: Any) -> Sequence[Any]:
-    query = select(*TASK).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    query = select(*TASK_COLUMNS).join(job_tasks, job_tasks.c.task == tasks.c.seq)
     return connection.execute(query.where(tasks.c.state.in_(WAITING), *which)).all()
 
 
 @contextmanager
-def ledger(connection: Connection, now: float) -> Iterator[Ledger]:
+def queue_transaction(connection: Connection, now: float) -> Iterator[QueueTransaction]:
     """Open a ledger and close it, unless the block raises."""
-    book = Ledger(connection, now)
-    yield book
-    _close(book)
+    tx = QueueTransaction(connection, now)
+    yield tx
+    _close(tx)
 
 
 def _sum_of(*states: TaskState) -> Any:
@@ -297,46 +297,48 @@ _OPEN_JOBS = Prepared(
 )
 
 
-def _close(book: Ledger) -> None:
+def _close(tx: QueueTransaction) -> None:
     """Bring the counters up to date, and let the states of the jobs follow."""
-    book.count()
-    for job in _OPEN_JOBS.rows(book.connection):
+    tx.flush_counters()
+    for job in _OPEN_JOBS.rows(tx.connection):
         if job.state == JobState.queued and job.on_lease:
-            book.set_state(job.seq, JobState.running)
+            tx.set_job_state(job.seq, JobState.running)
         elif job.state == JobState.planning and job.on_lease and job.started_at is None:  # it runs when it is planned
-            book.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(started_at=book.now))
+            tx.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(started_at=tx.now))
         elif job.state in (JobState.queued, JobState.running) and job.failed and not (job.on_lease or job.retried):
-            _end_if_blocked(book, job.seq)
-        elif job.state == JobState.pausing and not (job.on_lease and holds_alone(book.connection, job.seq, RUNNABLE)):
-            why = book.connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job.seq)).one()
+            _end_if_blocked(tx, job.seq)
+        elif job.state == JobState.pausing and not (
+            job.on_lease and has_exclusive_lease(tx.connection, job.seq, RUNNABLE)
+        ):
+            why = tx.connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job.seq)).one()
             message = why.message if why.reason else "paused; resume it to go on"
-            book.set_state(job.seq, JobState.paused, reason=why.reason, message=message)
+            tx.set_job_state(job.seq, JobState.paused, reason=why.reason, message=message)
         elif job.state == JobState.cancelling and not (
-            job.given_up or (job.on_lease and holds_alone(book.connection, job.seq, LIVE))
+            job.given_up or (job.on_lease and has_exclusive_lease(tx.connection, job.seq, LIVE))
         ):
             message = "cancelled; what had been finished is kept and will not be done again"
-            book.set_state(job.seq, JobState.cancelled, reason=Reason.cancelled, message=message)
-    book.count()
+            tx.set_job_state(job.seq, JobState.cancelled, reason=Reason.cancelled, message=message)
+    tx.flush_counters()
 
 
-def holds_alone(connection: Connection, job: int, states: Sequence[JobState]) -> bool:
+def has_exclusive_lease(connection: Connection, job: int, states: Sequence[JobState]) -> bool:
     """Return whether a job has a task on lease that no job in some states needs."""
     # Looked for among all tasks on lease, which are fewer than a job has.
     is_of_job = exists().where(job_tasks.c.job == job, job_tasks.c.task == tasks.c.seq)
-    held = set(connection.scalars(select(tasks.c.seq).where(HELD, is_of_job)))
+    held = set(connection.scalars(select(tasks.c.seq).where(IS_LEASED, is_of_job)))
     return bool(held - live_jobs(connection, held, states).keys())
 
 
-def _end_if_blocked(book: Ledger, job: int) -> None:
+def _end_if_blocked(tx: QueueTransaction, job: int) -> None:
     """End a job with quarantined tasks of which nothing runs, unless one can be leased."""
-    own = select(*TASK, tasks.c.key, tasks.c.message).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    own = select(*TASK_COLUMNS, tasks.c.key, tasks.c.message).join(job_tasks, job_tasks.c.task == tasks.c.seq)
     own = own.where(job_tasks.c.job == job)
-    if book.connection.execute(own.where(READY).limit(1)).first() is not None:
+    if tx.connection.execute(own.where(IS_READY).limit(1)).first() is not None:
         return
-    failed = book.connection.execute(own.where(tasks.c.state == TaskState.failed).order_by(tasks.c.seq)).all()
+    failed = tx.connection.execute(own.where(tasks.c.state == TaskState.failed).order_by(tasks.c.seq)).all()
     message = (
         f"everything else is done, but {len(failed)} of its tasks were quarantined; the first is "
         f"{task_id(failed[0].stage, failed[0].key)}: {failed[0].message}. What is done is kept; submit the job again "
         "to try again"
     )
-    book.end(job, JobState.failed, Reason.quarantined, message)
+    tx.end_job(job, JobState.failed, Reason.quarantined, message)
