@@ -15,8 +15,9 @@ from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, start, sweep
+from stickslip_services.queue.heartbeat import reconcile_leases, renew_leases
 from stickslip_services.queue.ids import task_key
-from stickslip_services.queue.lease import lease_tasks, reconcile_leases, renew_leases
+from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection

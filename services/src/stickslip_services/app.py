@@ -45,7 +45,7 @@ from stickslip_services.local.supervisor import configure_logging, limit_arenas,
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import release_ended_jobs, scrub_when_idle, start, sweep
-from stickslip_services.queue.lease import renew_leases
+from stickslip_services.queue.heartbeat import renew_leases
 from stickslip_services.queue.recompute import check_made_datasets
 from stickslip_services.queue.submit import Planner
 from stickslip_services.settings import SERVER, Settings, options

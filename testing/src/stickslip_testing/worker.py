@@ -52,7 +52,8 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.lease import lease_tasks, reconcile_leases, register_worker, renew_leases
+from stickslip_services.queue.heartbeat import reconcile_leases, renew_leases
+from stickslip_services.queue.lease import lease_tasks, register_worker
 from stickslip_services.queue.report import report_results
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)

@@ -20,7 +20,7 @@ from enum import Enum, auto
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 from sqlalchemy import URL, Column, Connection, Dialect, Engine, Row, Select, Table, create_engine, event, text
@@ -307,6 +307,24 @@ class Prepared:
             compiled = _Compiled(sql, names, defaults, lists, mark)
             self._compiled[dialect.name] = compiled
         return compiled
+
+
+RowType = TypeVar("RowType", bound=tuple[Any, ...])
+
+
+class RowQuery(Prepared, Generic[RowType]):
+    """A prepared SELECT whose rows have a type: a NamedTuple with one field for each selected column, in order."""
+
+    def __init__(self, row_type: type[RowType], statement: Select[Any]) -> None:
+        super().__init__(statement)
+        fields = row_type._fields  # type: ignore[attr-defined]  # of every NamedTuple
+        selected = tuple(statement.selected_columns.keys())
+        if fields != selected:
+            raise TypeError(f"{row_type.__name__} has the fields {fields}, and the query selects {selected}")
+        self._make = row_type._make  # type: ignore[attr-defined]
+
+    def rows(self, connection: Connection, values: Values | None = None) -> list[RowType]:
+        return super().rows(connection, values)
 
 
 class Counters(Prepared):

@@ -30,6 +30,7 @@ from stickslip_services.errors import DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import SAMPLE_COLUMNS, row_digest
 from stickslip_services.queue.plan import Terms
+from stickslip_services.queue.rows import Task
 from stickslip_services.queue.transaction import (
     FINISHED,
     LIVE,
@@ -37,7 +38,6 @@ from stickslip_services.queue.transaction import (
     SETTLED,
     TASK_COLUMNS,
     QueueTransaction,
-    Task,
     assign,
     live_jobs,
 )

@@ -31,40 +31,24 @@ from stickslip_services.catalog.versions import (
     sign_version,
 )
 from stickslip_services.client.http import ClientError
-from stickslip_services.database.database import Prepared, batches
+from stickslip_services.database.database import Prepared, RowQuery, batches
 from stickslip_services.database.tables import job_counts, job_tasks, jobs, previews, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.recompute import add_dependencies, recompute
-from stickslip_services.queue.transaction import (
-    IS_LEASED,
-    LIVE,
-    RUNNABLE,
-    SETTLED,
-    TASK_COLUMNS,
-    QueueTransaction,
-    reassign,
-)
+from stickslip_services.queue.rows import LeasedTask, Task, TaskRow, columns
+from stickslip_services.queue.transaction import IS_LEASED, LIVE, RUNNABLE, SETTLED, QueueTransaction, reassign
 from stickslip_services.queue.workers import find_worker, touch_workers
 from stickslip_services.settings import Settings
 
-LEASED_TASK_COLUMNS = [*TASK_COLUMNS, *(tasks.c[name] for name in ("key", "tries", "losses", "token", "expires_at"))]
-"""Columns of a leased task, or of one whose lease has just ended."""
-
-Ended = tuple[Any, TaskResult]
-"""A task, a row of `_FIND`, and its result."""
+Ended = tuple[LeasedTask, TaskResult]
 
 _NOTE_REPORT = Prepared(
     update(tasks)
     .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
     .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
 )
-_FIND = Prepared(
-    select(
-        *LEASED_TASK_COLUMNS,
-        *(tasks.c[name] for name in ("kind", "cost_group", "owner", "reported_by", "reported_token")),
-    ).where(tasks.c.key.in_(bindparam("b_keys", expanding=True)))
-)
+_FIND = RowQuery(LeasedTask, select(*columns(LeasedTask)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True))))
 _WRITTEN = ("state", "reason", "message", "output", "digest", "cpu_seconds", "wall_seconds", "finished_at")
 _SETTLE = Prepared(
     update(tasks)
@@ -91,7 +75,7 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
         tx.mark_started([task for task, _ in ended if task.state == TaskState.leased])
         ended = [(task._replace(state=TaskState.running), result) for task, result in ended]
         _take_results(tx, [(task, result) for task, result in ended if result.outcome != "failed"], versions)
-        charged: list[tuple[Any, Reason, str]] = []
+        failures: list[tuple[LeasedTask, Reason, str]] = []
         for task, result in ended:
             if result.reason is Reason.store_unavailable:
                 context.store_watch.note(f"worker {worker.name} cannot use the store: {result.message}")
@@ -99,8 +83,8 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
             elif result.reason is Reason.worker_lost:
                 requeue_lost(tx, [task], context.settings, message=result.message)
             elif result.outcome == "failed":
-                charged.append((task, result.reason or Reason.internal_error, result.message))
-        record_failures(tx, charged, context.settings)
+                failures.append((task, result.reason or Reason.internal_error, result.message))
+        record_failures(tx, failures, context.settings)
         for task, result in ended:
             if result.damaged_inputs:
                 recompute(tx, task.seq, result.damaged_inputs)
@@ -142,13 +126,13 @@ def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
 
 def _judged(
     tx: QueueTransaction, worker_id: str, reports: Sequence[Report], versions: dict[str, Manifest]
-) -> tuple[list[ReportVerdict], list[Any], list[Ended]]:
+) -> tuple[list[ReportVerdict], list[LeasedTask], list[Ended]]:
     """Judge each report; return the verdicts, the tasks that were given back, and those that have ended.
 
     `versions` has the summaries of manifests by publish task; they were read before the transaction.
     """
     verdicts: list[ReportVerdict] = []
-    released: list[Any] = []
+    released: list[LeasedTask] = []
     ended: list[Ended] = []
     keys = {key for report in reports if (key := task_key(report.task_id)) is not None}
     found = (row for batch in batches(keys) for row in _FIND.rows(tx.connection, {"b_keys": batch}))
@@ -171,7 +155,7 @@ def _judged(
     return verdicts, released, ended
 
 
-def _checked(tx: QueueTransaction, task: Any, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
+def _checked(tx: QueueTransaction, task: LeasedTask, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
     """Return the result, or a failure where it does not fit the task."""
     if result.output is not None and result.output.stage != task.stage:
         wrong = f"the worker answered with the output of stage {result.output.stage}"
@@ -246,21 +230,22 @@ def _release_dependents(tx: QueueTransaction, settled: Sequence[int], rejected: 
     _release_dependents(tx, [edge.seq for edge in doomed], {})
 
 
-_FIND_HELD = Prepared(
-    select(*LEASED_TASK_COLUMNS).where(IS_LEASED, tasks.c.owner.in_(bindparam("b_owners", expanding=True)))
+_LEASED_TASKS = RowQuery(
+    LeasedTask, select(*columns(LeasedTask)).where(IS_LEASED, tasks.c.owner.in_(bindparam("b_owners", expanding=True)))
 )
 
 
-def leased_tasks_of(connection: Connection, owners: Sequence[str]) -> list[Any]:
-    return _FIND_HELD.rows(connection, {"b_owners": owners})
+def leased_tasks_of(connection: Connection, owners: Sequence[str]) -> list[LeasedTask]:
+    """Return the tasks that some workers hold."""
+    return _LEASED_TASKS.rows(connection, {"b_owners": owners})
 
 
-def requeue(tx: QueueTransaction, held: Sequence[Any], **values: Any) -> None:
+def requeue(tx: QueueTransaction, held: Sequence[TaskRow], **values: Any) -> None:
     """Return tasks to `pending`, with other values of their columns; cancel those that no live job needs."""
     tx.set_task_state(reassign(tx, held), TaskState.pending, **values)
 
 
-def requeue_lost(tx: QueueTransaction, held: Sequence[Any], settings: Settings, *, message: str) -> None:
+def requeue_lost(tx: QueueTransaction, held: Sequence[LeasedTask], settings: Settings, *, message: str) -> None:
     """Take back the leases of a lost worker. A task fails after `max_losses` lost workers."""
     started = [task for task in held if task.state == TaskState.running]
     requeue(tx, [task for task in held if task.state == TaskState.leased])
@@ -270,7 +255,9 @@ def requeue_lost(tx: QueueTransaction, held: Sequence[Any], settings: Settings, 
             _fail(tx, task, Reason.worker_lost, message, task.losses + 1, settings)
 
 
-def record_failures(tx: QueueTransaction, failures: Sequence[tuple[Any, Reason, str]], settings: Settings) -> None:
+def record_failures(
+    tx: QueueTransaction, failures: Sequence[tuple[LeasedTask, Reason, str]], settings: Settings
+) -> None:
     """Count failed tries; each task is retried later, or fails for good."""
     for task, reason, message in failures:
         tries = task.tries + 1
@@ -285,7 +272,7 @@ def record_failures(tx: QueueTransaction, failures: Sequence[tuple[Any, Reason, 
         tx.emit_task_event(task, TaskState.soft_failed, **why)
 
 
-def _fail(tx: QueueTransaction, task: Any, reason: Reason, message: str, times: int, settings: Settings) -> None:
+def _fail(tx: QueueTransaction, task: LeasedTask, reason: Reason, message: str, times: int, settings: Settings) -> None:
     """Let a task fail for good after `times` failures or losses, and quarantine it or end its jobs."""
     name = task_id(task.stage, task.key)
     command = reproducer(name, settings)
@@ -322,10 +309,8 @@ _EXPIRED = (
     "AND tasks.owner NOT IN (SELECT workers.id FROM workers WHERE workers.last_seen_at > :b_alive_since)"
 )
 _DUE = "tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now"
-_FIND_EXPIRED, _FIND_DUE = (
-    Prepared(select(*LEASED_TASK_COLUMNS).where(text(_EXPIRED))),
-    Prepared(select(*TASK_COLUMNS).where(text(_DUE))),
-)
+_FIND_EXPIRED = RowQuery(LeasedTask, select(*columns(LeasedTask)).where(text(_EXPIRED)))
+_FIND_DUE = RowQuery(Task, select(*columns(Task)).where(text(_DUE)))
 _IS_DUE = Prepared(f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) OR EXISTS (SELECT 1 FROM tasks WHERE {_DUE})")
 
 

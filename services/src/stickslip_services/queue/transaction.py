@@ -18,7 +18,7 @@ Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 from sqlalchemy import Connection, bindparam, case, exists, func, insert, or_, select, text, update
 from stickslip_schemas.base import Document, JobState, Reason, TaskState
@@ -35,6 +35,7 @@ from stickslip_services.database.database import Counters, Prepared, batches, do
 from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
 from stickslip_services.queue.eta import add_costs
 from stickslip_services.queue.ids import task_id
+from stickslip_services.queue.rows import Task, TaskRow, columns
 
 RUNNABLE = (JobState.planning, JobState.queued, JobState.running)
 """States of a job whose tasks may be leased; a `planning` job has only a part of them."""
@@ -61,15 +62,9 @@ RESET_ATTEMPTS: Mapping[str, Any] = {"reason": None, "message": "", "tries": 0, 
 """Values of a task that has all its tries."""
 
 
-class Task(NamedTuple):
-    """What the ledger needs to know of a task."""
+TASK_COLUMNS = columns(Task)
 
-    seq: int
-    stage: str
-    state: str
-
-
-TASK_COLUMNS = [tasks.c[name] for name in Task._fields]
+Row = TypeVar("Row", bound=TaskRow)
 
 _OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
 _HOLDERS = Prepared(
@@ -95,12 +90,12 @@ class QueueTransaction:
     def __init__(self, connection: Connection, now: float) -> None:
         self.connection = connection
         self.now = now
-        self._moves: list[tuple[Any, TaskState]] = []
+        self._moves: list[tuple[TaskRow, TaskState]] = []
         self._runs: list[tuple[Any, TaskResult]] = []
         self.released_jobs: set[int] = set()
         """Jobs whose tasks this transaction gives up: their counters follow, also after they have ended."""
 
-    def set_task_state(self, rows: Collection[Any], state: TaskState, **values: Any) -> None:
+    def set_task_state(self, rows: Collection[TaskRow], state: TaskState, **values: Any) -> None:
         """Put tasks into a state, and write other values of their columns."""
         if state not in ON_LEASE:
             values |= {"owner": None, "expires_at": None}
@@ -112,11 +107,11 @@ class QueueTransaction:
             self.connection.execute(update(tasks).where(own).values(state=state, **values))
         self.record_transition(rows, state)
 
-    def record_transition(self, rows: Iterable[Any], state: TaskState) -> None:
+    def record_transition(self, rows: Iterable[TaskRow], state: TaskState) -> None:
         """Note that tasks were put into a state by other means."""
         self._moves += [(row, state) for row in rows]
 
-    def mark_started(self, rows: Collection[Any]) -> None:
+    def mark_started(self, rows: Collection[TaskRow]) -> None:
         """Note that leased tasks have been started: from here on they may fail."""
         self.set_task_state(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
 
@@ -236,7 +231,7 @@ def assign(connection: Connection, job_of: Mapping[int, int]) -> None:
         connection.execute(own.values(job=bindparam("b_job")), charges)
 
 
-def reassign(tx: QueueTransaction, rows: Sequence[Any]) -> list[Any]:
+def reassign(tx: QueueTransaction, rows: Sequence[Row]) -> list[Row]:
     """Charge unfinished tasks to the jobs that they will run for; cancel the needless, and return the others."""
     job_of = live_jobs(tx.connection, [row.seq for row in rows])
     assign(tx.connection, job_of)
@@ -244,7 +239,7 @@ def reassign(tx: QueueTransaction, rows: Sequence[Any]) -> list[Any]:
     return [row for row in rows if row.seq in job_of]
 
 
-def cancel(tx: QueueTransaction, rows: Collection[Any]) -> None:
+def cancel(tx: QueueTransaction, rows: Collection[TaskRow]) -> None:
     """Cancel tasks, leased ones included."""
     tx.set_task_state(rows, TaskState.cancelled, reason=Reason.cancelled, message="no job needs it")
 

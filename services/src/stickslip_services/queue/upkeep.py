@@ -43,7 +43,8 @@ from stickslip_services.database.tables import (
 from stickslip_services.errors import ConflictError, NotFoundError
 from stickslip_services.queue.plan import Terms, begin_planning, insert_job, pieces, write_plan
 from stickslip_services.queue.recompute import DIGEST
-from stickslip_services.queue.transaction import TASK_COUNTS, Task, queue_transaction
+from stickslip_services.queue.rows import Task
+from stickslip_services.queue.transaction import TASK_COUNTS, queue_transaction
 
 PIECE = 10_000
 """Size of the pieces of a plan [samples]."""
