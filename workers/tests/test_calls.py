@@ -1,12 +1,14 @@
 """What becomes of calls when a node of the cluster is lost, without Ray."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import ray
 from stickslip_schemas.base import Stage
-from stickslip_workers.calls import Call, Calls, NotDoneError
+from stickslip_workers.batching import Call
+from stickslip_workers.ray_calls import Failed, NotRun, RayCalls
 from stickslip_workers.settings import Settings
 
 
@@ -27,22 +29,22 @@ def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(monkeyp
     monkeypatch.setattr(ray, "nodes", lambda: nodes)
     monkeypatch.setattr(ray, "cancel", lambda reference, force: cancelled.append(reference))
     monkeypatch.setattr(ray, "wait", lambda *_, **__: ([], []))
-    calls = Calls(Settings(urls=(), store="nowhere", name="test"), {False: {"builds": {}}, True: {"builds": {}}})
+    calls = RayCalls(Settings(urls=(), store="nowhere", name="test"), {"builds": {}}, {"builds": {}})
     here, lost, waiting = (
         Call(Stage.simulate, [], reference=name, node=node) for name, node in zip("hlw", ("a", "b", ""), strict=True)
     )
     here.started_at = lost.started_at = time.monotonic()
-    calls._calls = {one.reference: one for one in (here, lost, waiting)}
-    assert list(calls._look()) == []
+    calls._in_progress = {one.reference: one for one in (here, lost, waiting)}
+    assert list(calls.check_nodes()) == []
     nodes[1]["Alive"] = False
-    said = {id(one): type(error) for one, error in calls._look()}
-    assert said == {id(lost): RuntimeError, id(waiting): NotDoneError}
+    said = {id(one): type(error) for one, error in calls.check_nodes()}
+    assert said == {id(lost): Failed, id(waiting): NotRun}
     assert cancelled == ["w"]
     assert list(calls) == [here]
-    assert list(calls._look()) == []
+    assert list(calls.check_nodes()) == []
 
     # They differ from earlier ones, for Ray would let them wait behind its requests to the lost node.
     remote = Remote()
-    calls._remote = {False: remote, True: remote}
-    calls.give(Call(Stage.simulate, []))
+    calls._stages = replace(calls._stages, remote=remote)
+    calls.submit(Call(Stage.simulate, []))
     assert remote.given["label_selector"] == {"ray.io/node-id": "!in(b)"}

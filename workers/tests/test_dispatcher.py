@@ -17,10 +17,10 @@ from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTas
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
-from stickslip_workers.calls import StartError
 from stickslip_workers.cluster import Place
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.lease_client import CoordinatorError
+from stickslip_workers.ray_calls import StartError
 from stickslip_workers.settings import Settings
 
 pytestmark = [pytest.mark.real, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray leaves its log files open

@@ -10,7 +10,7 @@ from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
-from stickslip_workers.calls import merged, shading_of, split
+from stickslip_workers.batching import merge_renders, shading_key, split_render_result
 from stickslip_workers.dispatcher import process_failure
 from stickslip_workers.stages.run import MESSAGE_LENGTH, failure
 
@@ -75,28 +75,28 @@ def chunk(number: int) -> ChunkRef:
 
 
 def test_only_the_texture_may_differ() -> None:
-    same = shading_of(clip("dots"))
-    assert shading_of(clip("plaid", preview=True)) == same
+    same = shading_key(clip("dots"))
+    assert shading_key(clip("plaid", preview=True)) == same
     others = [clip("dots", light_seed=2), clip("dots", viewpoint="right"), clip("dots", creases=0.5)]
     others.append(clip("dots", ground_truth=("depth",)))
     others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
-    assert same not in {shading_of(task) for task in others}
+    assert same not in {shading_key(task) for task in others}
     with pytest.raises(ValueError, match="renders of one shading"):
-        merged([clip("dots"), others[0]])
+        merge_renders([clip("dots"), others[0]])
 
 
 def test_a_rod_shares_nothing() -> None:
     rod = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=1)
     task = RenderTask(render=rod, record=RECORD)
-    assert shading_of(task) is None
-    assert merged([task]) is task
+    assert shading_key(task) is None
+    assert merge_renders([task]) is task
     with pytest.raises(ValueError, match="renders of one shading"):
-        merged([task, task])
+        merge_renders([task, task])
 
 
 def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     tasks = [clip("dots"), clip("plaid", preview=True), clip("floral")]
-    asked = merged(tasks)
+    asked = merge_renders(tasks)
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
     depth = {"depth": chunk(9)}
     made = [
@@ -106,7 +106,9 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     poor = TaskResult(outcome="rejected", reason=Reason.poor_pictures, message="psnr_edge")
     all_three = [*(TaskResult(outcome="succeeded", output=one) for one in made), poor]
     output = RenderOutput(chunks={}, labels={}, clips=dict(zip(asked.textures, all_three, strict=True)))
-    results = split(tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0))
+    results = split_render_result(
+        tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0)
+    )
     assert [result.output.chunks for result in results[:2]] == [{"video": chunk(n), **depth} for n in range(2)]
     assert [result.output.preview for result in results[:2]] == [None, "e" * 64]
     assert [result.output.labels for result in results[:2]] == [{"psnr_cloth": 40.0}, {"psnr_cloth": 41.0}]
@@ -118,17 +120,19 @@ def test_textures_of_the_users_own_go_by_their_pictures() -> None:
     """Two jobs may give one name to two pictures, and one picture may have two names."""
     one, other = (f"sha256:{digit * 64}" for digit in "12")
     tasks = [clip("dots"), clip("logo", image=one), clip("logo", image=other), clip("brand", image=one)]
-    asked = merged(tasks)
+    asked = merge_renders(tasks)
     assert asked.textures == ("dots", one, other)
     output = RenderOutput(chunks={}, labels={}, clips={name: done(n) for n, name in enumerate(asked.textures)})
-    results = split(tasks, TaskResult(outcome="succeeded", output=output))
+    results = split_render_result(tasks, TaskResult(outcome="succeeded", output=output))
     assert [result.output.chunks["video"] for result in results] == [chunk(n) for n in (0, 1, 2, 1)]
 
 
 def test_what_is_wrong_with_a_shading_is_wrong_with_all_its_clips() -> None:
     tasks = [clip("dots"), clip("plaid")]
     out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)
-    assert [(result.reason, result.cpu_seconds) for result in split(tasks, out)] == [(Reason.out_of_frame, 1.0)] * 2
+    assert [(result.reason, result.cpu_seconds) for result in split_render_result(tasks, out)] == [
+        (Reason.out_of_frame, 1.0)
+    ] * 2
     lacking = RenderOutput(chunks={}, labels={}, clips={"dots": done(0)})
-    results = split(tasks, TaskResult(outcome="succeeded", output=lacking))
+    results = split_render_result(tasks, TaskResult(outcome="succeeded", output=lacking))
     assert {result.outcome for result in results} == {"failed"}

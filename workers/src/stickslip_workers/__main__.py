@@ -123,9 +123,9 @@ def _dispatch(options: argparse.Namespace) -> int:
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.calls import StartError
     from stickslip_workers.cluster import Place, own_directory
     from stickslip_workers.dispatcher import Dispatcher
+    from stickslip_workers.ray_calls import StartError
 
     address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
     if address is None and data is None:
