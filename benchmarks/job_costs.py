@@ -17,7 +17,7 @@ from typing import Any
 
 import httpx
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.points import count, estimated
+from stickslip_schemas.plan.costs import count, estimated
 from thesis_job import service
 
 

@@ -12,7 +12,8 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import KeyedPoint, count, keyed_points
+from stickslip_schemas.plan.costs import count
+from stickslip_schemas.plan.points import KeyedPoint, keyed_points
 
 BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" * 64)
 MESH, PICTURE = f"sha256:{'a' * 64}", f"sha256:{'b' * 64}"

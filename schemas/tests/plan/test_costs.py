@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from stickslip_schemas.base import Stage
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.points import Estimate, Interval, count, estimated
+from stickslip_schemas.plan.costs import Estimate, Interval, count, estimated
 from stickslip_schemas.spec.names import Texture
 
 

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import count, keyed_points
+from stickslip_schemas.plan.costs import count
+from stickslip_schemas.plan.points import keyed_points
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 

@@ -10,7 +10,7 @@ from stickslip_schemas.base import ArtifactRef, Document, Int, JobState, Reason,
 from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
-from stickslip_schemas.plan.points import Estimate
+from stickslip_schemas.plan.costs import Estimate
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from click.exceptions import Exit
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents import responses
 from stickslip_schemas.format.manifest import bytes_estimate
-from stickslip_schemas.plan.points import Counts, Estimate, Interval, count, estimated
+from stickslip_schemas.plan.costs import Counts, Estimate, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.cli.common import (

@@ -19,7 +19,7 @@ from stickslip_schemas.base import JobState, Reason, Stage, sha256
 from stickslip_schemas.documents.responses import JobDetail, Validation
 from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.points import Counts, Interval, count, estimated
+from stickslip_schemas.plan.costs import Counts, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.access.keys import check_quota, note, this_asker

@@ -13,7 +13,7 @@ from sqlalchemy import func, select
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.points import count, estimated
+from stickslip_schemas.plan.costs import count, estimated
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
