@@ -7,7 +7,7 @@ from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, frames_at, training_cameras
 from stickslip_training.cloth.crop import ANCHOR, HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
 from stickslip_training.cloth.render import POINTS, _refined, draw_style, draw_textures, render_crops, splat, turned
-from stickslip_training.cloth.world import coded, draw_world
+from stickslip_training.cloth.surroundings import Codec, apply_codec, sample_surroundings
 
 RIG = training_cameras()
 FACING = looking_at(
@@ -138,7 +138,7 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
 
     def seen(seed, drawn=True):
         generator = torch.Generator().manual_seed(seed)
-        style, world = draw_style(3, 6, generator), draw_world(3, generator) if drawn else None
+        style, world = draw_style(3, 6, generator), sample_surroundings(3, generator) if drawn else None
         return render_crops(meshes, cameras, instants, style, generator, world)
 
     first, again, other, dark = seen(1), seen(1), seen(2), seen(1, drawn=False)
@@ -151,12 +151,10 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
 
 
 def test_a_codec_keeps_what_is_smooth():
-    world = draw_world(2, torch.Generator().manual_seed(0))
-    world.there["codec"][:] = torch.tensor([1.0, 0.0])
-    world.drawn["codec"][:] = 0.1
+    number = torch.ones(2, 1, 1, 1)
+    codec = Codec(is_on=torch.tensor([1.0, 0.0])[:, None, None, None], step=0.1 * number)
     ramp = torch.linspace(0, 1, WIDTH).expand(2, 1, HEIGHT, WIDTH) + 0.02 * torch.randn(2, 1, HEIGHT, WIDTH)
-    kept = coded(ramp, world)
+    kept = apply_codec(ramp, codec)
     assert torch.equal(kept[1], ramp[1])
     assert 0.001 < (kept[0] - ramp[0]).abs().mean() < 0.03
-    exact = world.drawn | {"codec": torch.full((2,), 1e-4)}
-    assert torch.allclose(coded(ramp, replace(world, drawn=exact)), ramp, atol=1e-3)
+    assert torch.allclose(apply_codec(ramp, replace(codec, step=1e-4 * number)), ramp, atol=1e-3)

@@ -23,7 +23,7 @@ from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
 from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, load_runs, runs_of_dataset
-from stickslip_training.cloth.world import draw_world
+from stickslip_training.cloth.surroundings import sample_surroundings
 from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine.fit import seed_of_step
 
@@ -149,7 +149,7 @@ def render_clips(
             seen = randomly_turned(rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator)
             looks = draw_style(len(chosen), len(frames), generator)
             meshes = torch.from_numpy(runs.positions[chosen][:, frames]).to(device)
-            world = draw_world(len(chosen), generator) if drawn_world else None
+            world = sample_surroundings(len(chosen), generator) if drawn_world else None
             picture, cover = render_crops(meshes, seen, instants, looks, generator, world)
             crops.append(picture.cpu())
             covers.append(cover.cpu())

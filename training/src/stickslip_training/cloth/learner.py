@@ -30,7 +30,7 @@ from stickslip_training.cloth.model import FrictionModel, PosteriorNet, log_hist
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between
-from stickslip_training.cloth.world import cloth_of_clip, draw_world
+from stickslip_training.cloth.surroundings import cloth_of_clip, sample_surroundings
 from stickslip_training.engine.fit import (
     EpochReport,
     FitSettings,
@@ -241,7 +241,7 @@ class FrictionLearner(Learner):
             views = torch.from_numpy(random.integers(len(self.rig.focal), size=count))
             cameras = randomly_turned(self.rig[views], self.settings.turn, generator)
             looks = draw_style(count, len(self.frames), generator)
-            world = draw_world(count, generator) if self.settings.worlds else None
+            world = sample_surroundings(count, generator) if self.settings.worlds else None
             crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
             first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
             mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(device)
@@ -257,7 +257,7 @@ class FrictionLearner(Learner):
         """Return clips of another renderer as part of a batch, each in a drawn world."""
         device = self.settings.device
         shown, cover, direction = (part.to(device) for part in (clips.crops, clips.cover, clips.direction))
-        looks, world = draw_style(len(clips), len(self.frames), generator), draw_world(len(clips), generator)
+        looks, world = draw_style(len(clips), len(self.frames), generator), sample_surroundings(len(clips), generator)
         cloth, world, cover = cloth_of_clip(shown, cover, looks, world, generator)
         cameras = self.rig[torch.cdist(direction, self.rig.rotation[:, 2]).argmin(dim=1)]
         crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)

@@ -19,7 +19,7 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
-from stickslip_training.cloth.world import Cloth, World, blurred, coded, enlarged, light_of
+from stickslip_training.cloth.surroundings import ClothLayer, Surroundings, apply_codec, blurred, composite, enlarged
 
 POINTS = 56
 """Points along a side of the refined mesh."""
@@ -126,7 +126,7 @@ def render_crops(
     instants: tuple[float, ...],
     style: Style,
     generator: torch.Generator | None = None,
-    world: World | None = None,
+    world: Surroundings | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render the holder-registered crops of meshes (B, F, side, side, 3) [m], and how much of each pixel cloth covers.
 
@@ -135,7 +135,7 @@ def render_crops(
     it there is none.
     """
     crops = holder_crops(cameras, instants)
-    true = cameras if world is None else world.seen_by(cameras)
+    true = cameras if world is None else world.true_cameras(cameras)
     shade = shading(positions, true, style)
     parts = []
     count = 1 if positions.device.type == "cpu" else len(positions)  # one clip's points fit into a processor's cache
@@ -148,30 +148,30 @@ def render_crops(
         fallen = points - lamp * (points[..., 2:] / lamp[..., 2:])
         shadow = torch.zeros(1) if world is None else splat(fallen, torch.ones_like(colors), *place)[0]
         parts.append((*splat(points, colors, *place), shadow))
-    cloth = Cloth(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    cloth = ClothLayer(*(torch.cat(part) for part in zip(*parts, strict=True)))
     return pictured(cloth, true, crops, instants, style, generator, world), cloth.alpha
 
 
 def pictured(
-    cloth: Cloth,
+    cloth: ClothLayer,
     cameras: Cameras,
     crops: Crops,
     instants: tuple[float, ...],
     style: Style,
     generator: torch.Generator | None,
-    world: World | None,
+    world: Surroundings | None,
 ) -> torch.Tensor:
     """Return the grey levels of cloth in a world, or over the dark floor of `style`, (B, F, 72, 88)."""
     if world is None:
         floor = style.floor[:, None, None, None]
         light = style.exposure[:, None, None, None] * cloth.alpha * cloth.light + (1.0 - cloth.alpha) * floor
     else:
-        light = light_of(cloth, cameras, crops, instants, style, world).clamp(max=1.0)
+        light = composite(cloth, cameras, crops, instants, style, world).clamp(max=1.0)
     picture = light.clamp(min=1e-5) ** style.gamma[:, None, None, None]
     picture = blurred(picture, style.blur)
     if generator is not None:
         picture = picture + style.noise[:, None, None, None] * torch.randn(picture.shape, generator=generator)
-    return (picture if world is None else coded(picture, world)).clamp(0.0, 1.0)
+    return (picture if world is None else apply_codec(picture, world.codec)).clamp(0.0, 1.0)
 
 
 def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
