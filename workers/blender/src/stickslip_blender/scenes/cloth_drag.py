@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stickslip_blender.cloth.clips import render_clips
 from stickslip_blender.cloth.geometry import Holders
+from stickslip_blender.cloth.render_task import render_clips
 from stickslip_blender.workshop import Workshop
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import Camera
 
-from stickslip_blender.cloth.clips import picture, render_clips, rig_camera
 from stickslip_blender.cloth.geometry import Geometry
+from stickslip_blender.cloth.render_task import picture, render_clips, rig_camera
 from stickslip_blender.cloth.stage import Stage
 from stickslip_blender.workshop import Workshop
 
