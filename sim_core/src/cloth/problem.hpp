@@ -6,6 +6,8 @@
 // components a node, the fourth is zero, so that a node is one vector register.
 #pragma once
 
+#include "contact/rows.hpp"
+
 namespace sim_core {
 
 // Triangles go through the membrane in groups of this many.
@@ -67,16 +69,6 @@ struct FoldData {
   float* coefficients;  // (triangles, 2): aa, ab
 };
 
-// Active pairs of closest points. Each has three weights of its four nodes: those of its closest points, and their
-// derivatives by where these lie. Its motions v_a = sum w_ai dx_i make forces f_a = sum C_ab v_b, of which node i gets
-// sum w_ai f_a.
-struct PairData {
-  int count;
-  const int* nodes;        // (count, 4), -1 for held ones
-  const float* weights;    // (count, 3, 4)
-  const float* stiffness;  // (count, 3 b, 3 columns, 3 a, 4): C, N/m
-};
-
 // K = mass + bending (x) 1 + membrane + folds + pairs, over the free nodes.
 struct ClothMatrix {
   int nodes;
@@ -89,17 +81,6 @@ struct ClothMatrix {
   float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
   const FoldData* folds;
   const PairData* pairs;  // may be null
-};
-
-// State of a node in the linear problem of contact.
-enum ContactMode : int { contact_open = 0, contact_slip = 1, contact_stick = 2 };
-
-struct ContactRows {
-  const int* mode;         // (nodes)
-  const float* normal;     // (nodes, 4)
-  const float* direction;  // (nodes, 4): of friction, in the plane
-  const float* mu;         // (nodes): 0 where the normal force is not positive
-  const float* turning;    // (nodes): stiffness against a turn of friction, N/m
 };
 
 // `count` rows of a front from `row` on are those of its parent from `place` on, in nodes, the parent's pivots first.

@@ -5,9 +5,9 @@
 #include <Eigen/Core>
 #include <vector>
 
-#include "cloth/problem.hpp"
 #include "contact/law.hpp"
 #include "contact/path.hpp"
+#include "contact/rows.hpp"
 #include "contact/settings.hpp"
 #include "contact/state.hpp"
 #include "contact/surface.hpp"

@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "cloth/problem.hpp"
+#include "contact/rows.hpp"
 
 namespace sim_core {
 namespace {

@@ -6,7 +6,7 @@
 #include <limits>
 #include <utility>
 
-#include "cloth/problem.hpp"
+#include "contact/rows.hpp"
 
 namespace sim_core {
 namespace {

@@ -9,11 +9,11 @@
 #include <optional>
 #include <vector>
 
-#include "cloth/problem.hpp"
 #include "contact/bodies.hpp"
 #include "contact/closest.hpp"
 #include "contact/law.hpp"
 #include "contact/pn_triangles.hpp"
+#include "contact/rows.hpp"
 #include "contact/settings.hpp"
 #include "contact/surface.hpp"
 #include "math/buffer.hpp"
