@@ -1,7 +1,9 @@
-"""What holds for the tests of all components: tiers, groups for parallel runs, and what each test costs.
+"""What holds for the tests of all components: tiers, groups for parallel runs, and what each test
+costs.
 
-`make test-fast` runs the tests without the markers `slow`, `real` and `physics`, and fails one that takes more CPU time
-than `--cpu-limit`. With `--cpu-report FILE` every test's CPU time [s] is written to a JSON file, longest first.
+`make test-fast` runs the tests without the markers `slow`, `real` and `physics`, and fails one that
+takes more CPU time than `--cpu-limit`. With `--cpu-report FILE` every test's CPU time [s] is
+written to a JSON file, longest first.
 """
 
 import gc
@@ -16,24 +18,36 @@ from _pytest.nodeid import NodeId
 for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write into what is in use
     os.environ.pop(_name, None)
 
-os.environ.setdefault("RAY_worker_niceness", "0")  # 15 by default: the other tests would starve those that use Ray
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of NumPy and torch wait by spinning, which the other tests pay
+os.environ.setdefault(
+    "RAY_worker_niceness", "0"
+)  # 15 by default: the other tests would starve those that use Ray
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # threads of NumPy and torch wait by spinning, which the other tests pay
 
 SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "s3": "s3"}
-"""Fixtures that start a server, and the group of the tests that share it. These tests are marked `real`."""
+"""Fixtures that start a server, and the group of the tests that share it. These tests are marked
+`real`.
+"""
 
 CPU_SECONDS = pytest.StashKey[float]()
 LAST_OF = pytest.StashKey[list[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--cpu-limit", type=float, help="fail a test whose call takes more CPU time than this [s]")
-    parser.addoption("--cpu-report", type=Path, help="write the CPU time of every test to this JSON file [s]")
+    parser.addoption(
+        "--cpu-limit", type=float, help="fail a test whose call takes more CPU time than this [s]"
+    )
+    parser.addoption(
+        "--cpu-report", type=Path, help="write the CPU time of every test to this JSON file [s]"
+    )
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Keep the garbage collector from what imports make, now and later: it would take a tenth of the time."""
+    """Keep the garbage collector from what imports make, now and later: it would take a tenth of
+    the time.
+    """
     gc.disable()
     yield
     gc.freeze()
@@ -41,13 +55,17 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one process run all tests that share a server or a fixture of their module, and sort the modules.
+    """Let one process run all tests that share a server or a fixture of their module, and sort the
+    modules.
 
-    Long rows of tests come first, then what waits or takes long: no process is left with it when the others are done.
+    Long rows of tests come first, then what waits or takes long: no process is left with it when
+    the others are done.
     """
     turns: dict[Path, tuple[bool, float, bool, bool]] = {}
     for item in items:
-        scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
+        scopes = {
+            name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()
+        }
         if "database" in scopes and "postgresql" in item.name:
             scopes["postgresql"] = "session"
         servers = [name for name in SERVERS if name in scopes]
@@ -69,14 +87,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Note the last test of each server."""
-    last = {name: item for item in session.items for name in SERVERS if name in item._fixtureinfo.name2fixturedefs}
+    last = {
+        name: item
+        for item in session.items
+        for name in SERVERS
+        if name in item._fixtureinfo.name2fixturedefs
+    }
     for name, item in last.items():
         item.stash.setdefault(LAST_OF, []).append(name)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
-    """Stop a server when its last test is over: Ray takes a tenth of a processor while nobody uses it."""
+    """Stop a server when its last test is over: Ray takes a tenth of a processor while nobody uses
+    it.
+    """
     yield
     for name in item.stash.get(LAST_OF, ()):
         item._fixtureinfo.name2fixturedefs[name][-1].finish(item._request)
@@ -96,7 +121,9 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[pytest.TestReport]:
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Iterator[pytest.TestReport]:
     report = yield
     if report.when == "call" and CPU_SECONDS in item.stash:
         report.user_properties.append(("cpu_seconds", round(item.stash[CPU_SECONDS], 2)))
@@ -115,4 +142,6 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     file = session.config.getoption("--cpu-report")
     if file is not None and not hasattr(session.config, "workerinput"):
-        file.write_text(json.dumps(dict(sorted(_costs.items(), key=lambda cost: -cost[1])), indent=1))
+        file.write_text(
+            json.dumps(dict(sorted(_costs.items(), key=lambda cost: -cost[1])), indent=1)
+        )

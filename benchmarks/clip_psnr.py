@@ -1,13 +1,15 @@
-"""What clips of cloth state of their own PSNR, against longer references at other instants, and what both cost.
+"""What clips of cloth state of their own PSNR, against longer references at other instants, and
+what both cost.
 
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
-    .venv-blender/bin/python benchmarks/clip_psnr.py /tmp/cloth.npz [--material gray-interlock] [--quality standard]
-        [--shown left matt drawn 21 [--shown ...]]
+    .venv-blender/bin/python benchmarks/clip_psnr.py /tmp/cloth.npz [--material gray-interlock]
+        [--quality standard] [--shown left matt drawn 21 [--shown ...]]
 
-Each clip has 30 frames and eight textures. `--shown` names viewpoint, floor, lighting and seed of a clip; without it,
-three are shown. The longer references are 3 x 128 paths per pixel and 6 x 128 of landed cloth, not denoised, at seven
-instants, for three of the textures; they share no noise with a clip's own.
+Each clip has 30 frames and eight textures. `--shown` names viewpoint, floor, lighting and seed of a
+clip; without it, three are shown. The longer references are 3 x 128 paths per pixel and 6 x 128 of
+landed cloth, not denoised, at seven instants, for three of the textures; they share no noise with a
+clip's own.
 """
 
 import argparse
@@ -40,7 +42,9 @@ def main() -> None:
     arguments.add_argument("--material", default="gray-interlock")
     arguments.add_argument("--quality", default="standard")
     arguments.add_argument("--measured", type=float, default=0.5)
-    arguments.add_argument("--shown", nargs=4, action="append", metavar=("VIEWPOINT", "FLOOR", "LIGHTING", "SEED"))
+    arguments.add_argument(
+        "--shown", nargs=4, action="append", metavar=("VIEWPOINT", "FLOOR", "LIGHTING", "SEED")
+    )
     options = arguments.parse_args()
     with np.load(options.trajectory) as file:
         track = file["track"]
@@ -68,20 +72,35 @@ def main() -> None:
         videos, _ = clip.clips(shading, [pictures[name] for name in TEXTURES])
         made = time.process_time()
         groups = list(dict.fromkeys(map(trio, TEXTURES)))
-        own = [list(clip.references([pictures[x] for x in g], clip.measured(options.measured, g))) for g in groups]
+        own = [
+            list(clip.references([pictures[x] for x in g], clip.measured(options.measured, g)))
+            for g in groups
+        ]
         weights, usual = clip.weights(shading)
         ended = time.process_time()
         others = replace(clip, seed=seed + 5000)
         long = list(others.references([pictures[name] for name in groups[0]], INSTANTS, LONG))
         seconds = (made - start) / len(TEXTURES) / 30
-        print(f"{viewpoint}, {substrate}, {lighting}: {seconds:.4f} CPU s a frame and texture", end=", ")
-        print(f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants", flush=True)
+        print(
+            f"{viewpoint}, {substrate}, {lighting}: {seconds:.4f} CPU s a frame and texture",
+            end=", ",
+        )
+        print(
+            f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants",
+            flush=True,
+        )
         for channel, name in enumerate(groups[0]):
             video = videos[TEXTURES.index(name)]
-            stated = pooled([(errors(video[f], lit, channel), weights[f]) for f, lit in own[0]], usual)
+            stated = pooled(
+                [(errors(video[f], lit, channel), weights[f]) for f, lit in own[0]], usual
+            )
             found = pooled([(errors(video[f], lit, channel), weights[f] > 0.0) for f, lit in long])
             said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
-            print(f"  {name}:", "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said), flush=True)
+            print(
+                f"  {name}:",
+                "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """What drop-and-drag costs on meshes of 21, 41 and 81 vertices a side, beside what it cost before.
 
-    python benchmarks/cloth.py [--vertices 21 41 81] [--mu 0.5] [--material gray-interlock] [--preset certified]
-                               [--seconds 124.6]
+    python benchmarks/cloth.py [--vertices 21 41 81] [--mu 0.5] [--material gray-interlock]
+                               [--preset certified] [--seconds 124.6]
 
-Prints, for the motion in one thread, CPU seconds, steps, and what they took. `BEFORE` is the core of
-November 2026 that stepped by 20 ms (gray-interlock, mu 0.5, `certified`, 131 s), on a machine with little else to do.
+Prints, for the motion in one thread, CPU seconds, steps, and what they took. `BEFORE` is the core
+of November 2026 that stepped by 20 ms (gray-interlock, mu 0.5, `certified`, 131 s), on a machine
+with little else to do.
 """
 
 import argparse
@@ -16,8 +17,14 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_sim_core.scenes.holders import Hands, Holder
 
-BEFORE = {21: (13.3, 6359, 3.91, 13.6, 0.45), 41: (82.3, 6359, 3.74, 15.5, 0.52), 81: (1037.0, 6319, 7.2, 57.6, 1.9)}
-"""By vertices a side: CPU s, steps, and Newton, GMRES and factors a step; 81: those of 10 steps at 45.5 s."""
+BEFORE = {
+    21: (13.3, 6359, 3.91, 13.6, 0.45),
+    41: (82.3, 6359, 3.74, 15.5, 0.52),
+    81: (1037.0, 6319, 7.2, 57.6, 1.9),
+}
+"""By vertices a side: CPU s, steps, and Newton, GMRES and factors a step; 81: those of 10 steps at
+45.5 s.
+"""
 
 
 def run(material: str, mu: float, preset: str, vertices: int, seconds: float) -> None:
@@ -42,7 +49,9 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     )
     if vertices in BEFORE:
         cost, count, newton, krylov, factors = BEFORE[vertices]
-        print(f"| {vertices}, before | {cost:.1f} | | {count} | {newton:.2f} | {krylov:.1f} | {factors:.2f} | | 0 |")
+        print(
+            f"| {vertices}, before | {cost:.1f} | | {count} | {newton:.2f} | {krylov:.1f} | {factors:.2f} | | 0 |"
+        )
 
 
 def main() -> None:
@@ -52,7 +61,9 @@ def main() -> None:
     parser.add_argument("--mu", type=float, default=0.5)
     parser.add_argument("--material", choices=fabric_names(), default="gray-interlock")
     parser.add_argument("--preset", choices=tuple(PRESETS), default="certified")
-    parser.add_argument("--seconds", type=float, default=(cloth_drag.FRAMES - 1) / cloth_drag.FRAME_RATE)
+    parser.add_argument(
+        "--seconds", type=float, default=(cloth_drag.FRAMES - 1) / cloth_drag.FRAME_RATE
+    )
     args = parser.parse_args()
     print(f"{args.material}, mu {args.mu}, {args.preset}, core {build_info().build_hash[:12]}")
     names = "hanging [s] | steps | Newton | GMRES | factors a step | missed | unconverged"

@@ -1,17 +1,18 @@
-"""Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its protocols.
+"""Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its
+protocols.
 
-    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [drops] [momentum] [protocols]
-        [--only PREFIX] [--figures FOLDER]
+    python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [drops] [momentum]
+        [protocols] [--only PREFIX] [--figures FOLDER]
 
-`camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and without contact
-with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing touches.
-`stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50 frames and all 300. `facets`:
-capstan over cylinders of triangles, and over a cloth.
-`drops`: sheets fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to see
-what crosses.
-`momentum`: what forces of pairs and their moments add up to. `protocols`: those of contact, with their settings; the
-stacked incline is on four meshes. Without a name all of them run; `--only pile` leaves out the drops and protocols
-whose names begin otherwise. With --figures the pictures of the protocols are drawn, too (needs matplotlib).
+`camel`: camel-ponte-roma, which folds onto itself, at mu 0.5 and 21 x 21 over 300 frames, with and
+without contact with itself. `overhead`: gray-interlock at 41 x 41 over 60 frames, in which nothing
+touches. `stretched`: gray-interlock at mu 0.5 over a stretched cloth and over a bare floor, 50
+frames and all 300. `facets`: capstan over cylinders of triangles, and over a cloth. `drops`: sheets
+fall, fold, are crumpled and pile up; after every step all edges are compared with all triangles, to
+see what crosses. `momentum`: what forces of pairs and their moments add up to. `protocols`: those
+of contact, with their settings; the stacked incline is on four meshes. Without a name all of them
+run; `--only pile` leaves out the drops and protocols whose names begin otherwise. With --figures
+the pictures of the protocols are drawn, too (needs matplotlib).
 """
 
 import argparse
@@ -23,7 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from stickslip_schemas.scene.library import load_scene
-from stickslip_sim_core import Body, Cloth, SelfContact, fabric, preset_named, protocols, self_intersections
+from stickslip_sim_core import (
+    Body,
+    Cloth,
+    SelfContact,
+    fabric,
+    preset_named,
+    protocols,
+    self_intersections,
+)
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import THICKNESS
@@ -43,8 +52,12 @@ PROTOCOLS: Mapping[str, Mapping[str, Any]] = {
 UNCONVERGED_SHARE_MAX = 0.002
 
 
-def dragged(material: str, vertices: int, frames: int, mu: float | None) -> tuple[float, Cloth, int]:
-    """Drop and drag at mu 0.5; return CPU seconds, the cloth, and how many of its steps end with a crossing.
+def dragged(
+    material: str, vertices: int, frames: int, mu: float | None
+) -> tuple[float, Cloth, int]:
+    """Drop and drag at mu 0.5.
+
+    Return CPU seconds, the cloth, and how many of its steps end with a crossing.
 
     The seconds are without the hanging and without looking for crossings.
     """
@@ -123,7 +136,9 @@ def tumble_all(only: str) -> None:
         )
         if seen.crossing_steps or seen.unconverged_steps > UNCONVERGED_SHARE_MAX * seen.steps:
             failed.append(name)
-    print(f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: {', '.join(failed) or 'none'}")
+    print(
+        f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: {', '.join(failed) or 'none'}"
+    )
 
 
 def momentum(name: str, steps: int) -> None:
@@ -145,17 +160,23 @@ def momentum_all() -> None:
 
 
 def over_facets() -> None:
-    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells, shorter and longer.
+    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells,
+    shorter and longer.
 
-    Then over a held cloth on such a cylinder, which is rough, with strips of cells of 5 to 2.5 degrees.
+    Then over a held cloth on such a cylinder, which is rough, with strips of cells of 5 to 2.5
+    degrees.
     """
     preset = preset_named("certified")
     of_cloth_cases = ((72, 60), (72, 120), (96, 120), (120, 90), (144, 60), (144, 120))
     for mu in capstan.FRICTION:
         strips: dict[str, capstan.Strip] = {"round": capstan.Strip(mu, 0.05, preset)}
-        strips |= {f"{facets} facets": OverTriangles(mu, 0.05, preset, facets) for facets in (72, 60, 24)}
+        strips |= {
+            f"{facets} facets": OverTriangles(mu, 0.05, preset, facets) for facets in (72, 60, 24)
+        }
         for cells, facets in of_cloth_cases:
-            strips[f"{cells} cells a turn, {facets} facets of cloth"] = OverCloth(mu, 0.05, preset, facets, cells)
+            strips[f"{cells} cells a turn, {facets} facets of cloth"] = OverCloth(
+                mu, 0.05, preset, facets, cells
+            )
         for name, strip in strips.items():
             heavy, wrap = strip.draw()
             cloth, expected = strip.cloth, np.log(master_curves.capstan(mu, wrap, 0.05))
@@ -179,7 +200,9 @@ def measure_all(only: str, figures: Path | None) -> None:
 def measure(name: str, settings: Mapping[str, Any], figures: Path | None) -> None:
     begin = time.process_time()
     result = protocols.run(name, "certified", **settings)
-    print(f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s")
+    print(
+        f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s"
+    )
     for curve in result.curves:
         print("  ", dict(curve.parameters), [f"{error:+.2e}" for error in curve.errors])
     print("  ", dict(result.settings), flush=True)
@@ -205,7 +228,9 @@ def main() -> None:
     parts = [*PARTS, "protocols"]
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(parts)}; none: all")
     parser.add_argument("--only", default="", help="how names of drops and protocols begin")
-    parser.add_argument("--figures", type=Path, help="folder to draw the pictures of the documentation into")
+    parser.add_argument(
+        "--figures", type=Path, help="folder to draw the pictures of the documentation into"
+    )
     given = parser.parse_args()
     for part in given.parts:
         if part not in parts:

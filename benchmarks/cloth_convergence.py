@@ -1,12 +1,14 @@
 """Convergence of drop-and-drag with the mesh and with the time step.
 
-python benchmarks/cloth_convergence.py [--vertices 21 41 81] [--divisors 1 2 4] [--mu 0.5] [--frames 300]
+python benchmarks/cloth_convergence.py [--vertices 21 41 81] [--divisors 1 2 4] [--mu 0.5] [--frames
+300]
 
-Vertices a side are 20 k + 1, so that all meshes share those of the coarsest, which are compared at every frame: meshes
-by the preset's own steps, each with the next finer one; and the preset's own steps (divisor 1) with fixed steps, its
-`time_step` over the other divisors, on the coarsest mesh, each with the shortest. Prints distances of vertices in mm
-over all frames and over those of the steady first drag, with the CPU seconds of each simulation, one thread. The cloth
-passes through itself, so that the step alone decides.
+Vertices a side are 20 k + 1, so that all meshes share those of the coarsest, which are compared at
+every frame: meshes by the preset's own steps, each with the next finer one; and the preset's own
+steps (divisor 1) with fixed steps, its `time_step` over the other divisors, on the coarsest mesh,
+each with the shortest. Prints distances of vertices in mm over all frames and over those of the
+steady first drag, with the CPU seconds of each simulation, one thread. The cloth passes through
+itself, so that the step alone decides.
 """
 
 import argparse
@@ -39,7 +41,13 @@ def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> ClothRun:
     start = time.process_time()
     preset = divided(preset_named(args.preset), divisor)
     scene = cloth_drag.scene(
-        args.material, args.mu, preset=preset, mesh=vertices, frames=args.frames, seed=args.seed, self_friction=None
+        args.material,
+        args.mu,
+        preset=preset,
+        mesh=vertices,
+        frames=args.frames,
+        seed=args.seed,
+        self_friction=None,
     ).run()
     seconds = time.process_time() - start
     print(
@@ -58,7 +66,9 @@ def shared(scene: ClothRun, vertices: int, coarsest: int) -> NDArray[np.float64]
     return scene.positions.reshape(len(scene.positions), vertices, vertices, 3)[:, ::every, ::every]
 
 
-def compare(name: str, a: NDArray[np.float64], b: NDArray[np.float64], times: NDArray[np.float64]) -> None:
+def compare(
+    name: str, a: NDArray[np.float64], b: NDArray[np.float64], times: NDArray[np.float64]
+) -> None:
     distance = 1e3 * np.linalg.norm(a - b, axis=-1)
     steady = distance[(times > STEADY[0]) & (times < STEADY[1])]
     for label, some in (("all frames", distance), ("steady drag", steady)):
@@ -70,8 +80,12 @@ def compare(name: str, a: NDArray[np.float64], b: NDArray[np.float64], times: ND
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vertices", type=int, nargs="+", default=[21, 41], help="a side; 81 takes long")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--vertices", type=int, nargs="+", default=[21, 41], help="a side; 81 takes long"
+    )
     parser.add_argument("--divisors", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--material", default="gray-interlock")
     parser.add_argument("--mu", type=float, default=0.5)
@@ -84,8 +98,12 @@ def main() -> None:
         parser.error("vertices: all meshes must have those of the coarsest")
 
     build = build_info()
-    print(f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  load {os.getloadavg()[0]:.1f}")
-    print(f"drop-and-drag of {args.material}, mu {args.mu:g}, {args.frames} frames, preset {args.preset}")
+    print(
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  load {os.getloadavg()[0]:.1f}"
+    )
+    print(
+        f"drop-and-drag of {args.material}, mu {args.mu:g}, {args.frames} frames, preset {args.preset}"
+    )
     scenes = {(side, 1): simulate(args, side, 1) for side in sides}
     for divisor in sorted(set(args.divisors) - {1}):
         scenes[sides[0], divisor] = simulate(args, sides[0], divisor)
@@ -96,7 +114,12 @@ def main() -> None:
         compare(f"mesh {coarse} and {fine}", paths[coarse, 1], paths[fine, 1], times)
     steps = sorted(divisor for side, divisor in paths if side == sides[0])
     for divisor in steps[:-1]:
-        compare(f"dt/{divisor} and dt/{steps[-1]}", paths[sides[0], divisor], paths[sides[0], steps[-1]], times)
+        compare(
+            f"dt/{divisor} and dt/{steps[-1]}",
+            paths[sides[0], divisor],
+            paths[sides[0], steps[-1]],
+            times,
+        )
     for (side, divisor), scene in scenes.items():
         steady = (scene.times > STEADY[0]) & (scene.times < STEADY[1])
         if steady.any():

@@ -10,14 +10,19 @@ from stickslip_testing.everyday import EVERYDAY
 
 
 def main() -> None:
-    """Print a row for each scene and mesh; exit with 1 if one is neither right nor refused nor caught."""
+    """Print a row for each scene and mesh.
+
+    Exit with 1 if one is neither right nor refused nor caught.
+    """
     wrong = []
     print("| scene | cells | outcome | CPU s |\n|---|---|---|---|")
     for cells in [int(argument) for argument in sys.argv[1:]] or [8, 16]:
         for name, (scene, allowed) in EVERYDAY.items():
             begin = time.process_time()
             outcome = scene(cells)
-            print(f"| {name} | {cells} | {outcome} | {time.process_time() - begin:.2f} |", flush=True)
+            print(
+                f"| {name} | {cells} | {outcome} | {time.process_time() - begin:.2f} |", flush=True
+            )
             if outcome not in allowed:
                 wrong.append(f"{name} at {cells} cells")
     if wrong:

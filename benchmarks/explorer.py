@@ -1,10 +1,11 @@
-"""The page of a large dataset in Chromium: how long until it paints, and until its list has followed a filter.
+"""The page of a large dataset in Chromium: how long until it paints, and until its list has
+followed a filter.
 
     python benchmarks/explorer.py [--samples 100000] [--repeat 9]
 
-Makes a dataset of rods without pictures as `million.py publish` does. Prints one JSON object with the first visit, the
-median of later ones [s], and the CPU time of the coordinator for each [s]. The list waits until a slider has
-not moved for 100 ms, which is part of the time of a filter.
+Makes a dataset of rods without pictures as `million.py publish` does. Prints one JSON object with
+the first visit, the median of later ones [s], and the CPU time of the coordinator for each [s]. The
+list waits until a slider has not moved for 100 ms, which is part of the time of a filter.
 """
 
 import argparse
@@ -36,7 +37,9 @@ def measure(samples: int, repeat: int) -> dict[str, Any]:
     """Make the dataset, and visit its page."""
     with tempfile.TemporaryDirectory() as directory, sync_playwright() as playwright:
         _coordinate(Path(directory), samples, 0.0)
-        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path="/usr/bin/chromium", args=["--no-sandbox"]
+        )
         with coordinator(Path(directory)) as (client, pid):
             (dataset,) = client.get("/v1/datasets").json()["items"]
             page = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -52,14 +55,19 @@ def measure(samples: int, repeat: int) -> dict[str, Any]:
         browser.close()
     told = {"paint": paints, "filter": filters, "cpu_paint": cpu_paint, "cpu_filter": cpu_filter}
     return {"samples": samples} | {
-        f"{name}_seconds": {"first": round(values[0], 3), "median": round(statistics.median(values[1:]), 3)}
+        f"{name}_seconds": {
+            "first": round(values[0], 3),
+            "median": round(statistics.median(values[1:]), 3),
+        }
         for name, values in told.items()
     }
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--samples", type=int, default=100_000)
     parser.add_argument("--repeat", type=int, default=9, help="visits (default: %(default)s)")
     arguments = parser.parse_args()

@@ -1,10 +1,11 @@
-"""From a hanging rod back to its natural curvature: exact, how ill-conditioned, and from a noisy centreline.
+"""From a hanging rod back to its natural curvature: exact, how ill-conditioned, and from a noisy
+centreline.
 
 OPENBLAS_NUM_THREADS=1 python benchmarks/inverse.py [--rods 50] [--figure docs/figures/inverse.png]
 
-Prints quantiles over random rods of the thesis's ranges, of natural curvature as root mean squares along the rod.
-Noise is white, per coordinate; 1 % is 0.01 L. Out-of-family rods add to each component of the natural curvature
-3 cosines of standard deviation (2, 2, 3)/k, k = 1 ... 3.
+Prints quantiles over random rods of the thesis's ranges, of natural curvature as root mean squares
+along the rod. Noise is white, per coordinate; 1 % is 0.01 L. Out-of-family rods add to each
+component of the natural curvature 3 cosines of standard deviation (2, 2, 3)/k, k = 1 ... 3.
 """
 
 import argparse
@@ -51,7 +52,9 @@ def quantiles(errors: Floats | list[float]) -> str:
 
 
 def exact_inverse(rng: np.random.Generator) -> None:
-    print("\nexact inverse, curvature from solve_rods at 150 points: relative error of natural curvature")
+    print(
+        "\nexact inverse, curvature from solve_rods at 150 points: relative error of natural curvature"
+    )
     n = 200
     for gamma in (100.0, 500.0, 1300.0):
         phi0, phi1 = rng.uniform([0.2, 6], [12, 20], (n, 2)).T
@@ -61,7 +64,9 @@ def exact_inverse(rng: np.random.Generator) -> None:
         with_frames = natural_curvature(rods.curvature, rods.frame, weight)
         alone = natural_curvature(rods.curvature, None, weight)
         for name, result in (("curvature and frames", with_frames), ("curvature alone", alone)):
-            print(f"  gamma {gamma:6.0f}  {name:21s} {quantiles(rms(result.curvature - natural) / rms(natural))}")
+            print(
+                f"  gamma {gamma:6.0f}  {name:21s} {quantiles(rms(result.curvature - natural) / rms(natural))}"
+            )
         modes = np.polynomial.legendre.legvander(2 * S[:, 0] - 1, 4) * np.sqrt(2 * np.arange(5) + 1)
         error = np.einsum("pb,nbi->npi", modes, rng.normal(size=(n, 5, 3)) / np.sqrt(15))
         error *= 0.01 * rms(rods.curvature)[:, None, None]
@@ -83,11 +88,16 @@ def three_parameters(rods: RodSolution, rng: np.random.Generator) -> None:
         start = time.process_time()
         fits = [fit_parameters(r + noise * rng.normal(size=r.shape)) for r in rods.centerline]
         seconds = (time.process_time() - start) / n
-        errors = [bending_error(f.solution.curvature[0], k) for f, k in zip(fits, rods.curvature, strict=True)]
+        errors = [
+            bending_error(f.solution.curvature[0], k)
+            for f, k in zip(fits, rods.curvature, strict=True)
+        ]
         print(f"  noise {noise:5.1%}  {quantiles(errors)}  CPU s per fit {seconds:.3f}")
 
 
-def distributed(name: str, natural: Floats, gamma: Floats, known: bool, rng: np.random.Generator) -> None:
+def distributed(
+    name: str, natural: Floats, gamma: Floats, known: bool, rng: np.random.Generator
+) -> None:
     rods = solve_general_rods(natural, gamma)
     noisy = rods.centerline + 0.005 * rng.normal(size=rods.centerline.shape)
     weights: list[float] | list[None] = list(gamma) if known else [None] * len(gamma)
@@ -96,8 +106,13 @@ def distributed(name: str, natural: Floats, gamma: Floats, known: bool, rng: np.
     seconds = (time.process_time() - start) / len(gamma)
     uniform = [fit_parameters(r, gamma=w) for r, w in zip(noisy, weights, strict=True)]
     print(f"\n{name}, gamma {'known' if known else 'fitted'}, noise 0.5 %, {len(gamma)} rods")
-    deformed = [bending_error(f.solution.curvature[0], k) for f, k in zip(fits, rods.curvature, strict=True)]
-    baseline = [bending_error(f.solution.curvature[0], k) for f, k in zip(uniform, rods.curvature, strict=True)]
+    deformed = [
+        bending_error(f.solution.curvature[0], k) for f, k in zip(fits, rods.curvature, strict=True)
+    ]
+    baseline = [
+        bending_error(f.solution.curvature[0], k)
+        for f, k in zip(uniform, rods.curvature, strict=True)
+    ]
     rest = [bending_error(f.natural_curvature, k) for f, k in zip(fits, natural, strict=True)]
     pairs = list(zip(fits, rods.centerline, strict=True))
     distance = [float(np.linalg.norm(f.solution.centerline[0] - r, axis=1).max()) for f, r in pairs]
@@ -105,8 +120,13 @@ def distributed(name: str, natural: Floats, gamma: Floats, known: bool, rng: np.
     print(f"  |kappa| hanging, three-parameter fit   {quantiles(baseline)}")
     print(f"  |kappa_bar|, distributed fit           {quantiles(rest)}")
     print(f"  re-hung centreline to truth, largest/L {quantiles(distance)}")
-    print(f"  degrees of freedom, median {np.median([f.degrees_of_freedom for f in fits]):.1f}", end="")
-    print(f"  noise found, median {np.median([f.noise for f in fits]):.5f}  CPU s per fit {seconds:.2f}")
+    print(
+        f"  degrees of freedom, median {np.median([f.degrees_of_freedom for f in fits]):.1f}",
+        end="",
+    )
+    print(
+        f"  noise found, median {np.median([f.noise for f in fits]):.5f}  CPU s per fit {seconds:.2f}"
+    )
 
 
 def figure(path: Path, natural: Floats, gamma: float) -> None:
@@ -124,16 +144,25 @@ def figure(path: Path, natural: Floats, gamma: float) -> None:
         1, 3, figsize=(12.5, 4.2), gridspec_kw={"width_ratios": [1, 1.6, 1.6]}, layout="constrained"
     )
     bend = [
-        np.hypot(k[:, 1], k[:, 2]) for k in (rod.curvature[0], fit.solution.curvature[0], uniform.solution.curvature[0])
+        np.hypot(k[:, 1], k[:, 2])
+        for k in (rod.curvature[0], fit.solution.curvature[0], uniform.solution.curvature[0])
     ]
     rest = [np.hypot(k[:, 1], k[:, 2]) for k in (natural, fit.natural_curvature, flat)]
     axes[0].plot(noisy[:, 0], noisy[:, 2], ".", ms=2.5, color="0.6")
     for solution, style in ((fit.solution, "C0-"), (uniform.solution, "C1--")):
         axes[0].plot(solution.centerline[0, :, 0], solution.centerline[0, :, 2], style)
-    axes[0].set(xlabel="x / L", ylabel="z / L", aspect="equal", title=f"$\\gamma$ = {gamma:.0f}, dots measured")
+    axes[0].set(
+        xlabel="x / L",
+        ylabel="z / L",
+        aspect="equal",
+        title=f"$\\gamma$ = {gamma:.0f}, dots measured",
+    )
     axes[0].locator_params(axis="x", nbins=3)
     axes[0].margins(x=0.3)
-    for ax, curves, title in ((axes[1], bend, r"$|\kappa|$ hanging"), (axes[2], rest, r"$|\bar\kappa|$ natural")):
+    for ax, curves, title in (
+        (axes[1], bend, r"$|\kappa|$ hanging"),
+        (axes[2], rest, r"$|\bar\kappa|$ natural"),
+    ):
         ax.plot(S[:, 0], curves[0], "k", lw=3, alpha=0.35, label="truth")
         ax.plot(S[:, 0], curves[1], "C0", label="distributed fit")
         ax.plot(S[:, 0], curves[2], "C1--", label="three-parameter fit")
@@ -145,14 +174,18 @@ def figure(path: Path, natural: Floats, gamma: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rods", type=int, default=50, help="rods per fit experiment")
     parser.add_argument("--figure", type=Path, help="also draw one fit, to this PNG")
     arguments = parser.parse_args()
     n = arguments.rods
 
     build = build_info()
-    print(f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}")
+    print(
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+    )
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     print(f"numpy {np.__version__}  python {platform.python_version()}  BLAS threads {threads}")
     exact_inverse(np.random.default_rng(1))
@@ -162,7 +195,9 @@ def main() -> None:
     inside = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None] * np.ones((1, POINTS, 1))
     outside = inside.copy()
     for k in (1, 2, 3):
-        outside += rng.normal(size=(n, 1, 3)) * np.array([2.0, 2.0, 3.0]) / k * np.cos(np.pi * k * S)
+        outside += (
+            rng.normal(size=(n, 1, 3)) * np.array([2.0, 2.0, 3.0]) / k * np.cos(np.pi * k * S)
+        )
     if arguments.figure:
         lightest = int(np.argmin(gamma))
         figure(arguments.figure, outside[lightest], float(gamma[lightest]))

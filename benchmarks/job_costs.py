@@ -2,9 +2,9 @@
 
     python benchmarks/job_costs.py [--only 0 1 2] [--port 9312]
 
-Runs the jobs one after the other in a service of its own, and prints a JSON object for each: CPU seconds by stage as
-the tasks measured them, and the estimate of the package with its interval [s]. No two jobs share a task. The first job
-of rods and the first of cloth pay for the start of Blender.
+Runs the jobs one after the other in a service of its own, and prints a JSON object for each: CPU
+seconds by stage as the tasks measured them, and the estimate of the package with its interval [s].
+No two jobs share a task. The first job of rods and the first of cloth pay for the start of Blender.
 """
 
 import argparse
@@ -24,14 +24,27 @@ from thesis_job import service
 def rods(number: int, quality: str) -> dict[str, Any]:
     """Return a job of rods with four views each."""
     gamma = {"type": "linspace", "start": 120, "stop": 1250, "num": number}
-    return {"kind": "rod_hang", "axes": {"gamma": gamma, "phi0": 2.0, "phi1": 9.0}, "quality": quality}
+    return {
+        "kind": "rod_hang",
+        "axes": {"gamma": gamma, "phi0": 2.0, "phi1": 9.0},
+        "quality": quality,
+    }
 
 
-def cloth(quality: str, frames: int, textures: str, material: str, mu: Any, **more: Any) -> dict[str, Any]:
+def cloth(
+    quality: str, frames: int, textures: str, material: str, mu: Any, **more: Any
+) -> dict[str, Any]:
     """Return a job of dragged cloth; `textures` are names with blanks between."""
     axes = {"material": material, "mu": mu, "texture": textures.split(), "viewpoint": "calibrated"}
     uncertified = {"allow_uncertified": True, "mesh": 21, "preset": "fast"}
-    return {"kind": "cloth_drag", "axes": axes, "quality": quality, "frames": frames, **uncertified, **more}
+    return {
+        "kind": "cloth_drag",
+        "axes": axes,
+        "quality": quality,
+        "frames": frames,
+        **uncertified,
+        **more,
+    }
 
 
 JOBS = [
@@ -43,7 +56,15 @@ JOBS = [
     cloth("draft", 20, "checker dots plaid gingham", "camel-ponte-roma", 0.6, preset="certified"),
     cloth("standard", 12, "houndstooth dots", "ivory-rib-knit", [0.2, 0.8]),
     cloth("draft", 24, "floral", "pink-ribbon-brown", 0.5, mesh=41),
-    cloth("standard", 10, "plaid dots herringbone", "white-swim-solid", 0.7, mesh=41, preset="certified"),
+    cloth(
+        "standard",
+        10,
+        "plaid dots herringbone",
+        "white-swim-solid",
+        0.7,
+        mesh=41,
+        preset="certified",
+    ),
     cloth("high", 8, "checker stripes", "tango-red-jet-set", 0.4, mesh=41),
 ]
 
@@ -57,14 +78,20 @@ def measured(client: httpx.Client, document: dict[str, Any]) -> dict[str, Any]:
     while (state := client.get(f"/v1/jobs/{job}").json())["finished_at"] is None:
         time.sleep(0.5)
     assert state["state"].startswith("succeeded"), state["message"]
-    stages = {name: round(stage["cpu_seconds"], 2) for name, stage in state["progress"]["stages"].items()}
+    stages = {
+        name: round(stage["cpu_seconds"], 2) for name, stage in state["progress"]["stages"].items()
+    }
     total, said = sum(stages.values()), usual.cpu_seconds
     return {
         "job": {name: value for name, value in document.items() if name != "allow_uncertified"},
         "cpu seconds": stages,
         "estimate": {name: round(stage.median, 2) for name, stage in usual.stages.items()},
         "total": round(total, 2),
-        "estimate of the total, low, median, high": [round(said.low, 2), round(said.median, 2), round(said.high, 2)],
+        "estimate of the total, low, median, high": [
+            round(said.low, 2),
+            round(said.median, 2),
+            round(said.high, 2),
+        ],
         "ratio": round(total / said.median, 2),
         "within the interval": said.low <= total <= said.high,
         "load": round(load, 1),

@@ -2,11 +2,12 @@
 
     python benchmarks/job_overhead.py [--rods 300] [--quality draft] [--slots N]
 
-Starts `stickslip up` in a directory of its own, waits until all processes are idle, submits a job of rods with four
-views each (a simulation and a render a rod, and a pack and a publish task or more), and reads the CPU time of every
-process of the service from /proc. What the stages took is what their tasks measured themselves; the rest of the
-processes that run them counts as overhead, like the coordinator, the dispatcher and Ray. What it costs to start the
-service, Blender above all, is printed apart: it is paid once.
+Starts `stickslip up` in a directory of its own, waits until all processes are idle, submits a job
+of rods with four views each (a simulation and a render a rod, and a pack and a publish task or
+more), and reads the CPU time of every process of the service from /proc. What the stages took is
+what their tasks measured themselves; the rest of the processes that run them counts as overhead,
+like the coordinator, the dispatcher and Ray. What it costs to start the service, Blender above all,
+is printed apart: it is paid once.
 """
 
 import argparse
@@ -40,8 +41,18 @@ HOSTS = "stage and render processes"
 
 def rods(count: int, quality: str) -> dict[str, Any]:
     """Return the spec of `count` rods with four views."""
-    axes = {"gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": count}, "phi0": 1.0, "phi1": 6.0}
-    return {"kind": "rod_hang", "axes": axes, "views": "rod-4", "quality": quality, "samples_per_shard": 100}
+    axes = {
+        "gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": count},
+        "phi0": 1.0,
+        "phi1": 6.0,
+    }
+    return {
+        "kind": "rod_hang",
+        "axes": axes,
+        "views": "rod-4",
+        "quality": quality,
+        "samples_per_shard": 100,
+    }
 
 
 class Accounts:
@@ -58,7 +69,12 @@ class Accounts:
             if entry.name.isdigit():
                 try:
                     fields = (entry / "stat").read_text().rpartition(")")[2].split()
-                    line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                    line = (
+                        (entry / "cmdline")
+                        .read_bytes()
+                        .replace(b"\0", b" ")
+                        .decode(errors="replace")
+                    )
                 except OSError:
                     continue
                 pid = int(entry.name)
@@ -66,7 +82,9 @@ class Accounts:
         for pid, fields in stats.items():
             if not self._is_ours(pid, parents, lines):
                 continue
-            part = next((name for text, name in PARTS if text in lines[pid]), f"other: {lines[pid][:60]}")
+            part = next(
+                (name for text, name in PARTS if text in lines[pid]), f"other: {lines[pid][:60]}"
+            )
             known = self._seconds.get((pid, fields[19]))
             if known is not None and part.startswith(("other", "Ray: agents")):
                 part = known[0]
@@ -126,13 +144,17 @@ def main() -> None:
         job = run_job(client, rods(options.rods, options.quality), accounts)
         wall = time.perf_counter() - begin
         accounts.look()
-        spent = {part: seconds - started.get(part, 0.0) for part, seconds in accounts.by_part().items()}
+        spent = {
+            part: seconds - started.get(part, 0.0) for part, seconds in accounts.by_part().items()
+        }
         stages = {stage: entry["cpu_seconds"] for stage, entry in job["progress"]["stages"].items()}
         tasks = sum(sum(entry["counts"].values()) for entry in job["progress"]["stages"].values())
     assert job["state"].startswith("succeeded"), job["message"]
     in_stages, total = sum(stages.values()), sum(spent.values())
     spent["around the tasks, in their processes"] = spent.pop(HOSTS) - in_stages
-    print(f"{tasks} tasks in {wall:.0f} s, load {load:.1f} before and {os.getloadavg()[0]:.1f} after")
+    print(
+        f"{tasks} tasks in {wall:.0f} s, load {load:.1f} before and {os.getloadavg()[0]:.1f} after"
+    )
     print(f"to start the service: {sum(started.values()):.1f} CPU s")
     for part, seconds in sorted(started.items(), key=lambda item: -item[1]):
         print(f"    {part:45} {seconds:7.2f}")
@@ -141,10 +163,14 @@ def main() -> None:
         print(f"    {stage:45} {seconds:7.2f}  {seconds / total:6.1%}")
     outside = 0.0
     for part, seconds in sorted(spent.items(), key=lambda item: -item[1]):
-        print(f"    {part:45} {seconds:7.2f}  {seconds / total:6.1%}  {1e3 * seconds / tasks:6.1f} ms a task")
+        print(
+            f"    {part:45} {seconds:7.2f}  {seconds / total:6.1%}  {1e3 * seconds / tasks:6.1f} ms a task"
+        )
         outside += seconds
     kept = sum(stages[stage] for stage in ("simulate", "render", "pack") if stage in stages)
-    print(f"outside simulate, render and pack: {total - kept:.2f} CPU s, {(total - kept) / total:.1%}")
+    print(
+        f"outside simulate, render and pack: {total - kept:.2f} CPU s, {(total - kept) / total:.1%}"
+    )
 
 
 if __name__ == "__main__":

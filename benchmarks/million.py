@@ -3,14 +3,16 @@
     python benchmarks/million.py plan [--samples 1000000] [--database postgresql://...]
     python benchmarks/million.py publish [--samples 1000000] [--delay 0.025]
 
-`plan`: how long the answer to the submission takes; then, while the coordinator plans, how long leases of another job
-take, and what planning costs it; then the same while the job is cancelled. `--database` is empty.
+`plan`: how long the answer to the submission takes; then, while the coordinator plans, how long
+leases of another job take, and what planning costs it; then the same while the job is cancelled.
+`--database` is empty.
 
-`publish`: a planned job of which every task but the last is said to have ended, in a store that answers each request
-after `--delay` seconds, whatever it asks. How long the coordinator takes to compose the last task, a worker to publish,
-and the coordinator to check what the worker says; then, in the directory of the version and without the delay, how long
-the reader of the training package takes to open it, to list the samples of a split, and to filter them by a label.
-Each of the three is a process of its own, with its own peak of memory. Prints one JSON object.
+`publish`: a planned job of which every task but the last is said to have ended, in a store that
+answers each request after `--delay` seconds, whatever it asks. How long the coordinator takes to
+compose the last task, a worker to publish, and the coordinator to check what the worker says; then,
+in the directory of the version and without the delay, how long the reader of the training package
+takes to open it, to list the samples of a split, and to filter them by a label. Each of the three
+is a process of its own, with its own peak of memory. Prints one JSON object.
 """
 
 import argparse
@@ -31,7 +33,13 @@ import httpx
 import numpy as np
 from plan import coordinator, peak_megabytes, spec
 from sqlalchemy import Row, text
-from stickslip_schemas.documents.tasks import PackOutput, PublishTask, RecordRef, SimulateOutput, TaskResult
+from stickslip_schemas.documents.tasks import (
+    PackOutput,
+    PublishTask,
+    RecordRef,
+    SimulateOutput,
+    TaskResult,
+)
 from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.store import DirectoryStore
@@ -70,7 +78,10 @@ class Worker:
         leases = self._post("lease", {"worker_id": self._id, "wanted": {"simulate": 10}})["leases"]
         seconds = time.perf_counter() - begin
         assert len(leases) == 10, "there must be tasks to lease"
-        reports = [{"task_id": lease["task_id"], "token": lease["token"], "result": None} for lease in leases]
+        reports = [
+            {"task_id": lease["task_id"], "token": lease["token"], "result": None}
+            for lease in leases
+        ]
         self._post("report", {"worker_id": self._id, "reports": reports})
         return seconds
 
@@ -95,7 +106,9 @@ def plan(samples: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory, coordinator(Path(directory)) as (client, pid):
         key = (Path(directory) / "worker-key").read_text().strip()
         worker = Worker(client, key, client.get("/v1/workers").json()[0]["id"])
-        client.post("/v1/jobs", json=spec(500, start=900.0), params={"priority": 5}).raise_for_status()
+        client.post(
+            "/v1/jobs", json=spec(500, start=900.0), params={"priority": 5}
+        ).raise_for_status()
         before: list[float] = []
         end = time.perf_counter() + BEFORE_SECONDS
         while time.perf_counter() < end:
@@ -103,7 +116,10 @@ def plan(samples: int) -> dict[str, Any]:
             time.sleep(0.05)
         cpu, begin = cpu_seconds(pid), time.perf_counter()
         job = client.post("/v1/jobs", json=spec(samples, start=0.0)).raise_for_status().json()
-        result: dict[str, Any] = {"samples": samples, "submit_seconds": round(time.perf_counter() - begin, 3)}
+        result: dict[str, Any] = {
+            "samples": samples,
+            "submit_seconds": round(time.perf_counter() - begin, 3),
+        }
         during: list[float] = []
         while job["state"] == "planning":
             during.append(worker.lease())
@@ -113,7 +129,10 @@ def plan(samples: int) -> dict[str, Any]:
         result["planning_seconds"] = round(time.perf_counter() - begin, 1)
         result["coordinator_cpu_seconds"] = round(cpu_seconds(pid) - cpu, 1)
         result["state"], result["tasks"] = job["state"], job["progress"]["total"]
-        result["lease_seconds_before"], result["lease_seconds_while_planning"] = told(before), told(during)
+        result["lease_seconds_before"], result["lease_seconds_while_planning"] = (
+            told(before),
+            told(during),
+        )
         result["coordinator_peak_mb"] = round(peak_megabytes(pid), 1)
         if (file := Path(directory) / "coordinator.sqlite3").exists():
             result["database_mb"] = round(file.stat().st_size / 1e6, 1)
@@ -128,8 +147,14 @@ def plan(samples: int) -> dict[str, Any]:
             job = client.get(f"/v1/jobs/{job['id']}").json()
             reads.append(time.perf_counter() - asked)
             time.sleep(0.05)
-        result["state"], result["cancelling_seconds"] = job["state"], round(time.perf_counter() - begin, 1)
-        result["lease_seconds_while_cancelling"], result["read_seconds_while_cancelling"] = told(leases), told(reads)
+        result["state"], result["cancelling_seconds"] = (
+            job["state"],
+            round(time.perf_counter() - begin, 1),
+        )
+        result["lease_seconds_while_cancelling"], result["read_seconds_while_cancelling"] = (
+            told(leases),
+            told(reads),
+        )
     return result
 
 
@@ -218,7 +243,9 @@ def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
             time.sleep(1)
         answer = running.result()
     output = answer.pop("output")
-    verdict = _timed(result, "check", lambda: worker.report((lease, TaskResult.model_validate(output))))
+    verdict = _timed(
+        result, "check", lambda: worker.report((lease, TaskResult.model_validate(output)))
+    )
     result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
     with made.database.read() as connection:
         state = connection.scalar(text("SELECT state FROM jobs"))
@@ -251,7 +278,9 @@ def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
 
 
 def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
-    """Yield what the packs of a job of rods without pictures might have made: curves that are all the same."""
+    """Yield what the packs of a job of rods without pictures might have made: curves that are all
+    the same.
+    """
     with made.database.read() as connection:
         row = connection.execute(text("SELECT seq, spec FROM jobs")).one()
         of_spec = parsed(json.loads(row.spec))
@@ -262,19 +291,26 @@ def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator
         curves = [array for array in layout(of_spec) if not array.is_label]
         # Some different ones: a file can have only so many hard links.
         shapes = [
-            [store.publish(encode_chunk(np.full((size, *array.shape), n, array.dtype))) for array in curves]
+            [
+                store.publish(encode_chunk(np.full((size, *array.shape), n, array.dtype)))
+                for array in curves
+            ]
             for n in range(64)
         ]
         sizes = {digest: store.size(digest) for digests in shapes for digest in digests}
         for shard in shards:
-            found = connection.execute(rows, {"job": row.seq, "first": shard * size, "end": (shard + 1) * size}).all()
+            found = connection.execute(
+                rows, {"job": row.seq, "first": shard * size, "end": (shard + 1) * size}
+            ).all()
             labels = [json.loads(sample.labels) for sample in found]
             columns = []
             for array in layout(of_spec):
                 if array.is_label:
                     values = np.zeros((len(found), *array.shape), array.dtype)
                     if array.name == "sample_key":
-                        values[:] = np.frombuffer(b"".join(sample.key for sample in found), np.uint8).reshape(-1, 32)
+                        values[:] = np.frombuffer(
+                            b"".join(sample.key for sample in found), np.uint8
+                        ).reshape(-1, 32)
                     elif array.name == "split":
                         values[:] = [sample.split for sample in found]
                     elif array.name == "valid":
@@ -322,17 +358,23 @@ def main() -> None:
     if sys.argv[1:2] and sys.argv[1].startswith("_"):
         what, *given = sys.argv[1:]
         parts: dict[str, Callable[..., dict[str, Any]]] = {
-            "_coordinate": lambda data, samples, delay: _coordinate(Path(data), int(samples), float(delay)),
+            "_coordinate": lambda data, samples, delay: _coordinate(
+                Path(data), int(samples), float(delay)
+            ),
             "_work": lambda task, store, delay: _work(Path(task), Path(store), float(delay)),
             "_read": lambda version: _read(Path(version)),
         }
         print(json.dumps(parts[what](*given)))
         return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("plan", "publish"))
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--database", help="URL of an empty PostgreSQL database, for plan")
-    parser.add_argument("--delay", type=float, default=0.025, help="of each request to the store [s]")
+    parser.add_argument(
+        "--delay", type=float, default=0.025, help="of each request to the store [s]"
+    )
     arguments = parser.parse_args()
     if arguments.database is not None:
         os.environ["STICKSLIP_DATABASE"] = arguments.database

@@ -72,9 +72,17 @@ def main() -> None:
                 slot=slot,
                 sample_key=f"{slot:064x}",
                 split=0,
-                labels={"gamma": 1.0, "phi0": 1.0, "phi1": 5.0, "energy": 0.0, "color": [0.5, 0.5, 0.5]},
+                labels={
+                    "gamma": 1.0,
+                    "phi0": 1.0,
+                    "phi1": 5.0,
+                    "energy": 0.0,
+                    "color": [0.5, 0.5, 0.5],
+                },
                 record=RecordRef(digest=record, row=slot),
-                chunks={"views": ChunkRef(digest=store.publish(chunk), offset=0, length=len(chunk))},
+                chunks={
+                    "views": ChunkRef(digest=store.publish(chunk), offset=0, length=len(chunk))
+                },
             )
             for slot, chunk in enumerate(chunks)
         )
@@ -82,7 +90,9 @@ def main() -> None:
         packing = cpu_seconds(lambda: pack(task, store))
     raw, size = sum(views.nbytes for views in pictures), sum(map(len, chunks))
     print(f"{SAMPLES} samples, {raw / 1e6:.1f} MB raw, {size / 1e6:.2f} MB encoded")
-    print(f"encode {encode * 1e3:.1f} ms, pack (all {len(layout(spec))} arrays) {packing * 1e3:.1f} ms CPU")
+    print(
+        f"encode {encode * 1e3:.1f} ms, pack (all {len(layout(spec))} arrays) {packing * 1e3:.1f} ms CPU"
+    )
     print(f"pack / encode {packing / encode:.1%}")
 
 

@@ -1,9 +1,10 @@
-"""Time and memory of planning a job of many samples, over HTTP, into an empty and into a full queue.
+"""Time and memory of planning a job of many samples, over HTTP, into an empty and into a full
+queue.
 
     python benchmarks/plan.py [--samples 100000]
 
-Prints one JSON object: for each job until it was accepted, and until all of it was planned. `million.py` measures what
-others notice of it.
+Prints one JSON object: for each job until it was accepted, and until all of it was planned.
+`million.py` measures what others notice of it.
 """
 
 import argparse
@@ -38,15 +39,25 @@ def peak_megabytes(pid: int) -> float:
 
 @contextmanager
 def coordinator(data: Path) -> Iterator[tuple[httpx.Client, int]]:
-    """Run a coordinator in a process of its own, with a worker for rods; yield a client and the process id."""
+    """Run a coordinator in a process of its own, with a worker for rods.
+
+    Yield a client and the process id.
+    """
     command = [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
         assert process.stdout is not None
         url = process.stdout.readline().split()[-1]
         try:
             with httpx.Client(base_url=url, timeout=120) as client:
                 builds = dict.fromkeys(Builds.model_fields, "a" * 64)
-                worker = {"name": "bench", "builds": {"rod_hang": builds}, "condition": {"slots": 1}, "versions": {}}
+                worker = {
+                    "name": "bench",
+                    "builds": {"rod_hang": builds},
+                    "condition": {"slots": 1},
+                    "versions": {},
+                }
                 key = {"Authorization": f"Bearer {(data / 'worker-key').read_text().strip()}"}
                 client.post("/v1/workers", json=worker, headers=key).raise_for_status()
                 yield client, process.pid

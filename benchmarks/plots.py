@@ -28,26 +28,61 @@ def plot(result: ProtocolResult) -> Figure:
     errors = [abs(e) for curve in result.curves for e in curve.errors if 0.0 < abs(e) < np.inf]
     floor = 0.3 * min([0.01 * result.tolerance, *errors])
     for curve in result.curves:
-        label = ", ".join(_label(result, name, value) for name, value in curve.parameters.items() if name != "mesh")
+        label = ", ".join(
+            _label(result, name, value)
+            for name, value in curve.parameters.items()
+            if name != "mesh"
+        )
         if first := label not in drawn:
             drawn[label] = next(colours)
-            above.plot(*dense_master(result.protocol, curve), color=drawn[label], label=f"master curve {label}".strip())
+            above.plot(
+                *dense_master(result.protocol, curve),
+                color=drawn[label],
+                label=f"master curve {label}".strip(),
+            )
         measured = "measured" if first else None
-        above.plot(curve.x, curve.measured, "o", color=drawn[label], markerfacecolor="none", label=measured)
-        below.plot(curve.x, np.maximum(np.abs(curve.errors), floor), "o", color=drawn[label], markersize=3)
+        above.plot(
+            curve.x, curve.measured, "o", color=drawn[label], markerfacecolor="none", label=measured
+        )
+        below.plot(
+            curve.x, np.maximum(np.abs(curve.errors), floor), "o", color=drawn[label], markersize=3
+        )
     scale = "log" if min(result.curves[0].x) > 0.0 else "linear"
-    above.set(xscale=scale, yscale=scale, ylabel=result.y_name, title=f"{result.protocol}: {_verdict(result)}")
+    above.set(
+        xscale=scale,
+        yscale=scale,
+        ylabel=result.y_name,
+        title=f"{result.protocol}: {_verdict(result)}",
+    )
     if scale == "linear":
         above.set_ylim(0.0, 1.3 * max(y for curve in result.curves for y in curve.master))
     above.legend(fontsize="small")
     below.axhline(result.tolerance, color="black", linestyle="--", linewidth=1)
     below.text(
-        0.01, result.tolerance, "tolerance", transform=below.get_yaxis_transform(), va="bottom", fontsize="small"
+        0.01,
+        result.tolerance,
+        "tolerance",
+        transform=below.get_yaxis_transform(),
+        va="bottom",
+        fontsize="small",
     )
-    below.set(yscale="log", ylabel="|relative error|", xlabel=result.x_name, ylim=(0.3 * floor, 50 * result.tolerance))
+    below.set(
+        yscale="log",
+        ylabel="|relative error|",
+        xlabel=result.x_name,
+        ylim=(0.3 * floor, 50 * result.tolerance),
+    )
     for axis, values in (
         (below.xaxis, result.curves[0].x),
-        (above.yaxis, [y for curve in result.curves for y in (*curve.measured, *curve.master) if np.isfinite(y)]),
+        (
+            above.yaxis,
+            [
+                y
+                for curve in result.curves
+                for y in (*curve.measured, *curve.master)
+                if np.isfinite(y)
+            ],
+        ),
     ):
         if scale == "log" and values and max(values) < 100.0 * min(values):
             axis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
@@ -57,8 +92,12 @@ def plot(result: ProtocolResult) -> Figure:
 
 
 def _label(result: ProtocolResult, name: str, value: float) -> str:
-    """Return the label of a parameter: settings may have texts for its numbers, such as "0 height, 1 length"."""
-    texts = dict(part.split(" ", 1) for part in str(result.settings.get(name, "")).split(", ") if " " in part)
+    """Return the label of a parameter: settings may have texts for its numbers, such as "0 height,
+    1 length".
+    """
+    texts = dict(
+        part.split(" ", 1) for part in str(result.settings.get(name, "")).split(", ") if " " in part
+    )
     return texts.get(f"{value:g}", f"{name} = {value:g}")
 
 

@@ -1,9 +1,11 @@
-"""Acceptance of the rod solver on the physical protocols: errors against the master curves, and what they cost.
+"""Acceptance of the rod solver on the physical protocols: errors against the master curves, and
+what they cost.
 
 python benchmarks/protocols_rods.py [--figures FOLDER]
 
-Prints one table per protocol. CPU seconds are those of the process, one thread; the master curves are part of them.
-With --figures the pictures of docs/protocols.md are drawn, too (needs matplotlib).
+Prints one table per protocol. CPU seconds are those of the process, one thread; the master curves
+are part of them. With --figures the pictures of docs/protocols.md are drawn, too (needs
+matplotlib).
 """
 
 import argparse
@@ -22,23 +24,41 @@ from stickslip_sim_core.reference import master_curves
 
 
 def report(result: ProtocolResult, seconds: float) -> None:
-    print(f"\n{result.protocol}: {'passed' if result.passed else 'FAILED'}, tolerance {result.tolerance:g}", end="")
-    print(f", largest error {result.error:.1e}, settings {dict(result.settings)}, {seconds:.2f} CPU s")
+    print(
+        f"\n{result.protocol}: {'passed' if result.passed else 'FAILED'}, tolerance {result.tolerance:g}",
+        end="",
+    )
+    print(
+        f", largest error {result.error:.1e}, settings {dict(result.settings)}, {seconds:.2f} CPU s"
+    )
     for curve in result.curves:
-        print("  " + (", ".join(f"{name} {value:g}" for name, value in curve.parameters.items()) or "all"))
+        print(
+            "  "
+            + (", ".join(f"{name} {value:g}" for name, value in curve.parameters.items()) or "all")
+        )
         print(f"  {result.x_name:>12} {'measured':>16} {'master':>16} {'error':>9}")
-        for x, measured, master, error in zip(curve.x, curve.measured, curve.master, curve.errors, strict=True):
+        for x, measured, master, error in zip(
+            curve.x, curve.measured, curve.master, curve.errors, strict=True
+        ):
             print(f"  {x:12.6g} {measured:16.9g} {master:16.9g} {error:9.1e}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--figures", type=Path, help="folder to draw the pictures of the documentation into")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--figures", type=Path, help="folder to draw the pictures of the documentation into"
+    )
     figures = parser.parse_args().figures
 
     build = build_info()
-    print(f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}")
-    print(f"numpy {np.__version__}  python {platform.python_version()}  load {os.getloadavg()[0]:.1f}")
+    print(
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+    )
+    print(
+        f"numpy {np.__version__}  python {platform.python_version()}  load {os.getloadavg()[0]:.1f}"
+    )
     results = []
     for name in [name for name in protocols.PROTOCOLS if name in protocols.ROD_PROTOCOLS]:
         start = time.process_time()

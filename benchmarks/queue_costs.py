@@ -1,11 +1,12 @@
-"""What the coordinator costs: leasing and completing tasks, many watchers of one job, many clients at once.
+"""What the coordinator costs: leasing and completing tasks, many watchers of one job, many clients
+at once.
 
     python benchmarks/queue_costs.py [--watchers 500] [--seconds 10] [--database postgresql://...]
 
-A coordinator runs as a process of its own with a database on a real disk, and its CPU time is read from /proc. That of
-a PostgreSQL server on this machine is shown beside it: of all its processes, so nothing else may use it. Workers
-pretend: their results are made up and lie in the store. Times of many clients depend on what else the machine does, so
-the load is printed with them.
+A coordinator runs as a process of its own with a database on a real disk, and its CPU time is read
+from /proc. That of a PostgreSQL server on this machine is shown beside it: of all its processes, so
+nothing else may use it. Workers pretend: their results are made up and lie in the store. Times of
+many clients depend on what else the machine does, so the load is printed with them.
 """
 
 import argparse
@@ -44,13 +45,17 @@ def cpu_seconds(server: ServerProcess) -> float:
 
 
 def database_seconds() -> float:
-    """Return the CPU time of the PostgreSQL servers of this machine, with all sessions that have ended [s]."""
+    """Return the CPU time of the PostgreSQL servers of this machine, with all sessions that have
+    ended [s].
+    """
     ticks = 0
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):  # it has just ended
             name, _, rest = path.read_text().rpartition(")")
             if name.endswith("(postgres"):
-                ticks += sum(map(int, rest.split()[11:15]))  # its own, and those of its children that have ended
+                ticks += sum(
+                    map(int, rest.split()[11:15])
+                )  # its own, and those of its children that have ended
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
@@ -65,7 +70,9 @@ def submit(server: ServerProcess, count: int, **spec: Any) -> str:
     return str(job["id"])
 
 
-def report_lease_and_complete(server: ServerProcess, worker: PretendWorker, batch: int, count: int) -> None:
+def report_lease_and_complete(
+    server: ServerProcess, worker: PretendWorker, batch: int, count: int
+) -> None:
     """Lease and complete simulations, so many with a request."""
     submit(server, count, poisson=0.1 + 0.001 * batch, views=None)
     (first,) = worker.lease(simulate=1)
@@ -78,14 +85,24 @@ def report_lease_and_complete(server: ServerProcess, worker: PretendWorker, batc
         leases = worker.lease(simulate=batch)
         worker.report(*((lease, result) for lease in leases))
         done += len(leases)
-    wall, spent, other = time.perf_counter() - begin, cpu_seconds(server) - cpu, database_seconds() - other
+    wall, spent, other = (
+        time.perf_counter() - begin,
+        cpu_seconds(server) - cpu,
+        database_seconds() - other,
+    )
     print(
         f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, {done / wall:.0f} a second"
-        + (f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL" if "STICKSLIP_DATABASE" in os.environ else "")
+        + (
+            f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL"
+            if "STICKSLIP_DATABASE" in os.environ
+            else ""
+        )
     )
 
 
-async def report_watchers(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
+async def report_watchers(
+    server: ServerProcess, worker: PretendWorker, count: int, seconds: float
+) -> None:
     """Let many watch one job that goes on."""
     job = submit(server, 400, poisson=0.31)
     heard: list[list[str]] = []
@@ -99,7 +116,11 @@ async def report_watchers(server: ServerProcess, worker: PretendWorker, count: i
         ids: list[str] = []
         heard.append(ids)
         async with client.stream("GET", f"/v1/jobs/{job}/events", timeout=60) as response:
-            ids += [line async for line in response.aiter_lines() if line.startswith(("id: ", "event: "))]
+            ids += [
+                line
+                async for line in response.aiter_lines()
+                if line.startswith(("id: ", "event: "))
+            ]
 
     limits = httpx.Limits(max_connections=None)
     async with httpx.AsyncClient(base_url=server.url, trust_env=False, limits=limits) as client:
@@ -114,11 +135,18 @@ async def report_watchers(server: ServerProcess, worker: PretendWorker, count: i
         await asyncio.to_thread(thread.join)
         await client.post(f"/v1/jobs/{job}:cancel")
         await asyncio.wait_for(asyncio.gather(*watchers), 60)
-    told = {tuple(dict.fromkeys(a for a, b in itertools.pairwise(ids) if "job.state" in b)) for ids in heard}
-    print(f"{count} watchers: {share:.0%} of a core; every one heard the same states: {len(told) == 1}")
+    told = {
+        tuple(dict.fromkeys(a for a, b in itertools.pairwise(ids) if "job.state" in b))
+        for ids in heard
+    }
+    print(
+        f"{count} watchers: {share:.0%} of a core; every one heard the same states: {len(told) == 1}"
+    )
 
 
-async def report_clients(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
+async def report_clients(
+    server: ServerProcess, worker: PretendWorker, count: int, seconds: float
+) -> None:
     """Let many clients ask once a second while a job runs."""
     job = submit(server, 400, poisson=0.32)
     took: list[float] = []
@@ -130,7 +158,9 @@ async def report_clients(server: ServerProcess, worker: PretendWorker, count: in
 
     async def ask(client: httpx.AsyncClient, number: int) -> None:
         await asyncio.sleep(number / count)
-        for path in ("/v1/jobs", f"/v1/jobs/{job}", f"/v1/jobs/{job}/samples", "/v1/workers") * int(seconds // 4 + 1):
+        for path in ("/v1/jobs", f"/v1/jobs/{job}", f"/v1/jobs/{job}/samples", "/v1/workers") * int(
+            seconds // 4 + 1
+        ):
             begin = time.perf_counter()
             (await client.get(path)).raise_for_status()
             took.append(time.perf_counter() - begin)
@@ -139,18 +169,27 @@ async def report_clients(server: ServerProcess, worker: PretendWorker, count: in
     thread = threading.Thread(target=work)
     thread.start()
     limits = httpx.Limits(max_connections=None)
-    async with httpx.AsyncClient(base_url=server.url, trust_env=False, limits=limits, timeout=30) as client:
+    async with httpx.AsyncClient(
+        base_url=server.url, trust_env=False, limits=limits, timeout=30
+    ) as client:
         await asyncio.gather(*(ask(client, number) for number in range(count)))
         stop.set()
         await asyncio.to_thread(thread.join)
         await client.post(f"/v1/jobs/{job}:cancel")
     took.sort()
     p50, p95, p99 = (1e3 * took[int(share * len(took))] for share in (0.5, 0.95, 0.99))
-    print(f"{count} clients, one request a second each: p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms")
+    print(
+        f"{count} clients, one request a second each: p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms"
+    )
 
 
-async def report_idle_streams(server: ServerProcess, worker: PretendWorker, count: int, seconds: float) -> None:
-    """Open idle event streams from as many addresses and keys as they need, and 100 too many; use the API meanwhile."""
+async def report_idle_streams(
+    server: ServerProcess, worker: PretendWorker, count: int, seconds: float
+) -> None:
+    """Open idle event streams from as many addresses and keys as they need, and 100 too many.
+
+    Use the API meanwhile.
+    """
     job, watched = submit(server, 800, poisson=0.33), submit(server, 4, poisson=0.331)
     httpx.post(f"{server.url}/v1/jobs/{watched}:pause", trust_env=False).raise_for_status()
     host, port = server.url.removeprefix("http://").split(":")
@@ -166,7 +205,9 @@ async def report_idle_streams(server: ServerProcess, worker: PretendWorker, coun
 
     async def open_stream(number: int) -> None:
         which = number // MOST_STREAMS
-        reader, writer = await asyncio.open_connection(host, int(port), local_addr=(f"127.0.0.{1 + which}", 0))
+        reader, writer = await asyncio.open_connection(
+            host, int(port), local_addr=(f"127.0.0.{1 + which}", 0)
+        )
         writer.write(f"{request}{keys[which]}\r\n\r\n".encode())
         statuses[(await reader.readline()).split()[1]] += 1
         writers.append(writer)
@@ -199,11 +240,15 @@ async def report_idle_streams(server: ServerProcess, worker: PretendWorker, coun
         with httpx.Client(trust_env=False, timeout=30) as client:
             await asyncio.to_thread(use, client)
         share = (cpu_seconds(server) - cpu) / seconds
-        print(f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load {os.getloadavg()[0]:.1f}")
+        print(
+            f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load {os.getloadavg()[0]:.1f}"
+        )
         for name, times in took.items():
             times.sort()
             p50, p99 = (1e3 * times[int(part * len(times))] for part in (0.5, 0.99))
-            print(f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest {1e3 * times[-1]:.0f} ms")
+            print(
+                f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest {1e3 * times[-1]:.0f} ms"
+            )
 
     await measure("no stream")
     readers = []
@@ -221,13 +266,20 @@ async def report_idle_streams(server: ServerProcess, worker: PretendWorker, coun
 
 def memory(server: ServerProcess) -> float:
     """Return the memory of a server [MiB]."""
-    return int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+    return (
+        int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
+        * resource.getpagesize()
+        / 2**20
+    )
 
 
-def report_heartbeats(server: ServerProcess, worker: PretendWorker, held: int, senders: int, seconds: float) -> None:
+def report_heartbeats(
+    server: ServerProcess, worker: PretendWorker, held: int, senders: int, seconds: float
+) -> None:
     """Send heartbeats of workers with so many leases each, over connections that are kept.
 
-    They are sent as bytes that were made before: what a dispatcher spends on its own machine is not to be measured.
+    They are sent as bytes that were made before: what a dispatcher spends on its own machine is not
+    to be measured.
     """
     submit(server, held * senders, poisson=0.34)
     key = (server.data / "worker-key").read_text().strip()
@@ -236,11 +288,16 @@ def report_heartbeats(server: ServerProcess, worker: PretendWorker, held: int, s
     requests = []
     for number in range(senders):
         one = PretendWorker(worker.api, server.store, name=f"beats-{number}").register()
-        leases = tuple(LeaseState(task_id=i.task_id, token=i.token, started=False) for i in one.lease(simulate=held))
+        leases = tuple(
+            LeaseState(task_id=i.task_id, token=i.token, started=False)
+            for i in one.lease(simulate=held)
+        )
         assert len(leases) == held
         body = Heartbeat(worker_id=one.id, leases=leases, condition=one.condition).model_dump_json()
         lines = f"Host: {host}", f"Authorization: Bearer {key}", "Content-Type: application/json"
-        head = "\r\n".join(["POST /v1/worker/heartbeat HTTP/1.1", *lines, f"Content-Length: {len(body)}"])
+        head = "\r\n".join(
+            ["POST /v1/worker/heartbeat HTTP/1.1", *lines, f"Content-Length: {len(body)}"]
+        )
         requests.append(f"{head}\r\n\r\n{body}".encode())
     end = time.perf_counter() + seconds
 
@@ -275,8 +332,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--watchers", type=int, default=500)
     parser.add_argument("--clients", type=int, default=50)
-    parser.add_argument("--streams", type=int, default=0, help="idle event streams; 2000 are the most")
-    parser.add_argument("--beats", type=int, default=0, help="workers that send heartbeats with 64 leases each")
+    parser.add_argument(
+        "--streams", type=int, default=0, help="idle event streams; 2000 are the most"
+    )
+    parser.add_argument(
+        "--beats", type=int, default=0, help="workers that send heartbeats with 64 leases each"
+    )
     parser.add_argument("--tasks", type=int, default=6401, help="to lease and complete; 0: none")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--database", help="URL of an empty PostgreSQL database")
@@ -288,15 +349,21 @@ def main() -> None:
         server = start_server(Path(directory) / "data")
         try:
             worker = server.worker()
-            with httpx.Client(trust_env=False, timeout=30) as client:  # as a dispatcher, which keeps its connection
+            with httpx.Client(
+                trust_env=False, timeout=30
+            ) as client:  # as a dispatcher, which keeps its connection
                 key = (server.data / "worker-key").read_text().strip()
-                steady = PretendWorker(HttpApi(server.url, key, client.post), server.store, name="steady").register()
+                steady = PretendWorker(
+                    HttpApi(server.url, key, client.post), server.store, name="steady"
+                ).register()
                 print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
                 if options.tasks:
                     report_lease_and_complete(server, steady, 1, 1 + options.tasks // 10)
                     report_lease_and_complete(server, steady, 16, options.tasks)
                 if options.streams:
-                    asyncio.run(report_idle_streams(server, steady, options.streams, options.seconds))
+                    asyncio.run(
+                        report_idle_streams(server, steady, options.streams, options.seconds)
+                    )
                 if options.beats:
                     report_heartbeats(server, steady, 64, options.beats, options.seconds)
             if options.watchers:

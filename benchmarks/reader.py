@@ -2,14 +2,15 @@
 
 python benchmarks/reader.py DATASET [--clips 128] [--batch-size 8] [--epochs 5]
 
-DATASET is a directory of `cloth_drag` clips, as `stickslip pull` gives it. Each row is CPU time (user and system, of
-all threads) for a clip, files in the page cache: the median over epochs, each a random order of all clips, after one
-epoch of warming up in which every batch is compared with the clips; in brackets the least and the most. Samples are
-stacked into a batch, as Torch's own collate function does. WebDataset reads its tar files in their order; its own
-shuffling is left out, which is to its advantage. All but the first four rows read raw pixels, without compression.
+DATASET is a directory of `cloth_drag` clips, as `stickslip pull` gives it. Each row is CPU time
+(user and system, of all threads) for a clip, files in the page cache: the median over epochs, each
+a random order of all clips, after one epoch of warming up in which every batch is compared with the
+clips; in brackets the least and the most. Samples are stacked into a batch, as Torch's own collate
+function does. WebDataset reads its tar files in their order; its own shuffling is left out, which
+is to its advantage. All but the first four rows read raw pixels, without compression.
 
-A peer that is not installed has no row. MosaicML Streaming wants numpy < 2.2, so it needs an environment of its own
-(docs/export.md says how to make one).
+A peer that is not installed has no row. MosaicML Streaming wants numpy < 2.2, so it needs an
+environment of its own (docs/export.md says how to make one).
 """
 
 import argparse
@@ -57,24 +58,34 @@ def tensorstore(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, 
     location = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(root / "video")}}
     context = library.Context({"data_copy_concurrency": {"limit": 1}})
     store = library.open(location, read=True, context=context).result()
-    yield "tensorstore", lambda indices: np.stack([store[index].read().result() for index in indices])
+    yield (
+        "tensorstore",
+        lambda indices: np.stack([store[index].read().result() for index in indices]),
+    )
 
 
 def npy(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
     """Yield one .npy file a clip."""
     for index, clip in enumerate(clips):
         np.save(scratch / f"{index}.npy", clip)
-    yield "np.load, raw", lambda indices: np.stack([np.load(scratch / f"{index}.npy") for index in indices])
+    yield (
+        "np.load, raw",
+        lambda indices: np.stack([np.load(scratch / f"{index}.npy") for index in indices]),
+    )
 
 
 def h5py(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
-    """Yield HDF5 with one chunk a clip: raw, and with the checksum that `stickslip export --hdf5` adds."""
+    """Yield HDF5 with one chunk a clip: raw, and with the checksum that `stickslip export --hdf5`
+    adds.
+    """
     import h5py as library
 
     for title, checked in (("HDF5, raw", False), ("HDF5, raw, with Fletcher's checksum", True)):
         path = scratch / f"{checked}.h5"
         with library.File(path, "w") as file:
-            file.create_dataset("video", data=clips, chunks=(1, *clips.shape[1:]), fletcher32=checked)
+            file.create_dataset(
+                "video", data=clips, chunks=(1, *clips.shape[1:]), fletcher32=checked
+            )
         video = library.File(path)["video"]
 
         def draw(indices: list[int], video: Any = video) -> Bytes:
@@ -92,7 +103,9 @@ def streaming(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Dr
     import streaming as library
 
     shape = ",".join(map(str, clips.shape[1:]))
-    with library.MDSWriter(out=str(scratch / "mds"), columns={"video": f"ndarray:uint8:{shape}"}) as writer:
+    with library.MDSWriter(
+        out=str(scratch / "mds"), columns={"video": f"ndarray:uint8:{shape}"}
+    ) as writer:
         for clip in clips:
             writer.write({"video": clip})
     rows = library.StreamingDataset(local=str(scratch / "mds"), shuffle=False, batch_size=1)
@@ -122,7 +135,9 @@ READERS = (ours, zarr_python, tensorstore, npy, h5py, streaming, webdataset)
 PACKAGES = {"ours": None, "zarr_python": "zarr", "npy": None}
 
 
-def measure(draw: Draw, clips: Bytes, batch_size: int, epochs: int, *, in_order: bool) -> tuple[float, float, float]:
+def measure(
+    draw: Draw, clips: Bytes, batch_size: int, epochs: int, *, in_order: bool
+) -> tuple[float, float, float]:
     """Return the CPU time for a clip [ms]: median, least and most over the epochs."""
     generator = np.random.default_rng(0)
     times = []
@@ -164,7 +179,9 @@ def packages() -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--clips", type=int, default=128)
     parser.add_argument("--batch-size", type=int, default=8)
@@ -173,16 +190,22 @@ def main() -> None:
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ResourceWarning)  # webdataset closes no file
-    print(f"benchmarks/reader.py --clips {options.clips} --batch-size {options.batch_size} --epochs {options.epochs}")
+    print(
+        f"benchmarks/reader.py --clips {options.clips} --batch-size {options.batch_size} --epochs {options.epochs}"
+    )
     print(f"python {platform.python_version()}, {packages()}")
     print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
 
     everything = Samples(options.dataset)
     count = min(options.clips, len(everything))
     clips = np.stack([np.asarray(everything[index]["video"]) for index in range(count)])
-    stored = sum(path.stat().st_size for path in (options.dataset / "video").rglob("*") if path.is_file())
+    stored = sum(
+        path.stat().st_size for path in (options.dataset / "video").rglob("*") if path.is_file()
+    )
     raw = clips[0].nbytes * len(everything)
-    ratio = f"{raw / 1e6:.0f} MB raw, {stored / 1e6:.0f} MB in shards: {raw / stored:.2f} times less"
+    ratio = (
+        f"{raw / 1e6:.0f} MB raw, {stored / 1e6:.0f} MB in shards: {raw / stored:.2f} times less"
+    )
     print(f"{count} of {len(everything)} clips; all have {ratio}")
     print(f"{'CPU ms a clip':40}median  [least - most]  of MDS")
     rows: dict[str, tuple[float, float, float]] = {}
@@ -193,7 +216,9 @@ def main() -> None:
                 continue
             for title, draw in reader(options.dataset, clips, Path(scratch)):
                 in_order = reader is webdataset
-                rows[title] = measure(draw, clips, options.batch_size, options.epochs, in_order=in_order)
+                rows[title] = measure(
+                    draw, clips, options.batch_size, options.epochs, in_order=in_order
+                )
     peer = rows.get("MDS, raw")
     for title, (median, least, most) in rows.items():
         ratio = f"{median / peer[0]:8.2f}" if peer else ""

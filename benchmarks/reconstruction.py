@@ -1,12 +1,14 @@
 """How far reconstructed centrelines are from the true ones, over rods rendered as datasets are.
 
-python benchmarks/reconstruction.py [--rods 200] [--hard | --varying] [--out DIR] [--save FILE.npz] [--views FILE.npz]
+python benchmarks/reconstruction.py [--rods 200] [--hard | --varying] [--out DIR] [--save FILE.npz]
+[--views FILE.npz]
 
-Draws rods from the thesis's ranges (seeded), renders them in Blender's interpreter, reconstructs them from the
-pictures alone, and prints errors in per cent of the length. The error of a rod is the mean distance of points at the
-same arc length. --views keeps the pictures, or takes them from there if the file exists. --save writes `true` and
-`reconstructed` (rods, 150, 3) over L, with verdicts, parameters and true strains: data for a model of reconstruction
-noise. --varying takes rods whose natural curvature varies along their length.
+Draws rods from the thesis's ranges (seeded), renders them in Blender's interpreter, reconstructs
+them from the pictures alone, and prints errors in per cent of the length. The error of a rod is the
+mean distance of points at the same arc length. --views keeps the pictures, or takes them from there
+if the file exists. --save writes `true` and `reconstructed` (rods, 150, 3) over L, with verdicts,
+parameters and true strains: data for a model of reconstruction noise. --varying takes rods whose
+natural curvature varies along their length.
 """
 
 import argparse
@@ -37,9 +39,12 @@ HERE = Path(__file__).parent
 RIG = "rod-4"
 RADIUS = 0.008  # [L], the renderer's default
 RANGES = {"gamma": (100.0, 1300.0), "phi0": (0.2, 12.0), "phi1": (6.0, 20.0)}  # [thesis, 5.4.1]
-# Where rods coil at their free end, twice over: most of the thesis's own few hard ones lie in this corner.
+# Where rods coil at their free end, twice over: most of the thesis's own few hard ones lie in this
+# corner.
 HARD_RANGES = {"gamma": (50.0, 200.0), "phi0": (0.2, 4.0), "phi1": (15.0, 30.0)}
-DEVIATION = np.array([2.0, 2.0, 3.0])  # of the first added cosine of twist, bend1 and bend2 [rad]; of the k-th, a k-th
+DEVIATION = np.array(
+    [2.0, 2.0, 3.0]
+)  # of the first added cosine of twist, bend1 and bend2 [rad]; of the k-th, a k-th
 WAVES = 3
 BAD = 0.005  # [L]: a mean error above it, or a largest error above four times it, is a failure
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -61,7 +66,9 @@ class Judged:
 
 
 def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats]:
-    """Return rods of a family that lie in all four frames: centrelines, strains and what they are made from."""
+    """Return rods of a family that lie in all four frames: centrelines, strains and what they are
+    made from.
+    """
     random, rig = np.random.Generator(np.random.PCG64(seed)), load_rig(RIG)
     ranges = HARD_RANGES if family == "hard" else RANGES
     made = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
@@ -77,10 +84,16 @@ def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats
     lines, strains = solution.centerline, solution.curvature
     seen = [all(camera.overflow(line, RADIUS) <= 0.0 for camera in rig) for line in lines]
     kept = np.flatnonzero(np.array(seen) & solution.stable)[:count]
-    return {"centerline": lines[kept], "strains": strains[kept], **{name: row[kept] for name, row in made.items()}}
+    return {
+        "centerline": lines[kept],
+        "strains": strains[kept],
+        **{name: row[kept] for name, row in made.items()},
+    }
 
 
-def rendered(rods: int, seed: int, family: str, blender: Path, keep: Path | None) -> dict[str, npt.NDArray[Any]]:
+def rendered(
+    rods: int, seed: int, family: str, blender: Path, keep: Path | None
+) -> dict[str, npt.NDArray[Any]]:
     """Return the rods with their `views`, rendered now unless `keep` has them."""
     if keep is not None and keep.exists():
         with np.load(keep) as file:
@@ -90,7 +103,9 @@ def rendered(rods: int, seed: int, family: str, blender: Path, keep: Path | None
         views = keep or Path(folder) / "views.npz"
         arrays: dict[str, Any] = {**draw_rods(rods, seed, family)}
         np.savez(drawn, **arrays)
-        subprocess.run([blender, HERE / "render_rod_set.py", drawn, views, "--rig", RIG], check=True)
+        subprocess.run(
+            [blender, HERE / "render_rod_set.py", drawn, views, "--rig", RIG], check=True
+        )
         with np.load(views) as file:
             return dict(file)
 
@@ -110,21 +125,27 @@ def thesis_error(pictures: npt.NDArray[np.uint8], true: Floats) -> float:
     ]
     line = moving_cylinder(visual_hull(views), RADIUS, DOWN)
     walked = np.linspace(0.0, 1.0, len(line))
-    even = np.stack([np.interp(np.linspace(0.0, 1.0, len(true)), walked, axis) for axis in line.T], axis=1)
+    even = np.stack(
+        [np.interp(np.linspace(0.0, 1.0, len(true)), walked, axis) for axis in line.T], axis=1
+    )
     return float(np.linalg.norm(even - true, axis=1).mean())
 
 
 def print_report(judged: list[Judged], thesis: list[float]) -> None:
     mean = 100.0 * np.array([item.error.mean() for item in judged])
     largest = 100.0 * np.array([item.error.max() for item in judged])
-    print(f"{len(judged)} rods, {platform.machine()}, one process, one thread; errors in % of the length")
+    print(
+        f"{len(judged)} rods, {platform.machine()}, one process, one thread; errors in % of the length"
+    )
     print(f"{'':24}{'median':>8}{'p95':>8}{'max':>8}")
     for name, values in (
         ("mean over the rod", mean),
         ("largest on the rod", largest),
         ("thesis: moving cylinder", 100.0 * np.array(thesis)),
     ):
-        print(f"{name:24}{np.median(values):8.3f}{np.quantile(values, 0.95):8.3f}{values.max():8.3f}")
+        print(
+            f"{name:24}{np.median(values):8.3f}{np.quantile(values, 0.95):8.3f}{values.max():8.3f}"
+        )
     seconds = np.array([item.seconds for item in judged])
     print(f"CPU s a rod: median {np.median(seconds):.2f}, p95 {np.quantile(seconds, 0.95):.2f}")
     bad = np.array([item.bad for item in judged])
@@ -138,10 +159,14 @@ def print_report(judged: list[Judged], thesis: list[float]) -> None:
         values = np.array([getattr(item.found, name) for item in judged])
         good = values[~bad]
         worst = f"{values[bad].min():.3f} to {values[bad].max():.3f}" if bad.any() else "-"
-        print(f"  {name:13} others up to {good.max():.3f} (median {np.median(good):.3f}), failures {worst}")
+        print(
+            f"  {name:13} others up to {good.max():.3f} (median {np.median(good):.3f}), failures {worst}"
+        )
 
 
-def save_pictures(out: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged], worst: int = 8) -> None:
+def save_pictures(
+    out: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged], worst: int = 8
+) -> None:
     """Write a histogram of errors, and overlays of the worst rods and of the middle one."""
     import matplotlib
 
@@ -169,7 +194,9 @@ def save_pictures(out: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Jud
 
 def save_data(path: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged]) -> None:
     """Write true and reconstructed centrelines."""
-    given: dict[str, Any] = {name: rods[name] for name in ("strains", "natural", *RANGES) if name in rods}
+    given: dict[str, Any] = {
+        name: rods[name] for name in ("strains", "natural", *RANGES) if name in rods
+    }
     np.savez_compressed(
         path,
         true=rods["centerline"],
@@ -187,7 +214,9 @@ def main() -> None:
     arguments.add_argument("--rods", type=int, default=200)
     arguments.add_argument("--seed", type=int, default=2024)
     kinds = arguments.add_mutually_exclusive_group()
-    kinds.add_argument("--hard", action="store_true", help="rods beyond the thesis's, to see failures flagged")
+    kinds.add_argument(
+        "--hard", action="store_true", help="rods beyond the thesis's, to see failures flagged"
+    )
     kinds.add_argument("--varying", action="store_true", help="rods of varying natural curvature")
     arguments.add_argument("--out", type=Path, help="folder for the histogram and overlays")
     arguments.add_argument("--save", type=Path, help="npz for true and reconstructed centrelines")

@@ -1,21 +1,24 @@
-"""CPU time and distance from 256 samples of a frame of cloth, by quality, with one shading for many textures.
+"""CPU time and distance from 256 samples of a frame of cloth, by quality, with one shading for many
+textures.
 
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
-    .venv/bin/python benchmarks/render_trajectory.py /tmp/cloth.npz
-    .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz [--frames 12] [--references DIR] [--substrates]
+    .venv/bin/python benchmarks/render_trajectory.py /tmp/cloth.npz .venv-blender/bin/python
+    benchmarks/render_cloth.py /tmp/cloth.npz [--frames 12] [--references DIR] [--substrates]
     .venv-blender/bin/python benchmarks/render_cloth.py /tmp/cloth.npz --clip CLIPS.npy
 
-References are rendered directly, with another seed, in the window that the cloth is in; those of --substrates are
-denoised, for gloss is still noisy at 256 samples. They take most of the time, and DIR keeps them. Decibels pool the
-squared error of 8-bit sRGB over the pixels that the cloth covers by half or more, over frames, views and textures.
-CPU time is a median over frames, per frame and texture, with eight textures.
+References are rendered directly, with another seed, in the window that the cloth is in; those of
+--substrates are denoised, for gloss is still noisy at 256 samples. They take most of the time, and
+DIR keeps them. Decibels pool the squared error of 8-bit sRGB over the pixels that the cloth covers
+by half or more, over frames, views and textures. CPU time is a median over frames, per frame and
+texture, with eight textures.
 
---look says what hem, thickness, translucency and creases cost, and --ground-truth what all its arrays cost, written to
-a store too: both against a shading and its composition, in turns, so that other work on the machine slows both alike.
+--look says what hem, thickness, translucency and creases cost, and --ground-truth what all its
+arrays cost, written to a store too: both against a shading and its composition, in turns, so that
+other work on the machine slows both alike.
 
---clip makes what a render process makes of a task, 8 clips of 30 frames in a store, says how much of its time is not
-Blender's, and writes the clips to a file.
+--clip makes what a render process makes of a task, 8 clips of 30 frames in a store, says how much
+of its time is not Blender's, and writes the clips to a file.
 """
 
 import argparse
@@ -35,7 +38,15 @@ from stickslip_blender.actor import RenderActor
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import FLOOR, Holders
 from stickslip_blender.cloth.ground_truth import ground_truth
-from stickslip_blender.cloth.looks import HARD, Substrate, drawn_light, drawn_substrate, floor_factor, grained, look_of
+from stickslip_blender.cloth.looks import (
+    HARD,
+    Substrate,
+    drawn_light,
+    drawn_substrate,
+    floor_factor,
+    grained,
+    look_of,
+)
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling, import_bpy
 from stickslip_blender.cycles.pixels import FrameReader, encode
@@ -81,20 +92,27 @@ class Bench:
             self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
         self.look = look_of(MATERIAL)
         self.pictures = {
-            texture: grained(texture_image(texture), self.look, self.renderer.geometry.surface) for texture in TEXTURES
+            texture: grained(texture_image(texture), self.look, self.renderer.geometry.surface)
+            for texture in TEXTURES
         }
         self.textures = Textures(list(self.pictures.values()))
         self.geometry, self.scene = self.renderer.geometry, self.renderer.scene
         self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
         self.rig = load_rig("drag")[:3]
-        build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[:12]
+        build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[
+            :12
+        ]
         self.references = references and references / build
 
     def set_up(self, shot: View) -> tuple[Points, npt.NDArray[np.float32]]:
         """Return where everything is, and the floor's factor."""
         camera = self.rig[shot.view]
-        self.scene.set_up(camera, drawn_light("drawn", shot.view), shot.substrate, self.look, self.track)
-        return self.geometry.points(self.track[shot.frame], shot.frame), floor_factor(shot.substrate, camera, FLOOR)
+        self.scene.set_up(
+            camera, drawn_light("drawn", shot.view), shot.substrate, self.look, self.track
+        )
+        return self.geometry.points(self.track[shot.frame], shot.frame), floor_factor(
+            shot.substrate, camera, FLOOR
+        )
 
     def reference(self, view: View, texture: Texture) -> tuple[Window, npt.NDArray[np.uint8]]:
         """Return the window and what it should look like."""
@@ -106,15 +124,22 @@ class Bench:
         camera = self.rig[view.view]
         light = np.zeros((camera.height, camera.width, 3), dtype=np.float16)
         light[window.slices] = self.scene.direct(
-            shot, self.pictures[texture], REFERENCE if view.substrate.name == "matt" else SMOOTH, window
+            shot,
+            self.pictures[texture],
+            REFERENCE if view.substrate.name == "matt" else SMOOTH,
+            window,
         )
-        picture = encode(light * self.scene.composer.floor_factor(shot, camera, floor))[window.slices]
+        picture = encode(light * self.scene.composer.floor_factor(shot, camera, floor))[
+            window.slices
+        ]
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             np.save(kept, picture)
         return window, picture
 
-    def composed(self, view: View, sampling: ClothSampling) -> tuple[npt.NDArray[np.uint8], float, float]:
+    def composed(
+        self, view: View, sampling: ClothSampling
+    ) -> tuple[npt.NDArray[np.uint8], float, float]:
         """Return the pictures of all textures, the seconds of Cycles and those of all the rest."""
         shot, floor = self.set_up(view)
         placed = time.process_time()
@@ -122,23 +147,31 @@ class Bench:
         traced = time.process_time()
         camera = self.rig[view.view]
         pictures = np.zeros((len(TEXTURES), camera.height, camera.width, 3), dtype=np.uint8)
-        self.scene.composer.compose(shading, shot, camera, view.substrate, floor, self.textures, pictures)
+        self.scene.composer.compose(
+            shading, shot, camera, view.substrate, floor, self.textures, pictures
+        )
         ended = time.process_time()
         return pictures, traced - placed, ended - traced + self._per_frame(view)
 
     def _per_frame(self, view: View) -> float:
-        """Return the seconds that it takes to place everything: once a frame, the rest of `set_up` once a clip."""
+        """Return the seconds that it takes to place everything: once a frame, the rest of `set_up`
+        once a clip.
+        """
         start = time.process_time()
         self.geometry.points(self.track[view.frame], view.frame)
         return time.process_time() - start
 
-    def direct(self, view: View, texture: Texture, sampling: Sampling) -> tuple[npt.NDArray[np.uint8], float]:
+    def direct(
+        self, view: View, texture: Texture, sampling: Sampling
+    ) -> tuple[npt.NDArray[np.uint8], float]:
         """Return a picture rendered directly, and its seconds."""
         shot, floor = self.set_up(view)
         start = time.process_time()
         light = self.scene.direct(shot, self.pictures[texture], sampling)
         spent = time.process_time() - start
-        return encode(light * self.scene.composer.floor_factor(shot, self.rig[view.view], floor)), spent
+        return encode(
+            light * self.scene.composer.floor_factor(shot, self.rig[view.view], floor)
+        ), spent
 
     def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""
@@ -185,8 +218,14 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
             floor.append(error[~cloth].ravel())
     everything = [error for errors in by_texture.values() for error in errors]
     seconds = (np.median(cycles) + np.median(rest)) / len(order)
-    textures = " ".join(f"{texture} {decibels(errors):.1f}" for texture, errors in by_texture.items())
-    views = " ".join(f"{bench.rig[view].name} {decibels(errors):.1f}" for view, errors in by_view.items() if errors)
+    textures = " ".join(
+        f"{texture} {decibels(errors):.1f}" for texture, errors in by_texture.items()
+    )
+    views = " ".join(
+        f"{bench.rig[view].name} {decibels(errors):.1f}"
+        for view, errors in by_view.items()
+        if errors
+    )
     print(
         f"{quality:18} {seconds:.4f} CPU s; cloth {decibels(everything):.2f} dB ({textures}; {views}); floor near it "
         f"{decibels(floor):.1f} dB; Cycles {1e3 * np.median(cycles):.0f} ms, all else {1e3 * np.median(rest):.0f} ms "
@@ -196,7 +235,9 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
 
 
 def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
-    """Print what a shading and its composition cost with a plain sheet, and with all that makes it look like cloth."""
+    """Print what a shading and its composition cost with a plain sheet, and with all that makes it
+    look like cloth.
+    """
     full, plain = bench.look, replace(bench.look, hem=0.0, translucency=0.0)
     seconds: dict[str, list[float]] = {"plain": [], "full": []}
     for _ in range(3):
@@ -215,14 +256,18 @@ def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
 
 
 def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
-    """Print the cost of depth, segmentation, normals, texture coordinates and flow, and of a shading."""
+    """Print the cost of depth, segmentation, normals, texture coordinates and flow, and of a
+    shading.
+    """
     pictures, known, written = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         workshop = Workshop(folder)
         for view in chosen * 2:
             _, light, other = bench.composed(view, CLOTH_SAMPLING[Quality.standard])
             pictures.append(light + other)
-            now, then = (bench.geometry.points(bench.track[k], k) for k in (view.frame, view.frame - 5))
+            now, then = (
+                bench.geometry.points(bench.track[k], k) for k in (view.frame, view.frame - 5)
+            )
             start = time.process_time()
             truth = ground_truth(bench.geometry, now, then, bench.rig[view.view])
             found = time.process_time()
@@ -231,7 +276,9 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
             known.append(found - start)
             written.append(time.process_time() - found)
     whole = np.array(pictures)
-    of_trace, of_all = (100 * np.median(part / whole) for part in (np.array(known), np.add(known, written)))
+    of_trace, of_all = (
+        100 * np.median(part / whole) for part in (np.array(known), np.add(known, written))
+    )
     print(
         f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the "
         f"{1e3 * np.median(whole):.0f} ms of a shading and its eight pictures; {of_all:.1f} % with writing it",
@@ -242,7 +289,11 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
 def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
     """Make the clips of a task, all of it, and print where the time goes."""
     with np.load(trajectory) as file:
-        record = {"positions": file["track"][None], "rest": file["rest"][None], "triangles": file["triangles"][None]}
+        record = {
+            "positions": file["track"][None],
+            "rest": file["rest"][None],
+            "triangles": file["triangles"][None],
+        }
     spent = [0.0, 0.0]  # in Blender, and for all
     rendered = FrameReader._rendered
 
@@ -269,7 +320,10 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
         reference = RecordRef(digest=store.publish(data.getvalue()), row=0)
         actor = RenderActor(folder)
         short = look.model_copy(update={"instants": look.instants[:1]})
-        for document, wanted in ((short, ()), (look, TEXTURES)):  # shaders are compiled once, with the first
+        for document, wanted in (
+            (short, ()),
+            (look, TEXTURES),
+        ):  # shaders are compiled once, with the first
             task = RenderTask(render=document, record=reference, textures=wanted)
             spent = [0.0, 0.0]
             start = time.process_time()
@@ -299,8 +353,12 @@ def main() -> None:
     arguments.add_argument("trajectory", type=Path)
     arguments.add_argument("--frames", type=int, default=12, help="instants, each in three views")
     arguments.add_argument("--references", type=Path, help="folder that keeps them")
-    arguments.add_argument("--substrates", action="store_true", help="the seven of the thesis, one instant each")
-    arguments.add_argument("--clip", type=Path, metavar="NPY", help="make whole clips instead, and write them there")
+    arguments.add_argument(
+        "--substrates", action="store_true", help="the seven of the thesis, one instant each"
+    )
+    arguments.add_argument(
+        "--clip", type=Path, metavar="NPY", help="make whole clips instead, and write them there"
+    )
     arguments.add_argument("--quality", default="standard", help="of --clip")
     arguments.add_argument("--substrate", default="matt", help="of --clip")
     arguments.add_argument("--material", default=MATERIAL, help="of --clip")
@@ -308,12 +366,18 @@ def main() -> None:
     arguments.add_argument("--creases", type=float, default=CREASES, help="of --clip")
     arguments.add_argument("--direct", action="store_true", help="direct renderings too")
     arguments.add_argument("--look", action="store_true", help="only what the look of cloth costs")
-    arguments.add_argument("--ground-truth", action="store_true", help="only what ground truth costs")
-    arguments.add_argument("--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings")
+    arguments.add_argument(
+        "--ground-truth", action="store_true", help="only what ground truth costs"
+    )
+    arguments.add_argument(
+        "--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings"
+    )
     options = arguments.parse_args()
     if options.clip is not None:
         names = ("quality", "material", "viewpoint", "substrate", "creases")
-        whole_clips(options.trajectory, options.clip, **{name: getattr(options, name) for name in names})
+        whole_clips(
+            options.trajectory, options.clip, **{name: getattr(options, name) for name in names}
+        )
         return
 
     bench = Bench(options.trajectory, options.references)
@@ -339,7 +403,9 @@ def main() -> None:
             for view in chosen[:6]:
                 picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "guided"))
                 part, reference = bench.reference(view, Texture.floral)
-                errors.append(squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel())
+                errors.append(
+                    squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel()
+                )
                 seconds.append(spent)
             print(
                 f"direct {samples:11} {np.median(seconds):.4f} CPU s; cloth {decibels(errors):.2f} dB (floral)",
@@ -347,7 +413,9 @@ def main() -> None:
             )
     if options.substrates:
         for name in HARD:
-            compare(bench, name, CLOTH_SAMPLING[Quality.standard], list(shots(bench.track, 1, (name,))))
+            compare(
+                bench, name, CLOTH_SAMPLING[Quality.standard], list(shots(bench.track, 1, (name,)))
+            )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Render a set of rods from all four cameras.
 
-Runs in Blender's interpreter:  .venv-blender/bin/python benchmarks/render_rod_set.py RODS.npz VIEWS.npz
+Runs in Blender's interpreter:  .venv-blender/bin/python benchmarks/render_rod_set.py RODS.npz
+VIEWS.npz
 
-RODS.npz has `centerline` (rods, 150, 3) over L; VIEWS.npz gets `views` (rods, cameras, height, width, 3) besides. The
-color of rod number i is that of seed i.
+RODS.npz has `centerline` (rods, 150, 3) over L; VIEWS.npz gets `views` (rods, cameras, height,
+width, 3) besides. The color of rod number i is that of seed i.
 """
 
 import argparse
@@ -27,7 +28,10 @@ def main() -> None:
         rods = dict(file)
     rig = load_rig(options.rig)
     renderer = RodRenderer(quality=options.quality)
-    views = [renderer.render(line, rig, color=silicone_color(seed)) for seed, line in enumerate(rods["centerline"])]
+    views = [
+        renderer.render(line, rig, color=silicone_color(seed))
+        for seed, line in enumerate(rods["centerline"])
+    ]
     np.savez_compressed(options.views, **rods, views=np.stack(views))
 
 

@@ -1,9 +1,11 @@
 """What a rod's view costs in CPU time and how far it is from a 256-sample reference, by quality.
 
-Runs in Blender's interpreter:  .venv-blender/bin/python benchmarks/render_rods.py [--rods N] [--all]
+Runs in Blender's interpreter:  .venv-blender/bin/python benchmarks/render_rods.py [--rods N]
+[--all]
 
-PSNR is given twice: over the whole frame, most of which is even ground, and over the pixels that the rod touches. CPU
-time is all of a rod's four views (mesh, cameras, Cycles, pixels out) over four, the median over rods after a first one.
+PSNR is given twice: over the whole frame, most of which is even ground, and over the pixels that
+the rod touches. CPU time is all of a rod's four views (mesh, cameras, Cycles, pixels out) over
+four, the median over rods after a first one.
 """
 
 import argparse
@@ -20,7 +22,9 @@ from stickslip_schemas.spec.cameras import load_rig
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""
 OTHERS = {
-    f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(samples=samples, denoiser=denoiser)
+    f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(
+        samples=samples, denoiser=denoiser
+    )
     for samples in (4, 8, 16, 32, 64, 128)
     for denoiser in ("none", "guided")
 }
@@ -39,9 +43,13 @@ def curls(count: int) -> npt.NDArray[np.float64]:
     random = np.random.Generator(np.random.PCG64(0))
     s = np.linspace(0.0, 1.0, POINTS)
     lines = []
-    for turns, opening in zip(random.uniform(1.0, 5.0, count), random.uniform(0.3, 1.3, count), strict=True):
+    for turns, opening in zip(
+        random.uniform(1.0, 5.0, count), random.uniform(0.3, 1.3, count), strict=True
+    ):
         tilt, turn = opening * np.sqrt(s), 2.0 * np.pi * turns * s**1.3
-        tangent = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1)
+        tangent = np.stack(
+            [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1
+        )
         steps = 0.5 * (tangent[1:] + tangent[:-1]) / (POINTS - 1)
         lines.append(np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
     return np.stack(lines)
@@ -65,8 +73,12 @@ def psnr(views: npt.NDArray[np.uint8], reference: npt.NDArray[np.uint8]) -> floa
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--rods", type=int, default=8, help="how many rods, each seen four times")
-    arguments.add_argument("--all", action="store_true", help="other samplings too, not only the named ones")
+    arguments.add_argument(
+        "--rods", type=int, default=8, help="how many rods, each seen four times"
+    )
+    arguments.add_argument(
+        "--all", action="store_true", help="other samplings too, not only the named ones"
+    )
     options = arguments.parse_args()
 
     lines = curls(options.rods)
@@ -75,16 +87,23 @@ def main() -> None:
     app = import_bpy().app
     print(f"bpy {app.version_string} ({app.build_hash.decode()}), {platform.machine()}, one thread")
     print(f"{options.rods} rods x 4 views; the rod covers {100 * rod.mean():.1f} % of the pixels")
-    print(f"{'quality':10} {'samples':>7} {'denoiser':>8} {'CPU ms/view':>11} {'PSNR frame':>10} {'PSNR rod':>8}")
+    print(
+        f"{'quality':10} {'samples':>7} {'denoiser':>8} {'CPU ms/view':>11} {'PSNR frame':>10} {'PSNR rod':>8}"
+    )
     named: dict[str, Sampling] = {str(name): sampling for name, sampling in SAMPLING.items()}
     for name, sampling in (named | (OTHERS if options.all else {})).items():
         result = measure(sampling, lines)
-        quality = [psnr(result.views, reference.views), psnr(result.views[rod], reference.views[rod])]
+        quality = [
+            psnr(result.views, reference.views),
+            psnr(result.views[rod], reference.views[rod]),
+        ]
         print(
             f"{name:10} {sampling.samples:7} {sampling.denoiser:>8} {result.milliseconds:11.0f} "
             f"{quality[0]:10.1f} {quality[1]:8.1f}"
         )
-    print(f"{'reference':10} {REFERENCE.samples:7} {REFERENCE.denoiser:>8} {reference.milliseconds:11.0f}")
+    print(
+        f"{'reference':10} {REFERENCE.samples:7} {REFERENCE.denoiser:>8} {reference.milliseconds:11.0f}"
+    )
 
 
 if __name__ == "__main__":

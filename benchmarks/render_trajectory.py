@@ -17,10 +17,14 @@ def main() -> None:
     arguments.add_argument("--mu", type=float, default=0.3)
     arguments.add_argument("--mesh", type=int, default=41, help="vertices a side")
     options = arguments.parse_args()
-    run = cloth_drag.scene(options.material, options.mu, preset="fast", mesh=options.mesh, seed=1).run()
+    run = cloth_drag.scene(
+        options.material, options.mu, preset="fast", mesh=options.mesh, seed=1
+    ).run()
     if not run.valid:
         raise SystemExit(f"not valid: {run.reason}")
-    np.savez(options.out, track=run.positions.astype(np.float32), rest=run.rest, triangles=run.triangles)
+    np.savez(
+        options.out, track=run.positions.astype(np.float32), rest=run.rest, triangles=run.triangles
+    )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 python benchmarks/rods.py [--repeats 5]
 
-Prints CPU seconds (all of the process: solving, sampling 150 points, page faults of the output) and, for the same
-settings, errors against a solve with 1,024 elements on every seventh rod.
+Prints CPU seconds (all of the process: solving, sampling 150 points, page faults of the output)
+and, for the same settings, errors against a solve with 1,024 elements on every seventh rod.
 """
 
 import argparse
@@ -51,13 +51,21 @@ def quantiles(errors: Floats) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="timed solves per setting; the median is printed")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="timed solves per setting; the median is printed"
+    )
     repeats = parser.parse_args().repeats
 
     build = build_info()
-    print(f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}")
-    print(f"rod kernel {build.rod_kernel}  numpy {np.__version__}  python {platform.python_version()}")
+    print(
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+    )
+    print(
+        f"rod kernel {build.rod_kernel}  numpy {np.__version__}  python {platform.python_version()}"
+    )
     print(f"cpu {cpu_model()}  {os.cpu_count()} cores  load {os.getloadavg()[0]:.1f}")
 
     rods = thesis_grid()
@@ -68,14 +76,24 @@ def main() -> None:
         times = [cpu_seconds(rods, elements)[0] for _ in range(repeats)]
         solution = cpu_seconds(rods, elements)[1]
         some = slice(None, None, SUBSAMPLE)
-        distance = np.linalg.norm(solution.centerline[some] - reference.centerline, axis=2).max(axis=1)
+        distance = np.linalg.norm(solution.centerline[some] - reference.centerline, axis=2).max(
+            axis=1
+        )
         scale = np.abs(reference.curvature).max(axis=(1, 2))
         curvature = np.abs(solution.curvature[some] - reference.curvature).max(axis=(1, 2)) / scale
-        turn = np.linalg.norm(solution.frame[some] - reference.frame, axis=(2, 3)).max(axis=1) / np.sqrt(2)
-        print(f"\n{name}: {elements} elements, {rods.shape[1]} rods x {solution.centerline.shape[1]} points")
-        print(f"  CPU s, median of {repeats}: {statistics.median(times):.3f}  (min {min(times):.3f})")
+        turn = np.linalg.norm(solution.frame[some] - reference.frame, axis=(2, 3)).max(
+            axis=1
+        ) / np.sqrt(2)
+        print(
+            f"\n{name}: {elements} elements, {rods.shape[1]} rods x {solution.centerline.shape[1]} points"
+        )
+        print(
+            f"  CPU s, median of {repeats}: {statistics.median(times):.3f}  (min {min(times):.3f})"
+        )
         print(f"  converged {solution.converged.mean():.2%}  stable {solution.stable.mean():.2%}")
-        print(f"  sweeps per rod: mean {solution.iterations.mean():.1f}  max {solution.iterations.max()}")
+        print(
+            f"  sweeps per rod: mean {solution.iterations.mean():.1f}  max {solution.iterations.max()}"
+        )
         print(f"  centreline error / L:      {quantiles(distance)}")
         print(f"  curvature error / max|k|:  {quantiles(curvature)}")
         print(f"  frame error, rad:          {quantiles(turn)}")

@@ -1,12 +1,13 @@
 """How many samples of each built-in scene are valid, and what they cost.
 
-    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--defaults] [--keep DIR]
-                                [--out FILE]
+    python benchmarks/scenes.py [SCENE ...] [--samples 16] [--seconds 4000] [--defaults] [--keep
+                                DIR] [--out FILE]
 
-Simulates each scene at the mesh and the preset of its file. All parameters vary together: numbers over their declared
-ranges as a Sobol sequence, fabrics over all that are built in. No more samples of a scene begin once it has cost
-`--seconds` of CPU. `--defaults` gives the first sample the default parameters. DIR gets the arrays of each sample.
-Writes a row for each scene as soon as it is done, and keeps the rows of other scenes that FILE has.
+Simulates each scene at the mesh and the preset of its file. All parameters vary together: numbers
+over their declared ranges as a Sobol sequence, fabrics over all that are built in. No more samples
+of a scene begin once it has cost `--seconds` of CPU. `--defaults` gives the first sample the
+default parameters. DIR gets the arrays of each sample. Writes a row for each scene as soon as it is
+done, and keeps the rows of other scenes that FILE has.
 """
 
 import argparse
@@ -45,7 +46,9 @@ def spec(name: str, samples: int, *, defaults: bool) -> Any:
             fabrics = [str(value) for value in given.values or Material]
             found: list[Any] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
         else:
-            sobol = SobolAxis[float](type="sobol", low=given.low or 0.0, high=given.high or 0.0, num=samples)
+            sobol = SobolAxis[float](
+                type="sobol", low=given.low or 0.0, high=given.high or 0.0, num=samples
+            )
             found = drawn_values(sobol, dimension=dimension).tolist()
         axes[parameter] = [default, *found[1:]] if defaults else found
     cameras = scene.looks.cameras
@@ -83,7 +86,9 @@ class Clock:
 
 
 def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> dict[str, Any]:
-    """Return what came of a sample: its code and reason if it is not valid, and CPU seconds by part."""
+    """Return what came of a sample: its code and reason if it is not valid, and CPU seconds by
+    part.
+    """
     begin, clock = time.process_time(), Clock()
     given = simulation.given(files.__getitem__)
     scene = cloth_scene.scene(given["scene"], seed=given["seed"])
@@ -108,10 +113,17 @@ def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> di
     }
     if keep is not None:
         np.savez(keep, allow_pickle=False, **outcome.record)
-    return {"code": outcome.code if outcome.reason else "", "reason": outcome.reason, "cpu": cpu, "layer": layer}
+    return {
+        "code": outcome.code if outcome.reason else "",
+        "reason": outcome.reason,
+        "cpu": cpu,
+        "layer": layer,
+    }
 
 
-def row(name: str, samples: int, seconds: float, *, defaults: bool, keep: Path | None) -> dict[str, Any]:
+def row(
+    name: str, samples: int, seconds: float, *, defaults: bool, keep: Path | None
+) -> dict[str, Any]:
     """Simulate samples of a scene, and return its row."""
     files, measured = dict(built_in_files()), commit()
     made = spec(name, samples, defaults=defaults)
@@ -122,13 +134,23 @@ def row(name: str, samples: int, seconds: float, *, defaults: bool, keep: Path |
             break
         values = {key: value for key, value in point.items() if key in stage.parameters}
         found.append(
-            simulated(made.simulation(point), files, keep and keep / f"{name}-{len(found)}.npz") | {"values": values}
+            simulated(made.simulation(point), files, keep and keep / f"{name}-{len(found)}.npz")
+            | {"values": values}
         )
-        print(name, len(found), f"{found[-1]['cpu']:.1f} s", values, found[-1]["reason"] or "valid", flush=True)
+        print(
+            name,
+            len(found),
+            f"{found[-1]['cpu']:.1f} s",
+            values,
+            found[-1]["reason"] or "valid",
+            flush=True,
+        )
     vertices = sum(sheet.mesh.shape[0] for sheet in stage.sheets.values())
     length = (stage.frames - 1) / stage.frame_rate
     cpu = [each["cpu"] for each in found]
-    share = {part: sum(each["layer"][part] for each in found) / sum(cpu) for part in found[0]["layer"]}
+    share = {
+        part: sum(each["layer"][part] for each in found) / sum(cpu) for part in found[0]["layer"]
+    }
     return {
         "scene": name,
         "preset": stage.preset.value,
@@ -136,26 +158,38 @@ def row(name: str, samples: int, seconds: float, *, defaults: bool, keep: Path |
         "scene seconds": round(length, 2),
         "samples": len(found),
         "valid": sum(not each["reason"] for each in found),
-        "not valid": [{key: each[key] for key in ("code", "reason", "values")} for each in found if each["reason"]],
-        "CPU s a sample, least, median, most": [round(value, 1) for value in (min(cpu), median(cpu), max(cpu))],
+        "not valid": [
+            {key: each[key] for key in ("code", "reason", "values")}
+            for each in found
+            if each["reason"]
+        ],
+        "CPU s a sample, least, median, most": [
+            round(value, 1) for value in (min(cpu), median(cpu), max(cpu))
+        ],
         "CPU ms a vertex and scene second, least, median, most": [
             round(1e3 * value / vertices / length, 2) for value in (min(cpu), median(cpu), max(cpu))
         ],
-        "share of CPU outside the solver's steps, %": {part: round(100 * value, 2) for part, value in share.items()},
+        "share of CPU outside the solver's steps, %": {
+            part: round(100 * value, 2) for part, value in share.items()
+        },
         "commit": measured,
     }
 
 
 def commit() -> str:
     """Return the commit that is measured."""
-    found = subprocess.run(["git", "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        ["git", "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True
+    )
     return found.stdout.strip()
 
 
 def main() -> None:
     """Run the scenes one after another."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("scenes", nargs="*", choices=[[], *scene_names()], metavar="SCENE", default=[])
+    parser.add_argument(
+        "scenes", nargs="*", choices=[[], *scene_names()], metavar="SCENE", default=[]
+    )
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=4000.0)
     parser.add_argument("--defaults", action="store_true")
@@ -165,7 +199,9 @@ def main() -> None:
     for name in args.scenes or scene_names():
         made = row(name, args.samples, args.seconds, defaults=args.defaults, keep=args.keep)
         old = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
-        rows = sorted([*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"])
+        rows = sorted(
+            [*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"]
+        )
         said = {
             "what": "Validity and CPU time of the built-in scenes, all parameters over their declared ranges",
             "command": COMMAND,

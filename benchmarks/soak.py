@@ -1,12 +1,15 @@
-"""A day in the life, in minutes: everything at once, and kills all the time; then an audit of the books.
+"""A day in the life, in minutes: everything at once, and kills all the time.
+
+Then an audit of the books.
 
     python benchmarks/soak.py [--minutes 30] [--every 20] [--seed 0] [--postgresql]
 
-Users submit, cancel, pause, resume, pull and scrub; bits flip in the store; disks are full; every `--every` seconds
-something is killed, frozen, or started with a clock that is up to an hour off. With `--postgresql` there are two
-coordinators on a PostgreSQL database and a bucket that fails at times, where no bits flip and no disk is full. Workers
-pretend (`stickslip_testing.worker`); tests/test_chaos.py kills real ones. Coordinators live on in the last two fifths,
-so that their memory and file handles can be compared.
+Users submit, cancel, pause, resume, pull and scrub; bits flip in the store; disks are full; every
+`--every` seconds something is killed, frozen, or started with a clock that is up to an hour off.
+With `--postgresql` there are two coordinators on a PostgreSQL database and a bucket that fails at
+times, where no bits flip and no disk is full. Workers pretend (`stickslip_testing.worker`);
+tests/test_chaos.py kills real ones. Coordinators live on in the last two fifths, so that their
+memory and file handles can be compared.
 """
 
 import argparse
@@ -83,7 +86,14 @@ class Soak:
         self.clients = [Client(url, patience=PATIENCE) for url in self.urls]
         for number, url in enumerate(self.urls):
             data = settings.data if number == 0 else place / f"data-{number}"
-            words = ["--data", str(data), "--port", url.rpartition(":")[2], "--store", settings.store_place]
+            words = [
+                "--data",
+                str(data),
+                "--port",
+                url.rpartition(":")[2],
+                "--store",
+                settings.store_place,
+            ]
             log = place / f"coordinator-{number}.log"
             self.coordinators.append(Node(f"coordinator {number}", COORDINATOR, words, log))
         for number, url in enumerate(self.urls * (3 - coordinators)):
@@ -91,7 +101,9 @@ class Soak:
             data = settings.data if number == 0 or coordinators == 1 else place / f"data-{number}"
             key = (data / "worker-key").read_text().strip()
             words = [f"worker-{number}", key, settings.store_place, url]
-            self.workers.append(Node(f"worker {number}", WORKER, words, place / f"worker-{number}.log"))
+            self.workers.append(
+                Node(f"worker {number}", WORKER, words, place / f"worker-{number}.log")
+            )
 
     @property
     def client(self) -> Client:
@@ -151,7 +163,11 @@ class Soak:
 
     def rot(self) -> None:
         where = random.choice(("artifacts/*/*", "datasets/*/*/**/*"))
-        files = [path for path in Path(self.settings.store_place).glob(where) if path.is_file() and path.stat().st_size]
+        files = [
+            path
+            for path in Path(self.settings.store_place).glob(where)
+            if path.is_file() and path.stat().st_size
+        ]
         if files:
             path = random.choice(files)
             data = bytearray(path.read_bytes())
@@ -160,7 +176,9 @@ class Soak:
             self.is_rotten = True
 
     def strike(self, *, spares_coordinators: bool) -> None:
-        victim = random.choice(self.workers if spares_coordinators else [*self.coordinators, *self.workers])
+        victim = random.choice(
+            self.workers if spares_coordinators else [*self.coordinators, *self.workers]
+        )
         how = random.choice(["kill", "kill", "freeze", "full disk"])
         if how == "full disk" and (victim in self.workers or len(self.coordinators) > 1):
             how = "kill"
@@ -214,7 +232,9 @@ class Soak:
         """Let all jobs end, and all rot be found and mended."""
         end = time.monotonic() + PATIENCE
         while self.open:
-            assert time.monotonic() < end, f"jobs do not end: {[self.client.job(job) for job in self.open]}"
+            assert time.monotonic() < end, (
+                f"jobs do not end: {[self.client.job(job) for job in self.open]}"
+            )
             for job in self.open:
                 with suppress(ProblemError):
                     self.client.resume(job)
@@ -222,11 +242,20 @@ class Soak:
             time.sleep(0.5)
         while not self.scrub():
             assert time.monotonic() < end, "rot is not mended"
-            wait_until(lambda: not any(job.state.is_open for job in self.client.jobs()), seconds=PATIENCE)
+            wait_until(
+                lambda: not any(job.state.is_open for job in self.client.jobs()), seconds=PATIENCE
+            )
 
     def audit(self) -> Iterator[str]:
         """Yield what is wrong; call it when all processes have been killed."""
-        place = ["--data", str(self.settings.data), "--store", self.settings.store_place, "--older-than", "0"]
+        place = [
+            "--data",
+            str(self.settings.data),
+            "--store",
+            self.settings.store_place,
+            "--older-than",
+            "0",
+        ]
         gc = [sys.executable, "-m", "stickslip_services.cli", "gc", *place]
         collected = subprocess.run([*gc, "--delete"], capture_output=True, text=True, check=False)
         if collected.returncode != 0:
@@ -239,16 +268,25 @@ class Soak:
         database, store = connect(self.settings), open_store(self.settings.store_place)
         with database.read() as connection:
             yield from violations(connection)
-            versions = connection.execute(dataset_versions.select().where(dataset_versions.c.manifest.is_not(None)))
+            versions = connection.execute(
+                dataset_versions.select().where(dataset_versions.c.manifest.is_not(None))
+            )
             rows = versions.all()
         database.close()
-        expected = {tuple(sample.key for sample in samples(parsed(spec), BUILDS)) for spec in self.specs.values()}
+        expected = {
+            tuple(sample.key for sample in samples(parsed(spec), BUILDS))
+            for spec in self.specs.values()
+        }
         for row in rows:
             manifest = Manifest.model_validate_json(store.read(row.manifest))
             contents = Contents(manifest, lambda file: store.read(file.sha256))
             keys = tuple(contents.sample_keys())
             self.counts["samples in datasets"] += len(keys)
-            if keys not in expected or len(set(keys)) != len(keys) or manifest.valid_count != len(keys):
+            if (
+                keys not in expected
+                or len(set(keys)) != len(keys)
+                or manifest.valid_count != len(keys)
+            ):
                 yield f"{row.dataset} has other samples than were ordered"
             if damaged := damaged_files(store, row.manifest, row.group_digest):
                 yield f"{row.dataset}:v{row.version} is damaged: {damaged}"
@@ -263,7 +301,9 @@ class Soak:
             if not early or early[-1].at > late[0].at:
                 yield f"{node.name}: its last life is too short to tell whether its memory grows; run for longer"
                 continue
-            before, after = (statistics.median(use.memory for use in some) for some in (early, late))
+            before, after = (
+                statistics.median(use.memory for use in some) for some in (early, late)
+            )
             handles = [statistics.median(use.handles for use in some) for some in (early, late)]
             print(
                 f"{node.name}: memory {before:.1f} MiB, and {after:.1f} ({after / before - 1:+.1%}) "
@@ -277,12 +317,16 @@ class Soak:
 
 @contextmanager
 def database_and_bucket() -> Iterator[str]:
-    """Run a PostgreSQL server and a bucket, which processes find by their environment; yield the store."""
+    """Run a PostgreSQL server and a bucket, which processes find by their environment; yield the
+    store.
+    """
     from stickslip_testing.postgresql import find_programs, postgresql_server
     from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 
     programs = find_programs()
-    assert programs is not None, "the PostgreSQL server is not installed: apt-get install postgresql"
+    assert programs is not None, (
+        "the PostgreSQL server is not installed: apt-get install postgresql"
+    )
     with postgresql_server(programs) as server, s3_proxy() as proxy:
         os.environ |= variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}
         make_bucket(proxy, "soak")

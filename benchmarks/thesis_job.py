@@ -1,10 +1,12 @@
-"""The thesis's 10,000 rods through the service: how long, how many accepted, and where samples were lost.
+"""The thesis's 10,000 rods through the service: how long, how many accepted, and where samples were
+lost.
 
 python benchmarks/thesis_job.py [--rendered 300] [--port 9310] [--pages DIR]
 
-Starts `stickslip up` in a directory of its own and submits two jobs: the whole grid without renders, then a seeded
-random choice from its ranges with four views each, of draft quality. Prints seconds from submission to the dataset,
-acceptance rates, and what the labels say. --pages keeps the page of each dataset.
+Starts `stickslip up` in a directory of its own and submits two jobs: the whole grid without
+renders, then a seeded random choice from its ranges with four views each, of draft quality. Prints
+seconds from submission to the dataset, acceptance rates, and what the labels say. --pages keeps the
+page of each dataset.
 """
 
 import argparse
@@ -31,14 +33,25 @@ STICKSLIP = Path(sys.executable).with_name("stickslip")
 
 def whole_grid() -> dict[str, Any]:
     """Return the spec of all 10,000 rods, nothing rendered."""
-    return {**yaml.safe_load(SPEC.read_text()), "name": "thesis-all", "views": None, "samples_per_shard": 2000}
+    return {
+        **yaml.safe_load(SPEC.read_text()),
+        "name": "thesis-all",
+        "views": None,
+        "samples_per_shard": 2000,
+    }
 
 
 def some_rendered(count: int) -> dict[str, Any]:
     """Return the spec of `count` rods drawn at random from the ranges of the grid, rendered."""
     spec = yaml.safe_load(SPEC.read_text())
     axes = {
-        name: {"type": "random", "low": axis["start"], "high": axis["stop"], "num": count, "seed": seed}
+        name: {
+            "type": "random",
+            "low": axis["start"],
+            "high": axis["stop"],
+            "num": count,
+            "seed": seed,
+        }
         for seed, (name, axis) in enumerate(spec["axes"].items())
     }
     return {**spec, "name": f"thesis-{count}", "axes": axes, "combine": "zip", "quality": "draft"}
@@ -66,7 +79,9 @@ def service(data: Path, port: int) -> Iterator[httpx.Client]:
 
 def _workers(client: httpx.Client) -> bool:
     try:
-        return any(worker["condition"]["state"] == "ready" for worker in client.get("/v1/workers").json())
+        return any(
+            worker["condition"]["state"] == "ready" for worker in client.get("/v1/workers").json()
+        )
     except httpx.TransportError:
         return False
 
@@ -91,7 +106,9 @@ def describe(client: httpx.Client, where: str) -> str:
     size = client.get(where).json()["bytes"]
     with DatasetReader(f"{client.base_url}".rstrip("/") + where) as reader:
         slots = np.concatenate([reader.slots(split) for split in ("train", "validation", "test")])
-        multistable, contact, reach = (reader.read(n, slots) for n in ("multistable", "self_contact_distance", "reach"))
+        multistable, contact, reach = (
+            reader.read(n, slots) for n in ("multistable", "self_contact_distance", "reach")
+        )
     near = contact[np.isfinite(contact)]
     return (
         f"  accepted {manifest.valid_count} of {manifest.sample_count} ({manifest.acceptance_rate:.2%})"
@@ -112,11 +129,15 @@ def main() -> None:
         for spec in jobs:
             load = os.getloadavg()[0]
             seconds, where = run_job(client, spec)
-            print(f"{spec['name']}: {seconds:.1f} s from submission to dataset (load average before: {load:.1f})")
+            print(
+                f"{spec['name']}: {seconds:.1f} s from submission to dataset (load average before: {load:.1f})"
+            )
             print(describe(client, where))
             if options.pages:
                 options.pages.mkdir(parents=True, exist_ok=True)
-                (options.pages / f"{spec['name']}.html").write_text(client.get(f"{where}/page").text)
+                (options.pages / f"{spec['name']}.html").write_text(
+                    client.get(f"{where}/page").text
+                )
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
     python benchmarks/validate.py
 
-Prints one JSON object: medians of 5 [s], and the peak resident memory of the coordinator [MB]. Targets: 0.5 s, 200 MB.
+Prints one JSON object: medians of 5 [s], and the peak resident memory of the coordinator [MB].
+Targets: 0.5 s, 200 MB.
 """
 
 import json
@@ -20,7 +21,11 @@ def main() -> None:
     product = spec(1_000_000, start=0.0)
     product["axes"]["gamma"]["num"] = 10_000
     axis = {"type": "linspace", "start": 0.0, "stop": 10.0, "num": 1_000_000}
-    zipped = {"kind": "rod_hang", "combine": "zip", "axes": dict.fromkeys(("gamma", "phi0", "phi1"), axis)}
+    zipped = {
+        "kind": "rod_hang",
+        "combine": "zip",
+        "axes": dict.fromkeys(("gamma", "phi0", "phi1"), axis),
+    }
     result: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as data, coordinator(Path(data)) as (client, pid):
         for name, document in (("product", product), ("zip", zipped)):

@@ -4,8 +4,9 @@ Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajector
 
     .venv-blender/bin/python benchmarks/window_border.py /tmp/cloth.npz [--quality standard]
 
-The light itself changes there: what is compared is the difference to a direct rendering of 32 paths, denoised. Its mean
-over 4 px inside the border, 6 to 10 px away from the cloth, minus that over 4 px outside it, is the step of a side.
+The light itself changes there: what is compared is the difference to a direct rendering of 32
+paths, denoised. Its mean over 4 px inside the border, 6 to 10 px away from the cloth, minus that
+over 4 px outside it, is the step of a side.
 """
 
 import argparse
@@ -83,7 +84,10 @@ def main() -> None:
             if inside
         }
         text = ", ".join(f"{name} {step:+.2f}" for name, step in steps.items())
-        print(f"{viewpoint}, {substrate}: largest {max(map(abs, steps.values())):.2f} levels; {text}", flush=True)
+        print(
+            f"{viewpoint}, {substrate}: largest {max(map(abs, steps.values())):.2f} levels; {text}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

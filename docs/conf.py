@@ -49,11 +49,15 @@ def _command_reference() -> str:
     runs = click.testing.CliRunner(), typer.testing.CliRunner()
     sections = [
         *_commands(
-            ours, lambda words: runs[0].invoke(ours, words, env=wide, prog_name="stickslip").stdout, ["stickslip"]
+            ours,
+            lambda words: runs[0].invoke(ours, words, env=wide, prog_name="stickslip").stdout,
+            ["stickslip"],
         ),
         *_commands(
             typer.main.get_command(training),
-            lambda words: runs[1].invoke(training, words, env=wide, prog_name="stickslip-train").stdout,
+            lambda words: (
+                runs[1].invoke(training, words, env=wide, prog_name="stickslip-train").stdout
+            ),
             ["stickslip-train"],
         ),
     ]
@@ -64,7 +68,9 @@ def _python_reference() -> str:
     sections = []
     for name in MODULES:
         gathers = "   :imported-members:\n" if hasattr(import_module(name), "__all__") else ""
-        sections.append(f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{gathers}```\n")
+        sections.append(
+            f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{gathers}```\n"
+        )
     return "\n".join(sections)
 
 
@@ -81,7 +87,11 @@ def _docstring(_: Any, what: str, *event: Any) -> None:
     """Read the sections of a docstring, in which |x| and x* are mathematics and no markup."""
     lines = event[-1]
     lines[:] = [line.replace("|", r"\|").replace("*", r"\*") for line in lines]
-    if what not in ("attribute", "data", "property"):  # of these, Napoleon takes the words before a colon for a type
+    if what not in (
+        "attribute",
+        "data",
+        "property",
+    ):  # of these, Napoleon takes the words before a colon for a type
         lines[:] = GoogleDocstring(lines, Config(), what=what).lines()
 
 

@@ -1,6 +1,7 @@
 """The main job, from POST /v1/jobs to a training batch, with a service of its own: `make demo`.
 
-Everything is left in demo-out/: the dataset, a contact sheet, the trained network, and the service's data.
+Everything is left in demo-out/: the dataset, a contact sheet, the trained network, and the
+service's data.
 """
 
 import shutil
@@ -48,11 +49,21 @@ def main() -> None:
         console.rule("2,500 more rods, without pictures, to learn from")
         more_rods = submit(MORE_RODS, url)
         run("stickslip", "pull", more_rods, OUT / "training-dataset", "--url", url)
-    run("stickslip-train", "curvature", OUT / "training-dataset", "--out", OUT / "training", "--steps", "800")
+    run(
+        "stickslip-train",
+        "curvature",
+        OUT / "training-dataset",
+        "--out",
+        OUT / "training",
+        "--steps",
+        "800",
+    )
     console.rule(f"done in {time.monotonic() - started:.0f} s")
     console.print(f"contact sheets {OUT / 'contact-sheet.png'}, {OUT / 'cloth-sheet.png'}")
     console.print(f"training       {OUT / 'training' / 'report.json'}")
-    console.print(f"datasets       {OUT / 'dataset'}, {OUT / 'cloth-dataset'}, {OUT / 'training-dataset'}")
+    console.print(
+        f"datasets       {OUT / 'dataset'}, {OUT / 'cloth-dataset'}, {OUT / 'training-dataset'}"
+    )
 
 
 def submit(spec: Path, url: str) -> str:
@@ -84,7 +95,9 @@ def wait_for_url(file: Path, process: subprocess.Popen[bytes]) -> str:
         if file.exists() and (url := file.read_text().strip()):
             return url
         time.sleep(0.1)
-    raise SystemExit(f"the service did not start within {START_SECONDS} s; its logs are in {file.parent / 'logs'}")
+    raise SystemExit(
+        f"the service did not start within {START_SECONDS} s; its logs are in {file.parent / 'logs'}"
+    )
 
 
 def run(command: str, *arguments: str | Path) -> None:
@@ -100,14 +113,21 @@ def look_at(directory: Path) -> None:
     rows = []
     for batch in rods.loader(16):
         rows += [np.concatenate(list(views), axis=1) for views in batch["views"].numpy()]
-    console.print(f"{len(rods)} rods in batches of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }")
+    console.print(
+        f"{len(rods)} rods in batches of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"
+    )
     rows += [np.zeros_like(rows[0])] * (-len(rows) % SHEET_COLUMNS)
-    lines = [np.concatenate(rows[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(rows), SHEET_COLUMNS)]
+    lines = [
+        np.concatenate(rows[i : i + SHEET_COLUMNS], axis=1)
+        for i in range(0, len(rows), SHEET_COLUMNS)
+    ]
     save_half_size(np.concatenate(lines), OUT / "contact-sheet.png")
 
 
 def look_at_cloth(directory: Path) -> None:
-    """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a row."""
+    """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a
+    row.
+    """
     console.rule("clips")
     clips = Samples(directory, arrays=["video", "positions"])
     (batch,) = clips.loader(len(clips))

@@ -2,9 +2,10 @@
 
     .venv/bin/python examples/thesis_cloth_clips.py [--out DIR] [--certificate DIR] [--small]
 
-4 fabrics x 8 friction coefficients x 8 textures x 3 viewpoints x 30 frames, on a mesh of 41 x 41. Give the `--out` of
-`examples/thesis_cloth_simulations.py`, and its simulations and its certificate are used. `--small` makes 24 clips of 6
-frames on a coarse mesh instead, without a certificate. You can stop the script and start it again.
+4 fabrics x 8 friction coefficients x 8 textures x 3 viewpoints x 30 frames, on a mesh of 41 x 41.
+Give the `--out` of `examples/thesis_cloth_simulations.py`, and its simulations and its certificate
+are used. `--small` makes 24 clips of 6 frames on a coarse mesh instead, without a certificate. You
+can stop the script and start it again.
 """
 
 import argparse
@@ -31,12 +32,22 @@ def main() -> None:
     """Submit, wait, pull, report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("thesis-cloth-out"))
-    parser.add_argument("--certificate", type=Path, help="what `stickslip certify --preset certified` wrote")
-    parser.add_argument("--small", action="store_true", help="24 clips of 6 frames, mesh 13, not certified")
+    parser.add_argument(
+        "--certificate", type=Path, help="what `stickslip certify --preset certified` wrote"
+    )
+    parser.add_argument(
+        "--small", action="store_true", help="24 clips of 6 frames, mesh 13, not certified"
+    )
     args = parser.parse_args()
     spec = yaml.safe_load(SPEC.read_text())
     if args.small:
-        spec |= {"name": "small-cloth-clips", "preset": "fast", "mesh": 13, "frames": 6, "allow_uncertified": True}
+        spec |= {
+            "name": "small-cloth-clips",
+            "preset": "fast",
+            "mesh": 13,
+            "frames": 6,
+            "allow_uncertified": True,
+        }
         spec["axes"] |= {"material": ["gray-interlock"], "mu": [0.5]}
     args.out.mkdir(exist_ok=True)
     begun = datetime.now(UTC)
@@ -60,14 +71,18 @@ def main() -> None:
 
 
 def wait_for_worker(url: str, since: datetime) -> None:
-    """Wait until a worker has registered since then: a job is planned for the builds of the newest one."""
+    """Wait until a worker has registered since then: a job is planned for the builds of the newest
+    one.
+    """
     with Client(url) as client:
         while not any(worker.registered_at >= since for worker in client.workers()):
             time.sleep(1.0)
 
 
 def report(dataset: Path, database: Path, job: str, wall: float) -> None:
-    """Print the wall time of the job, and the CPU seconds of its tasks: those made now, and those from before."""
+    """Print the wall time of the job, and the CPU seconds of its tasks: those made now, and those
+    from before.
+    """
     spent: dict[tuple[str, bool], list[float]] = defaultdict(list)
     with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
         rows = connection.execute(
@@ -82,16 +97,24 @@ def report(dataset: Path, database: Path, job: str, wall: float) -> None:
     length = manifest.spec.frames
     frames = manifest.valid_count * length
     console.rule("cost")
-    console.print(f"{manifest.valid_count} of {manifest.sample_count} clips, {frames} frames in {wall:.0f} s")
+    console.print(
+        f"{manifest.valid_count} of {manifest.sample_count} clips, {frames} frames in {wall:.0f} s"
+    )
     for (stage, cached), seconds in sorted(spent.items()):
         when = "before" if cached else "now"
-        console.print(f"  {stage:9} {len(seconds):5} tasks, {sum(seconds) / 3600:.3f} CPU h, made {when}")
+        console.print(
+            f"  {stage:9} {len(seconds):5} tasks, {sum(seconds) / 3600:.3f} CPU h, made {when}"
+        )
     rendering = spent["render", False]
     if rendering:
-        console.print(f"  {sum(rendering) / (len(rendering) * length):.4f} CPU s per frame and texture")
+        console.print(
+            f"  {sum(rendering) / (len(rendering) * length):.4f} CPU s per frame and texture"
+        )
     files = {file.path: file.size for file in manifest.files}
     video = sum(size for path, size in files.items() if path.startswith("video/"))
-    console.print(f"  video {video / 1e6:.0f} MB, {frames * 224 * 224 * 3 / max(video, 1):.2f} times smaller than raw")
+    console.print(
+        f"  video {video / 1e6:.0f} MB, {frames * 224 * 224 * 3 / max(video, 1):.2f} times smaller than raw"
+    )
     _print_labels(dataset)
 
 
@@ -101,7 +124,10 @@ def _print_labels(dataset: Path) -> None:
 
     group: Any = zarr.open_group(dataset, mode="r")
     valid = np.asarray(group["valid"])
-    least = {f"{name}, least": float(np.nanmin(np.asarray(group[name])[valid])) for name in ("psnr_cloth", "psnr_edge")}
+    least = {
+        f"{name}, least": float(np.nanmin(np.asarray(group[name])[valid]))
+        for name in ("psnr_cloth", "psnr_edge")
+    }
     found = least | {"frame_share": float(np.asarray(group["frame_share"])[valid].mean())}
     console.print(f"  {json.dumps(found)}")
 

@@ -1,10 +1,12 @@
-"""Make the thesis's 160 cloth simulations through the service, with the certificate, and report what they cost.
+"""Make the thesis's 160 cloth simulations through the service, with the certificate, and report
+what they cost.
 
     .venv/bin/python examples/thesis_cloth_simulations.py [--out DIR] [--certificate DIR]
 
-Certifies the preset first; give `--certificate` to use a certificate that `stickslip certify` has already written. You
-can stop the script and start it again: it goes on where it was. Pictures are kept to a few of low quality: the
-trajectories stay in the store, and a later job with other textures and views uses them.
+Certifies the preset first; give `--certificate` to use a certificate that `stickslip certify` has
+already written. You can stop the script and start it again: it goes on where it was. Pictures are
+kept to a few of low quality: the trajectories stay in the store, and a later job with other
+textures and views uses them.
 """
 
 import argparse
@@ -24,12 +26,23 @@ def main() -> None:
     """Certify, simulate, pull, report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("thesis-cloth-out"))
-    parser.add_argument("--certificate", type=Path, help="what `stickslip certify --preset certified` wrote")
+    parser.add_argument(
+        "--certificate", type=Path, help="what `stickslip certify --preset certified` wrote"
+    )
     args = parser.parse_args()
     args.out.mkdir(exist_ok=True)
     with service(args.out / "service") as url:
         if args.certificate is None:
-            run("stickslip", "certify", "--preset", "certified", "--out", args.out / "certificate", "--url", url)
+            run(
+                "stickslip",
+                "certify",
+                "--preset",
+                "certified",
+                "--out",
+                args.out / "certificate",
+                "--url",
+                url,
+            )
         else:
             run("stickslip", "register", args.certificate, "--url", url)
         dataset = submit(SPEC, url)
@@ -49,12 +62,18 @@ def report(out: Path) -> None:
     names = [f"{document['material']}, mu {document['mu']:g}" for document, _ in found]
     labels = zarr.open_group(out / "dataset", mode="r")
     valid = np.asarray(labels["valid"])
-    steps, unconverged = (np.asarray(labels[name])[valid] for name in ("steps", "unconverged_steps"))
+    steps, unconverged = (
+        np.asarray(labels[name])[valid] for name in ("steps", "unconverged_steps")
+    )
     shares = unconverged / steps
     console.rule("cost")
-    console.print(f"{len(costs)} simulations, {costs.sum() / 3600:.2f} CPU h; median {np.median(costs):.1f} CPU s")
+    console.print(
+        f"{len(costs)} simulations, {costs.sum() / 3600:.2f} CPU h; median {np.median(costs):.1f} CPU s"
+    )
     for i in np.argsort(costs)[::-1][:5]:
-        console.print(f"  {costs[i]:6.1f} CPU s, {costs[i] / np.median(costs):.1f} x the median: {names[i]}")
+        console.print(
+            f"  {costs[i]:6.1f} CPU s, {costs[i] / np.median(costs):.1f} x the median: {names[i]}"
+        )
     console.print(
         f"steps that did not converge: {unconverged.sum()} of {steps.sum()}; at most {100 * shares.max():.3f} % of one "
         f"simulation; in {np.count_nonzero(unconverged)} of {len(steps)} valid samples; "

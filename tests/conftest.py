@@ -27,13 +27,17 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture
 def hub() -> Iterator[int]:
-    """The namespace of the machine with the coordinator, which is the switch, too; the test runs there."""
+    """The namespace of the machine with the coordinator, which is the switch, too; the test runs
+    there.
+    """
     if os.geteuid() != 0:
         pytest.skip("network namespaces need root")
     for program in ("ip", "unshare", "nsenter"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed: apt-get install iproute2 util-linux")
-    probe = subprocess.run(["unshare", "--net", "--pid", "--fork", "--mount-proc", "true"], capture_output=True)
+    probe = subprocess.run(
+        ["unshare", "--net", "--pid", "--fork", "--mount-proc", "true"], capture_output=True
+    )
     if probe.returncode != 0:
         pytest.skip(f"this machine lets nobody make namespaces: {probe.stderr.decode().strip()}")
     with namespace() as pid:
@@ -47,9 +51,13 @@ def hub() -> Iterator[int]:
 @pytest.fixture
 def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
     """The coordinator with its database and its bucket."""
-    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    pytest.importorskip(
+        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+    )
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'")
+    pytest.importorskip(
+        "psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'"
+    )
     from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()
@@ -67,15 +75,31 @@ def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
         server = stack.enter_context(postgresql_server(programs))
         for name, value in (variables | {"STICKSLIP_DATABASE": server.empty()}).items():
             monkeypatch.setenv(name, value)
-        stack.enter_context(running(tmp_path, "bucket", ["-m", "moto.server", "-H", HUB, "-p", "9000"], 9000))
+        stack.enter_context(
+            running(tmp_path, "bucket", ["-m", "moto.server", "-H", HUB, "-p", "9000"], 9000)
+        )
         httpx.put(f"http://{HUB}:9000/lab", trust_env=False).raise_for_status()
         words = ["-m", "stickslip_services.app", "--data", str(tmp_path), "--store", BUCKET]
         words += ["--host", HUB, "--behind-proxy"]
         stack.enter_context(running(tmp_path, "coordinator", words, 8765))
-        create = [str(STICKSLIP), "keys", "create", "test", "--scope", "admin", "--data", str(tmp_path)]
+        create = [
+            str(STICKSLIP),
+            "keys",
+            "create",
+            "test",
+            "--scope",
+            "admin",
+            "--data",
+            str(tmp_path),
+        ]
         key = subprocess.run(create, capture_output=True, text=True, check=True).stdout.strip()
         client = stack.enter_context(
-            httpx.Client(base_url=URL, headers={"Authorization": f"Bearer {key}"}, trust_env=False, timeout=60)
+            httpx.Client(
+                base_url=URL,
+                headers={"Authorization": f"Bearer {key}"},
+                trust_env=False,
+                timeout=60,
+            )
         )
         database = connect(Settings.chosen(data=tmp_path, store=BUCKET), Role.visitor)
         stack.callback(database.close)

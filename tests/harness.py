@@ -1,4 +1,6 @@
-"""A real service for tests across components: coordinator, dispatcher, Ray and Blender under one directory."""
+"""A real service for tests across components: coordinator, dispatcher, Ray and Blender under one
+directory.
+"""
 
 import os
 import signal
@@ -22,12 +24,16 @@ STICKSLIP = Path(sys.executable).with_name("stickslip")
 
 
 PATIENCE = 5.0
-"""How many times as long as on a quiet machine something may take beside other tests, whose load nobody knows. The
-times themselves are printed; `benchmarks/results/faults.json` has those of quiet machines."""
+"""How many times as long as on a quiet machine something may take beside other tests, whose load
+nobody knows. The times themselves are printed; `benchmarks/results/faults.json` has those of quiet
+machines."""
 
 
 def wait_for(what: str, probe: Callable[[], T | None], timeout: float) -> T:
-    """Poll `probe` until it returns something; fail naming `what` after PATIENCE times `timeout` seconds."""
+    """Poll `probe` until it returns something.
+
+    Fail naming `what` after PATIENCE times `timeout` seconds.
+    """
     timeout *= PATIENCE
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
@@ -46,7 +52,9 @@ def pids() -> list[int]:
 def command_line(pid: int) -> str:
     """Return a process's command line; empty where there is no such process."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return (
+            Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        )
     except OSError:
         return ""
 
@@ -124,17 +132,23 @@ class Service:
         supervisor = self.process.pid
 
         def probe() -> int | None:
-            return next((pid for pid in descendants(supervisor) if f"-m {module}" in command_line(pid)), None)
+            return next(
+                (pid for pid in descendants(supervisor) if f"-m {module}" in command_line(pid)),
+                None,
+            )
 
         return wait_for(f"a process of {module}", probe, 60)
 
     def all_processes(self) -> list[int]:
-        """Return all processes that hold a file below the data directory open, or name it: ours, alive or orphaned."""
+        """Return all processes that hold a file below the data directory open, or name it: ours,
+        alive or orphaned.
+        """
         places = (str(self.data), str(own_directory(self.data)))
         return [
             pid
             for pid in pids()
-            if pid != os.getpid() and any(place in command_line(pid) + log_of(pid) for place in places)
+            if pid != os.getpid()
+            and any(place in command_line(pid) + log_of(pid) for place in places)
         ]
 
     def wait_for_end(self) -> None:
@@ -167,6 +181,8 @@ class Service:
 
 
 def read_arrays(place: Path | str | ZarrStore) -> dict[str, npt.NDArray[Any]]:
-    """Return all arrays of a dataset, on disk, at a URL or in a store of Zarr, as zarr-python reads them."""
+    """Return all arrays of a dataset, on disk, at a URL or in a store of Zarr, as zarr-python reads
+    them.
+    """
     group = zarr.open_group(place, mode="r")
     return {name: np.asarray(array[:]) for name, array in group.arrays()}

@@ -1,8 +1,9 @@
 """Machines on a network of their own, for tests that kill them or pull their cables.
 
-Each is a network namespace with a cable to a bridge, and what runs on it has pids and a host name of its own. The one
-with the bridge is the hub: it has the coordinator, PostgreSQL and a bucket, and the test runs there. Nothing of the
-network outside of the namespaces is touched. It needs root, `ip` and `unshare`; see the fixtures `hub` and `lab`.
+Each is a network namespace with a cable to a bridge, and what runs on it has pids and a host name
+of its own. The one with the bridge is the hub: it has the coordinator, PostgreSQL and a bucket, and
+the test runs there. Nothing of the network outside of the namespaces is touched. It needs root,
+`ip` and `unshare`; see the fixtures `hub` and `lab`.
 """
 
 import ctypes
@@ -45,10 +46,14 @@ def ip(*words: str, within: int | None = None) -> None:
 @contextmanager
 def namespace() -> Iterator[int]:
     """Hold a network namespace; yield the pid of a process in it."""
-    with subprocess.Popen(["unshare", "--net", "sleep", "infinity"], preexec_fn=dies_with_us) as holder:
+    with subprocess.Popen(
+        ["unshare", "--net", "sleep", "infinity"], preexec_fn=dies_with_us
+    ) as holder:
         try:
             name = Path(f"/proc/{holder.pid}/comm")
-            wait_for("a namespace", lambda: True if name.read_text().strip() == "sleep" else None, 10)
+            wait_for(
+                "a namespace", lambda: True if name.read_text().strip() == "sleep" else None, 10
+            )
             ip("link", "set", "lo", "up", within=holder.pid)
             yield holder.pid
         finally:
@@ -84,7 +89,10 @@ class Machine:
         self._holder = stack.enter_context(namespace())
         self._process: subprocess.Popen[bytes] | None = None
         self._cable = f"cable-{name}"
-        ends = [["name", self._cable, "netns", str(hub)], ["name", "eth0", "netns", str(self._holder)]]
+        ends = [
+            ["name", self._cable, "netns", str(hub)],
+            ["name", "eth0", "netns", str(self._holder)],
+        ]
         ip("link", "add", *ends[0], "type", "veth", "peer", *ends[1])
         ip("link", "set", self._cable, "master", "br0", "up", within=hub)
         ip("address", "add", f"{self.address}/24", "dev", "eth0", within=self._holder)
@@ -105,7 +113,10 @@ class Machine:
         named = ["sh", "-c", script, self.name]
         with log.open("ab") as file:
             self._process = subprocess.Popen(
-                [*inside, *alone, *named, *command], stdout=file, stderr=file, preexec_fn=dies_with_us
+                [*inside, *alone, *named, *command],
+                stdout=file,
+                stderr=file,
+                preexec_fn=dies_with_us,
             )
 
     def kill(self) -> None:
@@ -119,12 +130,17 @@ class Machine:
         """Yield the pid and the command line of each process."""
         for pid in pids():
             with suppress(OSError):
-                if pid != self._holder and Path(f"/proc/{pid}/ns/net").samefile(f"/proc/{self._holder}/ns/net"):
+                if pid != self._holder and Path(f"/proc/{pid}/ns/net").samefile(
+                    f"/proc/{self._holder}/ns/net"
+                ):
                     yield pid, command_line(pid)
 
     def is_at_work(self) -> bool:
         """Return whether a task runs here: Ray names processes after their tasks."""
-        return any(line.startswith(tuple(f"ray::{stage.value}" for stage in Stage)) for _, line in self.processes())
+        return any(
+            line.startswith(tuple(f"ray::{stage.value}" for stage in Stage))
+            for _, line in self.processes()
+        )
 
     def freeze(self) -> None:
         """Let all processes stop, as those of a machine that hangs."""
@@ -165,13 +181,24 @@ class Lab:
     def keep_busy(self) -> None:
         """Submit another job where the last one is nearly over."""
         with self._database.read() as connection:
-            query = select(tasks.c.state == "succeeded", func.count()).where(tasks.c.stage == "render")
-            counts = {bool(is_done): count for is_done, count in connection.execute(query.group_by(text("1")))}
-        is_planned = sum(counts.values()) == RODS * len(self.jobs)  # the first one is when a worker has come
+            query = select(tasks.c.state == "succeeded", func.count()).where(
+                tasks.c.stage == "render"
+            )
+            counts = {
+                bool(is_done): count
+                for is_done, count in connection.execute(query.group_by(text("1")))
+            }
+        is_planned = sum(counts.values()) == RODS * len(
+            self.jobs
+        )  # the first one is when a worker has come
         if self.jobs and not (is_planned and counts.get(False, 0) < RODS // 3):
             return
         gamma = {"type": "linspace", "start": 100, "stop": 1300, "num": RODS}
-        axes = {"gamma": gamma, "phi0": 0.2, "phi1": 6.0 + 0.1 * len(self.jobs)}  # no two jobs share a sample
+        axes = {
+            "gamma": gamma,
+            "phi0": 0.2,
+            "phi1": 6.0 + 0.1 * len(self.jobs),
+        }  # no two jobs share a sample
         spec = {"kind": "rod_hang", "axes": axes, "quality": "draft", "samples_per_shard": 50}
         answer = self._http.post("/v1/jobs", json=spec)
         assert answer.status_code == 202, answer.text
@@ -184,8 +211,13 @@ class Lab:
             return list(connection.execute(query))
 
     def held(self, name: str) -> dict[int, str]:
-        """Return the tasks that a worker holds, and their states: `running` where a heartbeat has said so."""
-        return {row.seq: row.state for row in self._rows(tasks.c.seq, tasks.c.state, name=name, of=tasks.c.owner)}
+        """Return the tasks that a worker holds, and their states: `running` where a heartbeat has
+        said so.
+        """
+        return {
+            row.seq: row.state
+            for row in self._rows(tasks.c.seq, tasks.c.state, name=name, of=tasks.c.owner)
+        }
 
     def done(self, name: str) -> int:
         """Return how many tasks a worker has done."""
@@ -200,7 +232,9 @@ class Lab:
     def sums(self) -> tuple[int, int]:
         """Return the tries that tasks were charged with, and the losses."""
         with self._database.read() as connection:
-            tries, losses = connection.execute(select(func.sum(tasks.c.tries), func.sum(tasks.c.losses))).one()
+            tries, losses = connection.execute(
+                select(func.sum(tasks.c.tries), func.sum(tasks.c.losses))
+            ).one()
         return int(tries), int(losses)
 
     def wait(self, what: str, is_so: Callable[[], bool], seconds: float = 240) -> float:
@@ -221,7 +255,9 @@ class Lab:
         return time.monotonic() - begin
 
     def worker(self, name: str) -> dict[str, Any]:
-        """Return the live worker of a name, with how it says that it is, if one exists; otherwise {}."""
+        """Return the live worker of a name, with how it says that it is, if one exists; otherwise
+        {}.
+        """
         workers: list[dict[str, Any]] = self._http.get("/v1/workers").json()
         return next((one for one in workers if one["name"] == name and one["alive"]), {})
 
@@ -230,7 +266,9 @@ class Lab:
 
         def probe() -> list[str] | None:
             jobs = [self._http.get(f"/v1/jobs/{job}").json() for job in self.jobs]
-            return [job["state"] for job in jobs] if all(job["finished_at"] for job in jobs) else None
+            return (
+                [job["state"] for job in jobs] if all(job["finished_at"] for job in jobs) else None
+            )
 
         return wait_for("the end of all jobs", probe, 300)
 
@@ -249,7 +287,9 @@ def running(place: Path, name: str, words: list[str], port: int) -> Iterator[Non
     def is_there() -> bool | None:
         assert process.poll() is None, (place / f"{name}.log").read_text()
         try:
-            return httpx.get(f"http://{HUB}:{port}/readyz", trust_env=False).status_code < 500 or None
+            return (
+                httpx.get(f"http://{HUB}:{port}/readyz", trust_env=False).status_code < 500 or None
+            )
         except httpx.TransportError:
             return None
 

@@ -1,6 +1,8 @@
-"""Rules between fields, which JSON Schema has no words for: a generated document that breaks one is not a valid one.
+"""Rules between fields, which JSON Schema has no words for: a generated document that breaks one is
+not a valid one.
 
-Each is a part of the message of the error that names it. Whatever else the coordinator refuses, its schema must refuse.
+Each is a part of the message of the error that names it. Whatever else the coordinator refuses, its
+schema must refuse.
 """
 
 import io
@@ -64,7 +66,9 @@ _DOCUMENTS: dict[str, TypeAdapter[Any]] = {
 
 @schemathesis.hook
 def filter_case(context: Any, case: Any) -> bool:
-    """Leave out valid cases whose body breaks a rule between fields, and jobs that take long to plan, and no other."""
+    """Leave out valid cases whose body breaks a rule between fields, and jobs that take long to
+    plan, and no other.
+    """
     adapter = _DOCUMENTS.get(case.path)
     if adapter is None or case.method != "POST" or not case.meta.generation.mode.is_positive:
         return True
@@ -84,7 +88,9 @@ def filter_case(context: Any, case: Any) -> bool:
 
 @schemathesis.hook
 def map_case(context: Any, case: Any) -> Any:
-    """Give each request an Idempotency-Key of its own: the same one with another document is rightly refused."""
+    """Give each request an Idempotency-Key of its own: the same one with another document is
+    rightly refused.
+    """
     if case.headers and "idempotency-key" in case.headers and case.meta.generation.mode.is_positive:
         case.headers["idempotency-key"] = uuid.uuid4().hex
     return case
@@ -98,4 +104,6 @@ def _picture(form: str) -> bytes:
 
 for form in ("PNG", "JPEG"):  # JSON Schema has no words for what is a picture
     schemathesis.openapi.media_type(f"image/{form.lower()}", st.just(_picture(form)))
-schemathesis.openapi.media_type("application/octet-stream", st.just(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"))
+schemathesis.openapi.media_type(
+    "application/octet-stream", st.just(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+)

@@ -1,4 +1,6 @@
-"""A dataset that is made in a bucket: real coordinator, dispatcher, Ray and Blender, and a real S3 server."""
+"""A dataset that is made in a bucket: real coordinator, dispatcher, Ray and Blender, and a real S3
+server.
+"""
 
 import subprocess
 from collections.abc import Iterator
@@ -11,7 +13,9 @@ from harness import STICKSLIP, Service, read_arrays
 from stickslip_sim_core import solve_rods
 from zarr.storage import ObjectStore
 
-pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+pytest.importorskip(
+    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+)
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 import obstore.store
@@ -46,7 +50,9 @@ def test_a_dataset_is_made_read_and_collected_in_a_bucket(service: Service, tmp_
     dataset = over["dataset"]["dataset"]
     served = read_arrays(f"{service.url}/v1/datasets/{dataset}/versions/1/files/")
     pulled = tmp_path / "pulled"
-    subprocess.run([STICKSLIP, "pull", dataset, pulled, "--url", service.url], check=True, capture_output=True)
+    subprocess.run(
+        [STICKSLIP, "pull", dataset, pulled, "--url", service.url], check=True, capture_output=True
+    )
     service.stop()  # the bucket is read without anything of ours
     version = obstore.store.S3Store("lab", prefix=f"one/datasets/{dataset}/v1")
     kept, local = read_arrays(ObjectStore(version, read_only=True)), read_arrays(pulled)
@@ -62,5 +68,7 @@ def test_a_dataset_is_made_read_and_collected_in_a_bucket(service: Service, tmp_
     collected = subprocess.run(
         [STICKSLIP, "gc", "--older-than", "0", *place], capture_output=True, text=True, check=True
     )
-    assert collected.stdout == "0 files, 0.0 MB, that nothing refers to may be deleted: add --delete\n"
+    assert (
+        collected.stdout == "0 files, 0.0 MB, that nothing refers to may be deleted: add --delete\n"
+    )
     assert not (service.data / "store").exists()

@@ -1,4 +1,6 @@
-"""From `stickslip certify` to a dataset that carries the certificate: real protocols, a real coordinator."""
+"""From `stickslip certify` to a dataset that carries the certificate: real protocols, a real
+coordinator.
+"""
 
 import json
 import sys
@@ -18,7 +20,12 @@ from stickslip_testing.worker import BUILDS
 
 CLOTH = {
     "kind": "cloth_drag",
-    "axes": {"material": "gray-interlock", "mu": [0.1, 0.2], "texture": "dots", "viewpoint": "left"},
+    "axes": {
+        "material": "gray-interlock",
+        "mu": [0.1, 0.2],
+        "texture": "dots",
+        "viewpoint": "left",
+    },
 }
 NOBODY = "http://127.0.0.1:9"
 
@@ -34,7 +41,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
 @pytest.fixture(scope="module")
 def cli(server: RunningServer) -> Callable[..., Result]:
     def run(*words: object, url: str = server.url) -> Result:
-        return CliRunner().invoke(app, [str(word) for word in words], env={"STICKSLIP_URL": url, "COLUMNS": "200"})
+        return CliRunner().invoke(
+            app, [str(word) for word in words], env={"STICKSLIP_URL": url, "COLUMNS": "200"}
+        )
 
     return run
 
@@ -57,14 +66,22 @@ def test_register_and_list(cli: Callable[..., Result], quick: Path) -> None:
     assert digest in registered.stdout
     assert cli("register", quick).stdout == registered.stdout
     (entry,) = json.loads(cli("certificates", "--json").stdout)
-    assert (entry["digest"], entry["preset"], entry["extent"], entry["passed"]) == (digest, "rods", "quick", True)
+    assert (entry["digest"], entry["preset"], entry["extent"], entry["passed"]) == (
+        digest,
+        "rods",
+        "quick",
+        True,
+    )
     assert digest[:16] in cli("certificates").stdout
 
 
 def test_a_cloth_job_from_refusal_to_dataset(
     cli: Callable[..., Result], server: RunningServer, quick: Path, tmp_path: Path
 ) -> None:
-    """The certificate is the rods' under the name of a preset of cloth; one of its reports stands for contact, too."""
+    """The certificate is the rods' under the name of a preset of cloth.
+
+    One of its reports stands for contact, too.
+    """
     certificate = read_certificate(quick)
     build = certificate.sim_core
     builds = BUILDS.model_copy(update={"sim_core": build})
@@ -73,19 +90,30 @@ def test_a_cloth_job_from_refusal_to_dataset(
     spec.write_text(json.dumps(CLOTH))
     refused = cli("submit", spec)
     assert refused.exit_code == 1
-    for words in ("preset", f"build {build[:12]}", "stickslip certify --preset certified", '"certified"'):
+    for words in (
+        "preset",
+        f"build {build[:12]}",
+        "stickslip certify --preset certified",
+        '"certified"',
+    ):
         assert words in refused.stderr
 
     made: dict[str, Any] = {"preset": "certified", "extent": "full"}
     alone = certificate.model_copy(update=made)
     of_rods = certificate.protocols
-    made["protocols"] = (*of_rods, *(of_rods[0].model_copy(update={"protocol": name}) for name in CONTACT_PROTOCOLS))
+    made["protocols"] = (
+        *of_rods,
+        *(of_rods[0].model_copy(update={"protocol": name}) for name in CONTACT_PROTOCOLS),
+    )
     full = certificate.model_copy(update=made)
     with Client(server.url) as client:
         client.register(alone)
         refused = cli("submit", spec)
         assert refused.exit_code == 1
-        assert f"it must have {', '.join(CONTACT_PROTOCOLS)}, since cloth touches cloth" in refused.stderr
+        assert (
+            f"it must have {', '.join(CONTACT_PROTOCOLS)}, since cloth touches cloth"
+            in refused.stderr
+        )
         entry = client.register(full)
         assert client.request("GET", entry.href).content == full.canonical()
         submitted = cli("submit", spec)
@@ -100,7 +128,9 @@ def test_a_cloth_job_from_refusal_to_dataset(
     assert "this" in cli("certificates").stdout
 
 
-def test_a_folder_without_a_certificate_is_refused_in_words(cli: Callable[..., Result], tmp_path: Path) -> None:
+def test_a_folder_without_a_certificate_is_refused_in_words(
+    cli: Callable[..., Result], tmp_path: Path
+) -> None:
     result = cli("register", tmp_path)
     assert result.exit_code == 1
     assert "there is no certificate.json" in result.stderr
@@ -110,13 +140,17 @@ def test_a_folder_without_a_certificate_is_refused_in_words(cli: Callable[..., R
 def test_an_old_certificate_is_not_taken_for_a_new_one(
     cli: Callable[..., Result], quick: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/false")  # ends with status 1, as a preset that fails does
+    monkeypatch.setattr(
+        sys, "executable", "/bin/false"
+    )  # ends with status 1, as a preset that fails does
     result = cli("certify", "--preset", "rods", "--out", quick)
     assert result.exit_code == 1
     assert "no certificate was made: the workers' program ended with status 1" in result.stderr
 
 
-def test_a_damaged_certificate_is_refused_in_words(cli: Callable[..., Result], quick: Path, tmp_path: Path) -> None:
+def test_a_damaged_certificate_is_refused_in_words(
+    cli: Callable[..., Result], quick: Path, tmp_path: Path
+) -> None:
     document = json.loads((quick / "certificate.json").read_text())
     document["protocols"][0]["error"] = 0.5
     (tmp_path / "certificate.json").write_text(json.dumps(document))

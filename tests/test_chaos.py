@@ -1,8 +1,10 @@
-"""Kill -9 anything in the middle of jobs of rods and start again: every sample once, every hash right.
+"""Kill -9 anything in the middle of jobs of rods and start again: every sample once, every hash
+right.
 
 STICKSLIP_KILLS=50 pytest -m slow tests/test_chaos.py -s      chosen deaths, random ones, and the longest gap
 
-The last of the tests has two coordinators and two dispatchers on one PostgreSQL database and one bucket.
+The last of the tests has two coordinators and two dispatchers on one PostgreSQL database and one
+bucket.
 """
 
 import os
@@ -35,7 +37,9 @@ from zarr.storage import LocalStore, ObjectStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chaos")]
 
-SPEC: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text())
+SPEC: dict[str, Any] = yaml.safe_load(
+    (Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text()
+)
 
 
 @pytest.fixture
@@ -74,17 +78,25 @@ def test_a_job_survives_the_death_of_every_process(service: Service) -> None:
 
 
 def renders_done(service: Service, job: str) -> int:
-    counts: dict[str, int] = service.get(f"/v1/jobs/{job}")["progress"]["stages"]["render"]["counts"]
+    counts: dict[str, int] = service.get(f"/v1/jobs/{job}")["progress"]["stages"]["render"][
+        "counts"
+    ]
     return counts.get("succeeded", 0)
 
 
 def wait_for_renders(service: Service, job: str, count: int) -> None:
-    """Wait until `count` renders are done; the job must not be over then, or the next kill would prove nothing."""
+    """Wait until `count` renders are done.
+
+    The job must not be over then, or the next kill would prove nothing.
+    """
 
     def probe() -> int | None:
         try:
             done = renders_done(service, job)
-        except (httpx.TransportError, KeyError):  # the coordinator is away, or the job is not planned yet
+        except (
+            httpx.TransportError,
+            KeyError,
+        ):  # the coordinator is away, or the job is not planned yet
             return None
         return done if done >= count else None
 
@@ -122,7 +134,9 @@ def files_of(store: Store, dataset: str, version: int) -> tuple[set[str], ZarrSt
     """Return the paths of what a version shows, and where a Zarr reader finds it."""
     if isinstance(store, DirectoryStore):
         place = store.dataset_path(dataset, version)
-        return {str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()}, LocalStore(place)
+        return {
+            str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()
+        }, LocalStore(place)
     import obstore
 
     bucket, _, prefix = store.place.removeprefix("s3://").partition("/")
@@ -131,7 +145,9 @@ def files_of(store: Store, dataset: str, version: int) -> tuple[set[str], ZarrSt
     return names, ObjectStore(objects, read_only=True)
 
 
-def check_dataset(store: Store, reference: dict[str, Any], spec: dict[str, Any], builds: Builds) -> None:
+def check_dataset(
+    store: Store, reference: dict[str, Any], spec: dict[str, Any], builds: Builds
+) -> None:
     """Every slot holds its own sample, and every byte is what the manifest says."""
     version = reference["dataset"], reference["version"]
     text = store.read_shown(*version, MANIFEST_NAME)
@@ -161,7 +177,9 @@ def test_ray_is_replaced_at_once_when_it_dies(service: Service) -> None:
     def session() -> str | None:
         """Return the session of a dispatcher to which Ray answers: it registers before."""
         workers = service.get("/v1/workers")
-        ready = [one["id"] for one in workers if one["alive"] and one["condition"]["state"] == "ready"]
+        ready = [
+            one["id"] for one in workers if one["alive"] and one["condition"]["state"] == "ready"
+        ]
         return ready[0] if ready else None
 
     assert service.process is not None
@@ -186,7 +204,10 @@ VICTIMS = {
     "coordinator": ("-m stickslip_services.app",),
     "dispatcher": ("-m stickslip_workers dispatch",),
     "ray start": ("-m stickslip_workers head",),
-    "stage or render process": ("ray::IDLE", *(f"ray::{stage.value}" for stage in Stage)),  # named after its task
+    "stage or render process": (
+        "ray::IDLE",
+        *(f"ray::{stage.value}" for stage in Stage),
+    ),  # named after its task
     "raylet": ("raylet/raylet",),
     "gcs": ("gcs/gcs_server",),
     "dashboard agent": ("ray::DashboardAgent",),
@@ -199,7 +220,9 @@ VICTIMS = {
 
 def many_rods(number: int) -> dict[str, Any]:
     """Return the spec of the job of this number: no two have a sample in common."""
-    axes = {"gamma": {"type": "linspace", "start": 100 + number, "stop": 1100 + number, "num": RODS}}
+    axes = {
+        "gamma": {"type": "linspace", "start": 100 + number, "stop": 1100 + number, "num": RODS}
+    }
     return {
         "kind": "rod_hang",
         "axes": axes | {"phi0": 1.0, "phi1": 6.0},
@@ -211,7 +234,10 @@ def many_rods(number: int) -> dict[str, Any]:
 
 
 class Watch:
-    """Keeps one job at work and notes how long nothing is finished. The services take turns to be asked."""
+    """Keeps one job at work and notes how long nothing is finished.
+
+    The services take turns to be asked.
+    """
 
     def __init__(self, *services: Service) -> None:
         self._services = services
@@ -222,7 +248,10 @@ class Watch:
         self.longest = 0.0
 
     def look(self) -> bool:
-        """Submit a job where the last one is over; return whether there was progress since the last look."""
+        """Submit a job where the last one is over.
+
+        Return whether there was progress since the last look.
+        """
         self._turns += 1
         service = self._services[self._turns % len(self._services)]
         try:
@@ -288,7 +317,10 @@ def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixtu
         gaps.setdefault(victim, []).append(watch.wait_for_progress())
         worst_load = max(worst_load, os.getloadavg()[0])
         with capsys.disabled():
-            print(f"{number + 1:3} {victim:28} {gaps[victim][-1]:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+            print(
+                f"{number + 1:3} {victim:28} {gaps[victim][-1]:5.1f} s, load {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
     over = [service.finished(job) for job in watch.jobs]
     assert [job["state"] for job in over] == ["succeeded"] * len(over)
     builds = Builds.model_validate(service.get("/v1/workers")[0]["builds"]["rod_hang"])
@@ -296,12 +328,18 @@ def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixtu
     service.wait_for_end()
     check_ledger(Settings(data=service.data))
     for number, job in enumerate(over):
-        check_dataset(DirectoryStore(service.data / "store"), job["dataset"], many_rods(number), builds)
+        check_dataset(
+            DirectoryStore(service.data / "store"), job["dataset"], many_rods(number), builds
+        )
     with capsys.disabled():
         print(f"{count} kills (seed {seed}): each of {len(over) * RODS} samples once")
         for victim, seconds in sorted(gaps.items()):
-            print(f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until something was finished")
-        print(f"    longest gap without progress {watch.longest:.1f} s, load {worst_load:.1f} at most")
+            print(
+                f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until something was finished"
+            )
+        print(
+            f"    longest gap without progress {watch.longest:.1f} s, load {worst_load:.1f} at most"
+        )
     assert watch.longest <= PATIENCE * LONGEST_GAP
 
 
@@ -312,10 +350,16 @@ FAULTS = {"503": 0.01, "late": 0.01, "lost answer": 0.005}
 
 @pytest.fixture
 def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Service, Service]]:
-    """Two nodes, each a coordinator and a dispatcher, on one PostgreSQL database and one bucket that fails at times."""
-    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    """Two nodes, each a coordinator and a dispatcher, on one PostgreSQL database and one bucket
+    that fails at times.
+    """
+    pytest.importorskip(
+        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+    )
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'")
+    pytest.importorskip(
+        "psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'"
+    )
     from stickslip_testing.postgresql import find_programs, postgresql_server
     from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 
@@ -327,7 +371,10 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
         proxy.some(1, FAULTS)
         for name, value in (variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}).items():
             monkeypatch.setenv(name, value)
-        both = tuple(Service(tmp_path / name, "--store", BUCKET, "--name", name, "--slots", "1") for name in ("a", "b"))
+        both = tuple(
+            Service(tmp_path / name, "--store", BUCKET, "--name", name, "--slots", "1")
+            for name in ("a", "b")
+        )
         try:
             for node in both:
                 node.start()
@@ -355,11 +402,14 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
         wait = watch.wait_for_progress()
         with capsys.disabled():
             print(
-                f"{number + 1:3} {node.data.name} {victim:28} {wait:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True
+                f"{number + 1:3} {node.data.name} {victim:28} {wait:5.1f} s, load {os.getloadavg()[0]:.1f}",
+                flush=True,
             )
     over = [nodes[0].finished(job, timeout=600) for job in watch.jobs]
     assert [job["state"] for job in over] == ["succeeded"] * len(over)
-    known = [worker["builds"] for worker in nodes[1].get("/v1/workers")]  # one that has just begun has told none
+    known = [
+        worker["builds"] for worker in nodes[1].get("/v1/workers")
+    ]  # one that has just begun has told none
     builds = Builds.model_validate(next(of for of in known if of)["rod_hang"])
     for node in nodes:
         node.stop()
@@ -367,13 +417,17 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
     settings = Settings.chosen(data=nodes[0].data, store=BUCKET)
     check_ledger(settings)
 
-    found = collected(settings, "--delete")  # what calls that were killed had written: another batch, another name
+    found = collected(
+        settings, "--delete"
+    )  # what calls that were killed had written: another batch, another name
     assert collected(settings) == 0
     store = open_store(BUCKET)
     for number, job in enumerate(over):
         check_dataset(store, job["dataset"], many_rods(number), builds)
     with capsys.disabled():
-        print(f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed calls collected")
+        print(
+            f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed calls collected"
+        )
         print(f"    longest gap without progress {watch.longest:.1f} s")
 
 

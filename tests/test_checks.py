@@ -1,4 +1,6 @@
-"""The table of checks is the same in the solver, the datasets, the reasons of rejections, and the docs."""
+"""The table of checks is the same in the solver, the datasets, the reasons of rejections, and the
+docs.
+"""
 
 from pathlib import Path
 
@@ -10,7 +12,9 @@ DOCS = Path(__file__).parents[1] / "docs" / "cloth.md"
 
 
 def test_labels_are_the_checks() -> None:
-    assert {name: limit for name, (_, limit) in LABELS.items()} == {check.name: check.limit for check in CHECKS}
+    assert {name: limit for name, (_, limit) in LABELS.items()} == {
+        check.name: check.limit for check in CHECKS
+    }
 
 
 def test_a_check_that_judges_is_a_reason_that_no_second_try_mends() -> None:

@@ -40,7 +40,9 @@ def job(service: Service) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def directory(service: Service, job: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def directory(
+    service: Service, job: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     target = tmp_path_factory.mktemp("pulled") / "clips"
     command = [STICKSLIP, "pull", job["dataset"]["dataset"], target, "--url", service.url]
     subprocess.run(command, check=True, capture_output=True)
@@ -63,7 +65,12 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
     simulation = spec.simulation({"material": "gray-interlock", "mu": 0.4})
     assert isinstance(simulation, ClothDragSimulation)
     run = cloth_drag.scene(
-        "gray-interlock", 0.4, preset="fast", mesh=9, seed=simulation.seed, self_friction=simulation.self_friction
+        "gray-interlock",
+        0.4,
+        preset="fast",
+        mesh=9,
+        seed=simulation.seed,
+        self_friction=simulation.self_friction,
     ).run()
     arrays = read_arrays(directory)
     assert arrays["valid"].all()
@@ -72,16 +79,31 @@ def test_meshes_and_labels_are_those_of_the_solver(directory: Path) -> None:
         assert np.array_equal(arrays["positions"][slot], run.positions.astype(np.float32))
         assert np.array_equal(arrays["rest"][slot], run.rest.astype(np.float32))
         assert np.array_equal(arrays["triangles"][slot], run.triangles)
-        assert np.array_equal(arrays["contact_force"][slot], run.record["contact_force"].astype(np.float32))
-        assert np.array_equal(arrays["holder_force"][slot], run.record["holder_force"].astype(np.float32))
+        assert np.array_equal(
+            arrays["contact_force"][slot], run.record["contact_force"].astype(np.float32)
+        )
+        assert np.array_equal(
+            arrays["holder_force"][slot], run.record["holder_force"].astype(np.float32)
+        )
         assert np.array_equal(arrays["self_intersections"][slot], run.self_intersections)
-        for name in ("bias_side", "landed_side", "bias", "steps", "unconverged_steps", "worst_residual"):
+        for name in (
+            "bias_side",
+            "landed_side",
+            "bias",
+            "steps",
+            "unconverged_steps",
+            "worst_residual",
+        ):
             assert arrays[name][slot] == ({**vars(run), **run.labels})[name], name
-    assert len(set(arrays["light_seed"].tolist())) == 2  # one for each viewpoint: textures share a trace
+    assert (
+        len(set(arrays["light_seed"].tolist())) == 2
+    )  # one for each viewpoint: textures share a trace
 
 
 def test_cloth_feels_itself_unless_its_spec_says_null(directory: Path) -> None:
-    simulation = job_spec_adapter.validate_python(SPEC).simulation({"material": "gray-interlock", "mu": 0.4})
+    simulation = job_spec_adapter.validate_python(SPEC).simulation(
+        {"material": "gray-interlock", "mu": 0.4}
+    )
     assert isinstance(simulation, ClothDragSimulation)
     through = cloth_drag.scene(
         "gray-interlock", 0.4, preset="fast", mesh=9, seed=simulation.seed, self_friction=None
@@ -91,7 +113,9 @@ def test_cloth_feels_itself_unless_its_spec_says_null(directory: Path) -> None:
 
 
 def test_clips_show_the_cloth_of_their_sample(directory: Path) -> None:
-    """What changes between two frames is where the cloth was or is, and the light it throws on the floor about."""
+    """What changes between two frames is where the cloth was or is, and the light it throws on the
+    floor about.
+    """
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
     cameras = {camera.name: camera for camera in manifest.cameras}
     clips = Samples(directory, arrays=["video", "positions"])
@@ -132,11 +156,19 @@ def test_what_is_known_of_every_pixel_reaches_the_reader(service: Service, tmp_p
     cloth = known["segmentation"][0] == SEGMENTS.index("cloth")
     assert (cloth == np.isfinite(known["uv"][0]).all(axis=-1)).all()
     for frame, instant in enumerate(instants):
-        vertices = arrays["positions"][0, instant] @ np.asarray(camera.rotation).T + np.asarray(camera.translation)
+        vertices = arrays["positions"][0, instant] @ np.asarray(camera.rotation).T + np.asarray(
+            camera.translation
+        )
         depth = known["depth"][0, frame][cloth[frame]]
-        assert vertices[:, 2].min() - 0.01 < depth.min() <= depth.max() < vertices[:, 2].max() + 0.01
+        assert (
+            vertices[:, 2].min() - 0.01 < depth.min() <= depth.max() < vertices[:, 2].max() + 0.01
+        )
         pixels, _ = camera.project(arrays["positions"][0, instant])
         rows, columns = np.nonzero(cloth[frame])
-        assert abs(columns.min() - pixels[:, 0].min()) < 3  # a corner ends in a tip that is thinner than a pixel
+        assert (
+            abs(columns.min() - pixels[:, 0].min()) < 3
+        )  # a corner ends in a tip that is thinner than a pixel
         assert abs(rows.max() - pixels[:, 1].max()) < 3
-    assert np.linalg.norm(known["flow"][0, 0][cloth[0]].astype(float), axis=-1).mean() > 10.0  # it is dragged
+    assert (
+        np.linalg.norm(known["flow"][0, 0][cloth[0]].astype(float), axis=-1).mean() > 10.0
+    )  # it is dragged

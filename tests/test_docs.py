@@ -1,4 +1,6 @@
-"""The examples of the documentation: their code runs as it is printed, and does what the text around it says."""
+"""The examples of the documentation: their code runs as it is printed, and does what the text
+around it says.
+"""
 
 import re
 from pathlib import Path
@@ -15,7 +17,10 @@ ROOT = Path(__file__).parents[1]
 def run_code(page: Path, names: dict[str, Any]) -> dict[str, Any]:
     """Run the Python of a Markdown page, block after block, in one namespace; return it."""
     text = page.read_text()
-    blocks = [(match.start(1), match.group(1)) for match in re.finditer(r"```python\n(.*?)```", text, re.DOTALL)]
+    blocks = [
+        (match.start(1), match.group(1))
+        for match in re.finditer(r"```python\n(.*?)```", text, re.DOTALL)
+    ]
     assert blocks, f"{page} has no code"
     for start, block in blocks:
         before = text.count("\n", 0, start)  # so that a traceback names the line of the page
@@ -37,7 +42,9 @@ def test_the_pictures_give_the_centreline(example: dict[str, Any]) -> None:
     found = example["found"]
     assert found.verdict == "good"
     s = np.linspace(0.0, 1.0, 150)
-    truth = solve_general_rods(np.stack([3 + 0 * s, 0 * s, 6 + 10 * s], axis=1)[None], [300.0]).centerline[0]
+    truth = solve_general_rods(
+        np.stack([3 + 0 * s, 0 * s, 6 + 10 * s], axis=1)[None], [300.0]
+    ).centerline[0]
     assert np.linalg.norm(found.centerline - truth, axis=1).mean() < 1e-3
 
 

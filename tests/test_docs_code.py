@@ -27,11 +27,17 @@ from stickslip_schemas.scene.document import Scene
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 RUN_ELSEWHERE = {"from-four-pngs.md"}  # test_docs.py runs it, and looks at what comes out
-LONG = {"README.md", "benchmark.md"}  # clips of two simulations, 245 rods; the tutorials make smaller datasets
-MOST_SKIPPED = 31  # deploy/, PostgreSQL and S3 need other machines; test_deploy.py checks commands of the first
+LONG = {
+    "README.md",
+    "benchmark.md",
+}  # clips of two simulations, 245 rods; the tutorials make smaller datasets
+# deploy/, PostgreSQL and S3 need other machines; test_deploy.py checks commands of the first
+MOST_SKIPPED = 31
 
 _RUN = ("python", "sh", "yaml")
-_FENCE = re.compile(r"(?:<!-- skip: (?P<reason>.+?) -->\n)?^```(?P<language>\S*)\n(?P<code>.*?)^```$", re.M | re.S)
+_FENCE = re.compile(
+    r"(?:<!-- skip: (?P<reason>.+?) -->\n)?^```(?P<language>\S*)\n(?P<code>.*?)^```$", re.M | re.S
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,12 @@ class Block:
 def blocks(page: Path) -> list[Block]:
     text = page.read_text()
     return [
-        Block(match["language"], match["code"], text.count("\n", 0, match.start("code")), match["reason"])
+        Block(
+            match["language"],
+            match["code"],
+            text.count("\n", 0, match.start("code")),
+            match["reason"],
+        )
         for match in _FENCE.finditer(text)
     ]
 
@@ -55,15 +66,28 @@ def blocks(page: Path) -> list[Block]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_block_says_what_it_is(page: Path) -> None:
     for block in blocks(page):
-        assert block.language.startswith("{") or block.language in ("python", "sh", "yaml", "ini", "text"), block
+        assert block.language.startswith("{") or block.language in (
+            "python",
+            "sh",
+            "yaml",
+            "ini",
+            "text",
+        ), block
         assert block.reason is None or len(block.reason) > 20, block
     outside = _FENCE.sub("", page.read_text())
     assert "```" not in outside
-    assert not re.search(r"^\n {4}[a-z]+[.(]", outside, re.M), "an indented block of code: nobody runs it"
+    assert not re.search(r"^\n {4}[a-z]+[.(]", outside, re.M), (
+        "an indented block of code: nobody runs it"
+    )
 
 
 def test_few_blocks_are_not_run() -> None:
-    skipped = [(page.name, block.line, block.reason) for page in PAGES for block in blocks(page) if block.reason]
+    skipped = [
+        (page.name, block.line, block.reason)
+        for page in PAGES
+        for block in blocks(page)
+        if block.reason
+    ]
     assert len(skipped) <= MOST_SKIPPED, skipped
 
 
@@ -105,9 +129,14 @@ def test_every_block_runs(
                 exec(compile("\n" * block.line + block.code, str(page), "exec"), names)
             for promised in re.findall(r"print\(.*\)  # (.+)", block.code):
                 start = promised.removesuffix(" ...")
-                assert any(line.startswith(start) for line in printed.getvalue().splitlines()), (where, promised)
+                assert any(line.startswith(start) for line in printed.getvalue().splitlines()), (
+                    where,
+                    promised,
+                )
         elif block.language == "sh":
-            script = f"set -euo pipefail; source {state}; set -a\n{block.code}\nexport -p > {state}\n"
+            script = (
+                f"set -euo pipefail; source {state}; set -a\n{block.code}\nexport -p > {state}\n"
+            )
             done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
             assert done.returncode == 0, f"{where}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
         elif block.language == "yaml":
@@ -143,16 +172,32 @@ def test_the_code_of_a_dataset_card_runs(rods: Path, monkeypatch: pytest.MonkeyP
 
 def test_the_reference_of_specs_is_up_to_date() -> None:
     made = subprocess.run(
-        [sys.executable, ROOT / "tools/spec_reference.py"], capture_output=True, text=True, check=True
+        [sys.executable, ROOT / "tools/spec_reference.py"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert made.stdout == (ROOT / "docs/spec.md").read_text(), "run: python tools/spec_reference.py > docs/spec.md"
+    assert made.stdout == (ROOT / "docs/spec.md").read_text(), (
+        "run: python tools/spec_reference.py > docs/spec.md"
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx", reason="pip install sphinx myst-parser furo")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", str(tmp_path / "site")]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-b",
+        "html",
+        "docs",
+        str(tmp_path / "site"),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     pages = {page.stem for page in (tmp_path / "site").glob("*.html")}

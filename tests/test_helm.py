@@ -1,7 +1,9 @@
-"""The Helm chart: it renders to what Kubernetes takes, refuses wrong values, and asks for metrics that there are.
+"""The Helm chart: it renders to what Kubernetes takes, refuses wrong values, and asks for metrics
+that there are.
 
-Kubernetes' own objects are checked against its schemas. Those of KubeRay, KEDA and the Prometheus Operator are checked
-against `CRDS` below, the fields that the chart sets, written down from the operators' own definitions.
+Kubernetes' own objects are checked against its schemas. Those of KubeRay, KEDA and the Prometheus
+Operator are checked against `CRDS` below, the fields that the chart sets, written down from the
+operators' own definitions.
 """
 
 import io
@@ -34,9 +36,13 @@ CHART = ROOT / "deploy" / "helm" / "stickslip"
 CI = {path.stem: yaml.safe_load(path.read_text()) for path in sorted((CHART / "ci").glob("*.yaml"))}
 RELEASE, NAMESPACE = "demo", "lab"
 KUBERNETES = ("1.27", "1.31", "1.37")
-"""Versions that the chart is checked against: the oldest and the newest that are known, and one between."""
+"""Versions that the chart is checked against: the oldest and the newest that are known, and one
+between.
+"""
 
-helm = pytest.importorskip("helm_python", reason="Helm is not installed: pip install helm-python-sdk")
+helm = pytest.importorskip(
+    "helm_python", reason="Helm is not installed: pip install helm-python-sdk"
+)
 
 
 def rendered(values: dict[str, Any]) -> list[dict[str, Any]]:
@@ -49,7 +55,11 @@ def rendered(values: dict[str, Any]) -> list[dict[str, Any]]:
 
 def of_kind(objects: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any]]:
     """Return the objects of a kind by their component."""
-    return {item["metadata"]["labels"]["app.kubernetes.io/component"]: item for item in objects if item["kind"] == kind}
+    return {
+        item["metadata"]["labels"]["app.kubernetes.io/component"]: item
+        for item in objects
+        if item["kind"] == kind
+    }
 
 
 def pods(objects: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -75,7 +85,12 @@ _STRINGS = {"type": "object", "additionalProperties": _STRING}
 
 
 def _object(*required: str, **properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties, "required": list(required), "additionalProperties": False}
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(required),
+        "additionalProperties": False,
+    }
 
 
 def _list(items: dict[str, Any]) -> dict[str, Any]:
@@ -120,7 +135,9 @@ CRDS = {
                 behavior=_object(scaleDown=_object(stabilizationWindowSeconds=_NUMBER))
             )
         ),
-        triggers=_list(_object("type", "metadata", type={"const": "prometheus"}, metadata=_STRINGS)),
+        triggers=_list(
+            _object("type", "metadata", type={"const": "prometheus"}, metadata=_STRINGS)
+        ),
     ),
     ("monitoring.coreos.com/v1", "ServiceMonitor"): _object(
         "selector",
@@ -131,7 +148,9 @@ CRDS = {
                 port=_STRING,
                 path=_STRING,
                 interval=_STRING,
-                authorization=_object(credentials=_object("name", "key", name=_STRING, key=_STRING)),
+                authorization=_object(
+                    credentials=_object("name", "key", name=_STRING, key=_STRING)
+                ),
             )
         ),
     ),
@@ -142,25 +161,35 @@ CRDS = {
 @pytest.mark.parametrize("name", CI)
 def test_kubernetes_takes_every_object(name: str, version: str) -> None:
     jsonschema = pytest.importorskip("jsonschema", reason="pip install jsonschema")
-    kubernetes = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    kubernetes = pytest.importorskip(
+        "kubernetes_validate", reason="pip install kubernetes-validate"
+    )
     objects = rendered(CI[name])
     for item in objects:
         spec = CRDS.get((item["apiVersion"], item["kind"]))
         if spec is None:
             kubernetes.validate(item, version, strict=True)
         else:
-            head = {"apiVersion": _STRING, "kind": _STRING, "metadata": _object("name", name=_STRING, labels=_STRINGS)}
+            head = {
+                "apiVersion": _STRING,
+                "kind": _STRING,
+                "metadata": _object("name", name=_STRING, labels=_STRINGS),
+            }
             jsonschema.validate(item, _object(*head, "spec", **head, spec=spec))
     for pod in pods(objects).values():
         kubernetes.validate(
-            {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "x"}, "spec": pod}, version, strict=True
+            {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "x"}, "spec": pod},
+            version,
+            strict=True,
         )
     names = [(item["kind"], item["metadata"]["name"]) for item in objects]
     assert len(set(names)) == len(names)
 
 
 def test_strict_means_strict() -> None:
-    kubernetes = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    kubernetes = pytest.importorskip(
+        "kubernetes_validate", reason="pip install kubernetes-validate"
+    )
     (service,) = of_kind(rendered(CI["minimal"]), "Service").values()
     service["spec"]["portz"] = []
     with pytest.raises(kubernetes.ValidationError, match="portz"):
@@ -235,14 +264,18 @@ def test_pods_may_do_little(name: str) -> None:
         assert pod["securityContext"]["runAsNonRoot"] is True
         assert pod["securityContext"]["runAsUser"] == 10001
         assert pod["automountServiceAccountToken"] is False
-        assert pod["enableServiceLinks"] is False  # STICKSLIP_PORT=tcp://... would be a wrong setting
+        assert (
+            pod["enableServiceLinks"] is False
+        )  # STICKSLIP_PORT=tcp://... would be a wrong setting
         for container in pod["containers"]:
             security = container["securityContext"]
             assert security["readOnlyRootFilesystem"] is True
             assert security["allowPrivilegeEscalation"] is False
             assert security["capabilities"] == {"drop": ["ALL"]}
             assert {"name": "tmp", "mountPath": "/tmp"} in container["volumeMounts"]
-            assert {mount["name"] for mount in container["volumeMounts"]} <= {item["name"] for item in pod["volumes"]}
+            assert {mount["name"] for mount in container["volumeMounts"]} <= {
+                item["name"] for item in pod["volumes"]
+            }
 
 
 def test_pods_have_the_time_that_a_drain_takes() -> None:
@@ -259,7 +292,11 @@ def commands(name: str) -> Iterator[tuple[str, list[str]]]:
     for pod in pods(rendered(CI[name])).values():
         for container in pod["containers"]:
             if "command" not in container and "args" in container:
-                program = next(module for image, module in images.items() if f"stickslip-{image}" in container["image"])
+                program = next(
+                    module
+                    for image, module in images.items()
+                    if f"stickslip-{image}" in container["image"]
+                )
                 yield program, container["args"]
             elif "args" in container:
                 _, _, line = container["args"][0].partition("python -m ")
@@ -288,7 +325,10 @@ def test_programs_have_the_options_that_they_are_given(name: str) -> None:
 
 def test_ray_is_of_the_version_of_the_image() -> None:
     (cluster,) = of_kind(rendered(CI["ray"]), "RayCluster").values()
-    assert f"ray=={cluster['spec']['rayVersion']}" in (ROOT / "constraints.txt").read_text().splitlines()
+    assert (
+        f"ray=={cluster['spec']['rayVersion']}"
+        in (ROOT / "constraints.txt").read_text().splitlines()
+    )
 
 
 def test_only_who_must_reaches_the_coordinator() -> None:
@@ -344,7 +384,9 @@ STATES: dict[str, set[str]] = {"stickslip_tasks": set(TaskState), "stickslip_job
 
 
 @pytest.mark.parametrize("expression", expressions())
-def test_every_expression_names_metrics_and_labels_that_exist(expression: str, metrics: dict[str, set[str]]) -> None:
+def test_every_expression_names_metrics_and_labels_that_exist(
+    expression: str, metrics: dict[str, set[str]]
+) -> None:
     used = re.findall(r"(stickslip_\w+)\{([^}]*)\}", expression)
     assert len(used) == expression.count("stickslip_") > 0  # each has matchers
     known = {"namespace"}
@@ -352,7 +394,9 @@ def test_every_expression_names_metrics_and_labels_that_exist(expression: str, m
         assert name in metrics
         labels = dict(re.findall(r'(\w+)=~?"([^"]*)"', matchers))
         assert set(labels) <= metrics[name] | {"namespace"}, name
-        assert set(filter(None, labels.get("state", "").split("|"))) <= {str(s) for s in STATES.get(name, ())}
+        assert set(filter(None, labels.get("state", "").split("|"))) <= {
+            str(s) for s in STATES.get(name, ())
+        }
         assert labels.get("outcome", "succeeded") == "succeeded"
         assert "stage" not in labels or labels["stage"] in set(Stage)
         known |= metrics[name]
@@ -362,7 +406,9 @@ def test_every_expression_names_metrics_and_labels_that_exist(expression: str, m
 
 def test_the_dashboard_reaches_its_config_map() -> None:
     config = of_kind(rendered(CI["full"]), "ConfigMap")["dashboard"]
-    assert json.loads(config["data"]["stickslip.json"]) == json.loads((CHART / "files/dashboard.json").read_text())
+    assert json.loads(config["data"]["stickslip.json"]) == json.loads(
+        (CHART / "files/dashboard.json").read_text()
+    )
     places = [
         (panel["gridPos"]["x"], panel["gridPos"]["y"])
         for panel in json.loads(config["data"]["stickslip.json"])["panels"]
@@ -371,7 +417,9 @@ def test_the_dashboard_reaches_its_config_map() -> None:
 
 
 def test_promql_is_sound() -> None:
-    parser = pytest.importorskip("promql_parser", reason="promql-parser is not installed: pip install promql-parser")
+    parser = pytest.importorskip(
+        "promql_parser", reason="promql-parser is not installed: pip install promql-parser"
+    )
     for expression in expressions():
         parser.parse(expression.replace("$__rate_interval", "5m"))
 
@@ -380,9 +428,21 @@ def test_promql_is_sound() -> None:
     ("series", "expected"),
     [
         ({}, 0),
-        ({'stickslip_jobs{state="succeeded"}': 4, 'stickslip_tasks{stage="render",state="succeeded"}': 900}, 0),
+        (
+            {
+                'stickslip_jobs{state="succeeded"}': 4,
+                'stickslip_tasks{stage="render",state="succeeded"}': 900,
+            },
+            0,
+        ),
         ({'stickslip_jobs{state="queued"}': 1}, 200),
-        ({'stickslip_jobs{state="paused"}': 1, 'stickslip_tasks{stage="render",state="pending"}': 900}, 0),
+        (
+            {
+                'stickslip_jobs{state="paused"}': 1,
+                'stickslip_tasks{stage="render",state="pending"}': 900,
+            },
+            0,
+        ),
         (
             {
                 'stickslip_jobs{state="running"}': 1,
@@ -401,11 +461,22 @@ def test_as_many_workers_are_asked_for_as_the_queue_is_long(
     if promtool is None:
         pytest.skip("promtool is not installed: apt-get install prometheus")
     both = [
-        {"series": name.replace("{", f'{{namespace="{NAMESPACE}",pod="{pod}",'), "values": str(value)}
+        {
+            "series": name.replace("{", f'{{namespace="{NAMESPACE}",pod="{pod}",'),
+            "values": str(value),
+        }
         for name, value in series.items()
         for pod in ("coordinator-0", "coordinator-1")  # each reports the same queue
     ]
-    case = {"expr": expressions()[-1], "eval_time": "0m", "exp_samples": [{"labels": "{}", "value": expected}]}
-    (tmp_path / "test.yaml").write_text(yaml.safe_dump({"tests": [{"input_series": both, "promql_expr_test": [case]}]}))
-    done = subprocess.run([promtool, "test", "rules", tmp_path / "test.yaml"], capture_output=True, text=True)
+    case = {
+        "expr": expressions()[-1],
+        "eval_time": "0m",
+        "exp_samples": [{"labels": "{}", "value": expected}],
+    }
+    (tmp_path / "test.yaml").write_text(
+        yaml.safe_dump({"tests": [{"input_series": both, "promql_expr_test": [case]}]})
+    )
+    done = subprocess.run(
+        [promtool, "test", "rules", tmp_path / "test.yaml"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout + done.stderr

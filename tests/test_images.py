@@ -1,11 +1,13 @@
 """Build both images without a registry and without Docker, and make a dataset with what is in them.
 
-    STICKSLIP_BUILD_OPTIONS="--volume=/etc/pip.conf:/etc/pip.conf:ro" pytest -m slow tests/test_images.py -s
+    STICKSLIP_BUILD_OPTIONS="--volume=/etc/pip.conf:/etc/pip.conf:ro" pytest -m slow
+    tests/test_images.py -s
 
-It needs root, buildah and debootstrap. The base image, which is Docker Hub's python:3.11-slim-bookworm elsewhere, is
-made by debootstrap from the first mirror of Debian that apt knows. Options of `buildah build` may follow in the
-variable, such as the places of a mirror of PyPI; nothing of them stays in an image. Programs run as the images' user on
-a root file system that is read-only, as deploy/ runs them. It takes a quarter of an hour, and 12 GB in
+It needs root, buildah and debootstrap. The base image, which is Docker Hub's
+python:3.11-slim-bookworm elsewhere, is made by debootstrap from the first mirror of Debian that apt
+knows. Options of `buildah build` may follow in the variable, such as the places of a mirror of
+PyPI; nothing of them stays in an image. Programs run as the images' user on a root file system that
+is read-only, as deploy/ runs them. It takes a quarter of an hour, and 12 GB in
 STICKSLIP_BUILD_PLACE (/var/tmp).
 """
 
@@ -34,8 +36,12 @@ LIMITS = {"coordinator": 400e6, "worker": 3e9}
 USER = 10001
 PORT = 8799
 
-# What Docker Hub's image has that Debian's packages give, too; headers of Python are for the worker's build.
-PACKAGES = {"coordinator": "python3-venv python-is-python3", "worker": "python3-venv python-is-python3 python3-dev"}
+# What Docker Hub's image has that Debian's packages give, too; headers of Python are for the
+# worker's build.
+PACKAGES = {
+    "coordinator": "python3-venv python-is-python3",
+    "worker": "python3-venv python-is-python3 python3-dev",
+}
 BASE_FILE = """
 FROM scratch
 COPY . /
@@ -44,7 +50,8 @@ RUN apt-get update \\
  && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /usr/share/doc/* /usr/share/locale/* /usr/share/man/*
 """
 
-# Arguments: the root, the data directory, and the command. Ray needs shared memory and pseudo terminals of /dev.
+# Arguments: the root, the data directory, and the command. Ray needs shared memory and pseudo
+# terminals of /dev.
 SANDBOX = """
 set -eu
 root=$1 data=$2 && shift 2
@@ -82,7 +89,9 @@ class Images:
         """Return where the files of an image are; build it when it is asked for first."""
         if name not in self._trees:
             self._make(name)
-            self._trees[name] = Path(self.buildah("mount", self.buildah("from", "--pull-never", name)))
+            self._trees[name] = Path(
+                self.buildah("mount", self.buildah("from", "--pull-never", name))
+            )
         return self._trees[name]
 
     def _make(self, name: str) -> None:
@@ -90,7 +99,15 @@ class Images:
         tree = self._place / "debian"
         if not tree.exists():
             mirror = run("apt-get", "indextargets", "--format", "$(REPO_URI)").split()[0]
-            run("nice", "debootstrap", "--variant=minbase", "--include=ca-certificates", "bookworm", tree, mirror)
+            run(
+                "nice",
+                "debootstrap",
+                "--variant=minbase",
+                "--include=ca-certificates",
+                "bookworm",
+                tree,
+                mirror,
+            )
             (tree / "etc/apt/sources.list").unlink()
             for rest in ("var/cache/apt/archives", "var/lib/apt/lists"):
                 shutil.rmtree(tree / rest)
@@ -107,27 +124,65 @@ class Images:
 
     def size(self, name: str) -> int:
         """Return how large the files of an image are, as `docker images` counts [bytes]."""
-        said = run("du", "--summarize", "--apparent-size", "--block-size=1", "--one-file-system", self.tree(name))
+        said = run(
+            "du",
+            "--summarize",
+            "--apparent-size",
+            "--block-size=1",
+            "--one-file-system",
+            self.tree(name),
+        )
         return int(said.split()[0])
 
     def config(self, name: str) -> dict[str, Any]:
         """Return what is set for containers of an image."""
         self.tree(name)
-        found: dict[str, Any] = json.loads(self.buildah("inspect", "--type=image", name))["OCIv1"]["config"]
+        found: dict[str, Any] = json.loads(self.buildah("inspect", "--type=image", name))["OCIv1"][
+            "config"
+        ]
         return found
 
     def command(self, name: str, data: Path, words: list[str]) -> list[str]:
         """Return the command that runs `words` in an image; without any, its entry point."""
-        isolated = ["unshare", "--mount", "--pid", "--ipc", "--fork", "--kill-child", "sh", "-c", SANDBOX, "sandbox"]
+        isolated = [
+            "unshare",
+            "--mount",
+            "--pid",
+            "--ipc",
+            "--fork",
+            "--kill-child",
+            "sh",
+            "-c",
+            SANDBOX,
+            "sandbox",
+        ]
         environment = [*self.config(name)["Env"], "HOME=/home/stickslip"]
-        return [*isolated, str(self.tree(name)), str(data), "env", "--ignore-environment", *environment, *words]
+        return [
+            *isolated,
+            str(self.tree(name)),
+            str(data),
+            "env",
+            "--ignore-environment",
+            *environment,
+            *words,
+        ]
 
     def entry(self, name: str, *words: str) -> list[str]:
         """Return the entry point of an image, with arguments."""
         return [*self.config(name)["Entrypoint"], *words]
 
     def tidy(self) -> None:
-        subprocess.run(["buildah", "--root", self._place / "storage", "--runroot", self._place / "run", "rm", "--all"])
+        subprocess.run(
+            [
+                "buildah",
+                "--root",
+                self._place / "storage",
+                "--runroot",
+                self._place / "run",
+                "rm",
+                "--all",
+            ]
+        )
         subprocess.run(["umount", "--quiet", self._place / "storage" / "overlay"])
         shutil.rmtree(self._place)
 
@@ -182,7 +237,11 @@ def test_the_worker_says_what_it_is(images: Images, data: Path) -> None:
     assert set(said["builds"]) == set(KINDS)
     written = run(*images.command("worker", data, ["cat", "/usr/share/doc/stickslip/builds.json"]))
     assert json.loads(written) == said
-    blender = ["/opt/stickslip/.venv-blender/bin/python", "-c", "import bpy; print(bpy.app.version_string)"]
+    blender = [
+        "/opt/stickslip/.venv-blender/bin/python",
+        "-c",
+        "import bpy; print(bpy.app.version_string)",
+    ]
     assert run(*images.command("worker", data, blender)).splitlines()[-1].startswith("5.0")
 
 
@@ -191,14 +250,22 @@ def test_the_coordinator_has_only_what_it_needs(images: Images, data: Path) -> N
     assert json.loads(said) == json.loads((ROOT / "docs" / "openapi.json").read_text())
     names = "ray", "torch", "bpy", "pip", "stickslip_workers", "stickslip_sim_core"
     asked = f"from importlib.util import find_spec; print([name for name in {names} if find_spec(name)])"
-    assert run(*images.command("coordinator", data, ["/opt/stickslip/.venv/bin/python", "-c", asked])) == "[]"
+    assert (
+        run(*images.command("coordinator", data, ["/opt/stickslip/.venv/bin/python", "-c", asked]))
+        == "[]"
+    )
 
 
 @contextmanager
-def started(images: Images, name: str, data: Path, *words: str) -> Iterator["subprocess.Popen[bytes]"]:
+def started(
+    images: Images, name: str, data: Path, *words: str
+) -> Iterator["subprocess.Popen[bytes]"]:
     with (data.parent / f"{name}.log").open("wb") as log:
         process = subprocess.Popen(
-            images.command(name, data, images.entry(name, *words)), stdout=log, stderr=log, start_new_session=True
+            images.command(name, data, images.entry(name, *words)),
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
         )
     try:
         yield process
@@ -218,8 +285,18 @@ def test_both_make_a_dataset(images: Images, data: Path) -> None:
             return None
         return answer.json() if answer.is_success else None
 
-    spec = {"kind": "rod_hang", "axes": {"gamma": [300, 900], "phi0": 0.2, "phi1": [6, 12]}, "quality": "draft"}
-    words = ["dispatch", f"--url={url}", "--store=/data/store", "--name=image", "--key-file=/data/worker-key"]
+    spec = {
+        "kind": "rod_hang",
+        "axes": {"gamma": [300, 900], "phi0": 0.2, "phi1": [6, 12]},
+        "quality": "draft",
+    }
+    words = [
+        "dispatch",
+        f"--url={url}",
+        "--store=/data/store",
+        "--name=image",
+        "--key-file=/data/worker-key",
+    ]
     with started(images, "coordinator", data, f"--port={PORT}") as coordinator:
         wait_for("the coordinator", lambda: job_when("/readyz"), 60)
         assert coordinator.poll() is None

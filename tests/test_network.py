@@ -2,7 +2,8 @@
 
     pytest -m slow tests/test_network.py -s
 
-Each has a worker with a Ray of its own, or they are a Ray cluster as the Helm chart makes it. See `machines`.
+Each has a worker with a Ray of its own, or they are a Ray cluster as the Helm chart makes it. See
+`machines`.
 """
 
 import os
@@ -39,11 +40,16 @@ def test_work_goes_on_whatever_happens_to_machines(
         """Expect that the coordinator notices the loss of a machine, and that others do its work."""
         held = lab.held(name)
         ran = [seq for seq, state in held.items() if state == "running"]
-        say(f"{how}: its {len(held)} tasks are free", lab.wait(f"the loss of {name}", lambda: not lab.held(name)))
+        say(
+            f"{how}: its {len(held)} tasks are free",
+            lab.wait(f"the loss of {name}", lambda: not lab.held(name)),
+        )
         say(f"{how}: what ran on it is done", lab.wait("its tasks", lambda: lab.left(ran) == 0))
 
     with ExitStack() as stack:
-        one, other, late = (Machine(name, number, hub, stack) for number, name in enumerate("abc", 11))
+        one, other, late = (
+            Machine(name, number, hub, stack) for number, name in enumerate("abc", 11)
+        )
         for machine in (one, other):
             machine.start(dispatch(machine.name, tmp_path), tmp_path / f"{machine.name}.log")
         lab.wait("work of both", lambda: all(lab.done(name) > 3 for name in "ab"))
@@ -53,14 +59,20 @@ def test_work_goes_on_whatever_happens_to_machines(
         lost("a", "killed")
 
         late.start(dispatch("c", tmp_path), tmp_path / "c.log")
-        say("late: its first task is done", lab.wait("work of the late one", lambda: lab.done("c") > 0))
+        say(
+            "late: its first task is done",
+            lab.wait("work of the late one", lambda: lab.done("c") > 0),
+        )
 
         lab.wait("a task that runs", lambda: "running" in lab.held("b").values())
         other.plug("down")
         lost("b", "cable pulled")
         before = lab.done("b")
         other.plug("up")
-        say("cable plugged in: its next task is done", lab.wait("its return", lambda: lab.done("b") > before))
+        say(
+            "cable plugged in: its next task is done",
+            lab.wait("its return", lambda: lab.done("b") > before),
+        )
 
         states = lab.finished()
     assert states == ["succeeded"] * len(states)
@@ -72,27 +84,41 @@ def test_work_goes_on_whatever_happens_to_machines(
 
 def ray_options(group: dict[str, Any]) -> list[str]:
     """Return the options that KubeRay makes of a group's parameters."""
-    return [f"--{name}={value}" if value != "true" else f"--{name}" for name, value in group["rayStartParams"].items()]
+    return [
+        f"--{name}={value}" if value != "true" else f"--{name}"
+        for name, value in group["rayStartParams"].items()
+    ]
 
 
 def test_nodes_of_the_charts_ray_cluster_come_and_go(
-    hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    hub: int,
+    lab: Lab,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """What KubeRay would start: a head, two nodes that work, and the dispatcher, which joins them.
 
-    Then a node comes late, one has other builds, one is killed, one freezes, one is cut off, and the head is killed.
+    Then a node comes late, one has other builds, one is killed, one freezes, one is cut off, and
+    the head is killed.
     """
-    helm = pytest.importorskip("helm_python", reason="Helm is not installed: pip install helm-python-sdk")
+    helm = pytest.importorskip(
+        "helm_python", reason="Helm is not installed: pip install helm-python-sdk"
+    )
     values = {"store": {"url": BUCKET}, "ray": {"enabled": True, "maxReplicas": 2, "slots": 1}}
     with helm.Chart.load(CHART) as chart:
         text = chart.render(values, name="demo", namespace="lab")["stickslip/templates/ray.yaml"]
     cluster, dispatcher = (item for item in yaml.safe_load_all(text) if item is not None)
     ray = str(Path(sys.executable).with_name("ray"))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", raising=False)  # other tests want loopback: no pod does
+    monkeypatch.delenv(
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", raising=False
+    )  # other tests want loopback: no pod does
     monkeypatch.setenv("RAY_AUTH_MODE", cluster["spec"]["authOptions"]["mode"])
     monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: other tests beside would starve the nodes
+    monkeypatch.setenv(
+        "RAY_worker_niceness", "0"
+    )  # 15 by default: other tests beside would starve the nodes
     container = dispatcher["spec"]["template"]["spec"]["containers"][0]
     script = re.sub(r"--url=\S+", f"--url={URL}", container["args"][0])
     script = script.replace("/etc/stickslip/worker-key", str(tmp_path / "worker-key"))
@@ -105,7 +131,9 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
 
     with ExitStack() as stack:
         names = ("head", "w1", "w2", "driver", "late", "foreign")
-        machines = {name: Machine(name, number, hub, stack) for number, name in enumerate(names, 31)}
+        machines = {
+            name: Machine(name, number, hub, stack) for number, name in enumerate(names, 31)
+        }
         address = f"{machines['head'].address}:6379"
         monkeypatch.setenv("RAY_ADDRESS", address)
 
@@ -113,8 +141,19 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
             here = f"--node-ip-address={machines[name].address}"
             command = [ray, "start", "--block", here, f"--address={address}", *ray_options(group)]
             if name == "head":
-                command = ["env", *(f"{item['name']}={item['value']}" for item in pod["env"]), ray, "start", "--block"]
-                command += [here, "--head", "--port=6379", *ray_options(cluster["spec"]["headGroupSpec"])]
+                command = [
+                    "env",
+                    *(f"{item['name']}={item['value']}" for item in pod["env"]),
+                    ray,
+                    "start",
+                    "--block",
+                ]
+                command += [
+                    here,
+                    "--head",
+                    "--port=6379",
+                    *ray_options(cluster["spec"]["headGroupSpec"]),
+                ]
             elif name == "driver":
                 command = [*container["command"], script.replace("ray start", f"ray start {here}")]
             elif name == "foreign":
@@ -128,7 +167,9 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
                 print(f"    {what:65} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
         def lose(name: str, how: Callable[[], None], what: str, limit: float) -> None:
-            """Lose a node that is at work, and expect that all that the dispatcher had then is done."""
+            """Lose a node that is at work, and expect that all that the dispatcher had then is
+            done.
+            """
             lab.wait(f"a task on {name}", machines[name].is_at_work)
             held = lab.held("demo-ray")
             assert held
@@ -143,7 +184,9 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
         start("foreign")
         said = "node foreign (10.213.0.36) has other builds"
         expect(
-            "a node has other builds: it is named", lambda: said in lab.worker("demo-ray")["condition"]["reason"], 40
+            "a node has other builds: it is named",
+            lambda: said in lab.worker("demo-ray")["condition"]["reason"],
+            40,
         )
         lose("w1", machines["w1"].kill, "a node is killed", 15)
         lose("w2", machines["w2"].freeze, "a node freezes", 40)
@@ -221,9 +264,15 @@ print(sum(node.state == 0 for node in nodes.values()))
 
 
 def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
-    hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    hub: int,
+    lab: Lab,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Ray's autoscaler, version 2, with nodes that are processes of one machine, and without a token."""
+    """Ray's autoscaler, version 2, with nodes that are processes of one machine, and without a
+    token.
+    """
     head = "f" * 51 + "0" * 5
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", raising=False)
@@ -244,13 +293,17 @@ def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
         config = tmp_path / "autoscaling.yaml"
         config.write_text(AUTOSCALING.format(address=address, head=head))
         ray = f"ray start --head --node-ip-address={machine.address} --port=6379 --num-cpus=0 --include-dashboard=false"
-        ray += f" --object-store-memory=134217728 --disable-usage-stats --autoscaling-config={config}"
+        ray += (
+            f" --object-store-memory=134217728 --disable-usage-stats --autoscaling-config={config}"
+        )
         words = [*dispatch("scaled", tmp_path), "--ray-address", address]
         words = [word for word in words if word not in ("--max-cpus", "1")]
         machine.start(["sh", "-c", f'{ray} && exec "$@"', "sh", *words], tmp_path / "head.log")
 
         wait_for(
-            "the dispatcher", lambda: lab.worker("scaled").get("condition", {}).get("state") == "ready" or None, 240
+            "the dispatcher",
+            lambda: lab.worker("scaled").get("condition", {}).get("state") == "ready" or None,
+            240,
         )
 
         def nodes() -> int:
@@ -267,6 +320,9 @@ def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
         wait_for("no nodes", lambda: True if nodes() == 0 else None, 120)
         with capsys.disabled():
             down, load = time.monotonic() - begin, os.getloadavg()[0]
-            print(f"    0 -> 2 nodes after {up:.1f} s, 2 -> 0 {down:.1f} s after the job, load {load:.1f}", flush=True)
+            print(
+                f"    0 -> 2 nodes after {up:.1f} s, 2 -> 0 {down:.1f} s after the job, load {load:.1f}",
+                flush=True,
+            )
     assert states == ["succeeded"]
     assert lab.faults() == []

@@ -1,4 +1,6 @@
-"""A scene of a user, from its file to trajectories: the command line, the workers' program and the core."""
+"""A scene of a user, from its file to trajectories: the command line, the workers' program and the
+core.
+"""
 
 import json
 import subprocess
@@ -55,7 +57,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def certificate(**change: Any) -> Certificate:
-    """Return a certificate that vouches for the preset of the scene with this build, but for what is changed."""
+    """Return a certificate that vouches for the preset of the scene with this build, but for what
+    is changed.
+    """
     curve = CurveReport(parameters={}, x=(1.0,), measured=(1.0,), master=(1.0,), errors=(0.0,))
     protocols = tuple(
         ProtocolReport(
@@ -72,7 +76,14 @@ def certificate(**change: Any) -> Certificate:
         for name in change.pop("names", SCENE_PROTOCOLS)
     )
     given = {"preset": "fast", "sim_core": solver_build(SOLVER), "extent": "full"} | change
-    return Certificate(numbers={}, protocol_sources="b" * 64, protocols=protocols, passed=True, environment={}, **given)
+    return Certificate(
+        numbers={},
+        protocol_sources="b" * 64,
+        protocols=protocols,
+        passed=True,
+        environment={},
+        **given,
+    )
 
 
 @pytest.mark.real
@@ -80,10 +91,17 @@ def test_from_the_file_to_trajectories(folder: Path) -> None:
     program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
     refused = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
     assert refused.returncode == 1
-    assert "there is no certificate of preset fast; `stickslip certify --preset fast` makes one" in refused.stderr
+    assert (
+        "there is no certificate of preset fast; `stickslip certify --preset fast` makes one"
+        in refused.stderr
+    )
     assert not (folder / "out").exists()
     ended = subprocess.run(
-        [*program, "--allow-uncertified", "--obj"], cwd=folder, capture_output=True, text=True, check=False
+        [*program, "--allow-uncertified", "--obj"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert ended.returncode == 0, ended.stderr
     assert "NOT certified: there is no certificate" in ended.stdout + ended.stderr
@@ -100,7 +118,9 @@ def test_from_the_file_to_trajectories(folder: Path) -> None:
     assert forces[-1, 0, 0, 2] == pytest.approx(weight, rel=0.02)
     lines = (folder / "out" / "cloth" / "0003.obj").read_text().splitlines()
     assert [float(word) for word in lines[0].split()[1:]] == pytest.approx(path[3, 0], abs=1e-7)
-    again = subprocess.run([*program, "--allow-uncertified"], cwd=folder, capture_output=True, text=True, check=False)
+    again = subprocess.run(
+        [*program, "--allow-uncertified"], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert again.returncode == 1
     assert "out: must not exist, and out does" in again.stderr
 
@@ -114,14 +134,18 @@ def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path)
     ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     said = " ".join(ended.stderr.split())
-    assert "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in said
+    assert (
+        "sheets.cloth.mesh.cells.0: Input should be greater than or equal to 1, and it is 0" in said
+    )
 
 
 def test_a_scene_is_checked_and_its_cost_named() -> None:
     """The cost is an interval that has the median of the samples that were measured."""
     said = json.loads(CliRunner().invoke(app, ["scene", "check", "peg", "--json"]).stdout)
     assert said["axes"]["speed"]["values"] == "-6 to 6 [rad/s]"
-    assert {"cloth.positions", "cloth.contact", "mu", "fabric"} <= {array["name"] for array in said["arrays"]}
+    assert {"cloth.positions", "cloth.contact", "mu", "fabric"} <= {
+        array["name"] for array in said["arrays"]
+    }
     cost = said["cost"]
     assert (cost["vertices"], cost["frames"]) == (441, 121)
     least, most = cost["cpu_seconds_a_sample"]
@@ -143,7 +167,9 @@ def test_a_scene_is_checked_and_its_cost_named() -> None:
     ],
 )
 def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: str) -> None:
-    found = why_uncertified(spec_of(Scene.model_validate(SCENE)), certificate(**change), solver_build(SOLVER))
+    found = why_uncertified(
+        spec_of(Scene.model_validate(SCENE)), certificate(**change), solver_build(SOLVER)
+    )
     assert found.startswith(why)
     assert bool(found) == bool(why)
 
@@ -152,8 +178,16 @@ def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: st
     ("place", "value", "message"),
     [
         ("turn", [0, 0.5, 0], "surface"),
-        ("holders", {"hand": {"low": [5, 5], "high": [6, 6]}}, "sheets.cloth.holders.hand: must hold a vertex"),
-        ("holders", {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"}, "sheets.cloth.holders.b: must not hold"),
+        (
+            "holders",
+            {"hand": {"low": [5, 5], "high": [6, 6]}},
+            "sheets.cloth.holders.hand: must hold a vertex",
+        ),
+        (
+            "holders",
+            {n: {"low": [0, 0], "high": [1, 1]} for n in "ab"},
+            "sheets.cloth.holders.b: must not hold",
+        ),
     ],
 )
 def test_a_scene_that_cannot_be_is_not_valid(place: str, value: Any, message: str) -> None:

@@ -47,11 +47,16 @@ def test_a_scene_is_drawn_before_it_is_simulated(tmp_path: Path, own: bool) -> N
     out = tmp_path / "pictures"
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     given = str(scene) if own else "turning-ball"
-    subprocess.run([sys.executable, "-m", "stickslip_services.cli", "scene", "preview", given, str(out)], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "stickslip_services.cli", "scene", "preview", given, str(out)],
+        check=True,
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < CPU_SECONDS
     views = ["above"] if own else ["front", "high", "side"]
-    assert sorted(path.name for path in out.iterdir()) == sorted([*(f"{view}.png" for view in views), "motion.webp"])
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        [*(f"{view}.png" for view in views), "motion.webp"]
+    )
     with Image.open(out / "motion.webp") as clip:
         assert clip.size == (320 * len(views), 320)
         first = np.asarray(clip.convert("RGB"), dtype=float)

@@ -1,4 +1,6 @@
-"""What a release needs: one version, licences, complete metadata, and wheels that install into a bare environment."""
+"""What a release needs: one version, licences, complete metadata, and wheels that install into a
+bare environment.
+"""
 
 import os
 import resource
@@ -19,16 +21,27 @@ ROOT = Path(__file__).parents[1]
 VERSION = (ROOT / "VERSION").read_text().strip()
 DISTRIBUTIONS = ("schemas", "sim_core", "services", "training", "workers", "workers/blender")
 PURE = ("schemas", "services", "training", "workers")
-PROJECTS = {name: tomllib.loads((ROOT / name / "pyproject.toml").read_text()) for name in DISTRIBUTIONS}
+PROJECTS = {
+    name: tomllib.loads((ROOT / name / "pyproject.toml").read_text()) for name in DISTRIBUTIONS
+}
 
 
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_every_distribution_has_complete_metadata(name: str) -> None:
     project = PROJECTS[name]["project"]
     assert project["dynamic"] == ["version"]
-    assert project.keys() >= {"description", "readme", "license", "license-files", "requires-python", "urls"}
+    assert project.keys() >= {
+        "description",
+        "readme",
+        "license",
+        "license-files",
+        "requires-python",
+        "urls",
+    }
     assert (ROOT / name / project["readme"]).is_file()
-    assert list((ROOT / name).glob("src/*/py.typed")) or list((ROOT / name).glob("python/*/py.typed"))
+    assert list((ROOT / name).glob("src/*/py.typed")) or list(
+        (ROOT / name).glob("python/*/py.typed")
+    )
 
 
 @pytest.mark.parametrize("name", ["sim_core", *PURE])
@@ -40,9 +53,15 @@ def test_every_distribution_carries_the_licence(name: str) -> None:
 def test_our_distributions_fit_together(name: str) -> None:
     project = PROJECTS[name]["project"]
     extras = [text for texts in project.get("optional-dependencies", {}).values() for text in texts]
-    ours = [Requirement(text) for text in (*project["dependencies"], *extras) if text.startswith("stickslip-")]
+    ours = [
+        Requirement(text)
+        for text in (*project["dependencies"], *extras)
+        if text.startswith("stickslip-")
+    ]
     for requirement in ours:
-        assert requirement.specifier.contains(Version(VERSION)), f"{requirement} does not admit {VERSION}"
+        assert requirement.specifier.contains(Version(VERSION)), (
+            f"{requirement} does not admit {VERSION}"
+        )
         assert str(requirement.specifier), f"{name} must state a range of {requirement.name}"
 
 
@@ -51,7 +70,9 @@ def test_the_version_is_written_once() -> None:
     chart = yaml.safe_load((ROOT / "deploy/helm/stickslip/Chart.yaml").read_text())
     assert (chart["version"], chart["appVersion"]) == (VERSION, VERSION)
     values = yaml.safe_load((ROOT / "deploy/helm/stickslip/values.yaml").read_text())
-    assert {values[part]["image"].rpartition(":")[2] for part in ("coordinator", "worker")} == {VERSION}
+    assert {values[part]["image"].rpartition(":")[2] for part in ("coordinator", "worker")} == {
+        VERSION
+    }
     for name in DISTRIBUTIONS:
         text = (ROOT / name / "pyproject.toml").read_text()
         assert f'version = "{VERSION}"' not in text
@@ -60,7 +81,11 @@ def test_the_version_is_written_once() -> None:
 @pytest.mark.parametrize("environment", [".venv", ".venv-blender"])
 def test_everything_that_is_installed_admits_the_python_of_debian_12(environment: str) -> None:
     packages = list(distributions(path=[str(ROOT / environment / "lib/python3.11/site-packages")]))
-    needs = {one.name: one.metadata["Requires-Python"] for one in packages if one.metadata["Requires-Python"]}
+    needs = {
+        one.name: one.metadata["Requires-Python"]
+        for one in packages
+        if one.metadata["Requires-Python"]
+    }
     assert len(needs) > 20
     assert {name: need for name, need in needs.items() if "3.11.2" not in SpecifierSet(need)} == {}
 
@@ -72,7 +97,9 @@ PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = tmp_path_factory.mktemp("wheels")
     for name in (*PURE, "sim_core"):
-        subprocess.run([*PIP, "wheel", "--no-deps", "--wheel-dir", str(found), str(ROOT / name)], check=True)
+        subprocess.run(
+            [*PIP, "wheel", "--no-deps", "--wheel-dir", str(found), str(ROOT / name)], check=True
+        )
     return found
 
 
@@ -82,8 +109,19 @@ def programs_of(wheels: Path, place: Path, *names: str) -> Path:
     Constraints pin what the index resolves; pip's own configuration says where it is.
     """
     venv.create(place, with_pip=False)
-    install = [*PIP, "--python", str(place / "bin" / "python"), "install", "--find-links", str(wheels)]
-    subprocess.run([*install, "--constraint", str(ROOT / "constraints.txt"), *names], check=True, cwd=place.parent)
+    install = [
+        *PIP,
+        "--python",
+        str(place / "bin" / "python"),
+        "install",
+        "--find-links",
+        str(wheels),
+    ]
+    subprocess.run(
+        [*install, "--constraint", str(ROOT / "constraints.txt"), *names],
+        check=True,
+        cwd=place.parent,
+    )
     return place / "bin"
 
 
@@ -95,7 +133,14 @@ def test_the_client_is_15_packages_of_60_megabytes(wheels: Path, tmp_path: Path)
     programs = programs_of(wheels, place, "stickslip")
     packages = list(place.glob("lib/python3*/site-packages/*.dist-info"))
     assert len(packages) <= 15, packages
-    assert sum(file.stat().st_size for file in place.rglob("*") if file.is_file() and not file.is_symlink()) < 60e6
+    assert (
+        sum(
+            file.stat().st_size
+            for file in place.rglob("*")
+            if file.is_file() and not file.is_symlink()
+        )
+        < 60e6
+    )
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     subprocess.run([str(programs / "stickslip"), "--help"], check=True, stdout=subprocess.DEVNULL)
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before < 0.3
@@ -109,9 +154,13 @@ def test_wheels_install_into_a_bare_environment(wheels: Path, tmp_path: Path) ->
     programs = programs_of(wheels, place, "stickslip[arrays,server,train]", "stickslip-sim-core")
     bare = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     for command in ("stickslip", "stickslip-train"):
-        done = subprocess.run([str(programs / command), "--help"], capture_output=True, text=True, env=bare)
+        done = subprocess.run(
+            [str(programs / command), "--help"], capture_output=True, text=True, env=bare
+        )
         assert done.returncode == 0, done.stderr
-    version = subprocess.run([str(programs / "stickslip"), "--version"], capture_output=True, text=True, env=bare)
+    version = subprocess.run(
+        [str(programs / "stickslip"), "--version"], capture_output=True, text=True, env=bare
+    )
     assert version.stdout.strip() == f"stickslip {VERSION}"
     code = "import stickslip_sim_core; from stickslip_sim_core import _sim_core; print(_sim_core.__file__)"
     python = [str(programs / "python"), "-c", code]

@@ -1,4 +1,6 @@
-"""The measured numbers: every file of `benchmarks/results/` is complete, and docs/measurements.md links files."""
+"""The measured numbers: every file of `benchmarks/results/` is complete, and docs/measurements.md
+links files.
+"""
 
 import json
 import re
@@ -15,7 +17,10 @@ COMMIT = r"[0-9a-f]{7,40}|studies-\d+"
 def test_a_result_has_its_origin_and_its_numbers(path: Path) -> None:
     result = json.loads(path.read_text())
     assert result.keys() - {"records"} == {"what", "command", "commit", "conditions", "rows"}
-    assert all(isinstance(result[key], str) and result[key] for key in ("what", "command", "commit", "conditions"))
+    assert all(
+        isinstance(result[key], str) and result[key]
+        for key in ("what", "command", "commit", "conditions")
+    )
     assert result["rows"]
     for row in result["rows"]:
         assert row.keys() - {"commit"}

@@ -1,4 +1,6 @@
-"""A scene of a user on real parts: REST, two dispatchers, a bucket, Blender, a training batch; and what runs again."""
+"""A scene of a user on real parts: REST, two dispatchers, a bucket, Blender, a training batch; and
+what runs again.
+"""
 
 import copy
 import subprocess
@@ -11,7 +13,9 @@ import httpx
 import pytest
 from harness import STICKSLIP, Service, read_arrays, wait_for
 
-pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+pytest.importorskip(
+    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+)
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 from stickslip_testing.s3 import make_bucket, s3_proxy, variables
@@ -29,7 +33,12 @@ SCENE: dict[str, Any] = {
     "parameters": {
         "mu": {"low": 0, "high": 2, "sets": ["friction.block.cloth"]},
         "fabric": {"sets": ["sheets.cloth.material"]},
-        "pull": {"unit": "m", "low": 0, "high": 0.05, "sets": ["bodies.block.motion.keys.1.move.0"]},
+        "pull": {
+            "unit": "m",
+            "low": 0,
+            "high": 0.05,
+            "sets": ["bodies.block.motion.keys.1.move.0"],
+        },
     },
     "sheets": {
         "cloth": {
@@ -40,7 +49,10 @@ SCENE: dict[str, Any] = {
     },
     "bodies": {
         "floor": {"type": "plane"},
-        "block": {"type": "mesh", "motion": {"keys": [{"time": 0}, {"time": 0.3, "move": [0.01, 0, 0]}]}},
+        "block": {
+            "type": "mesh",
+            "motion": {"keys": [{"time": 0}, {"time": 0.3, "move": [0.01, 0, 0]}]},
+        },
     },
     "friction": [{"between": ["cloth", "block"], "mu": 0.5}],
     "default_friction": 0.4,
@@ -51,7 +63,11 @@ def spec(file: str, **axes: Any) -> dict[str, Any]:
     """Return a spec of the scene, whose block is an uploaded file."""
     scene = copy.deepcopy(SCENE)
     scene["bodies"]["block"]["file"] = file
-    varied = {"mu": [0.2, 0.8], "fabric": ["gray-interlock", "camel-ponte-roma"], "pull": [0.0, 0.02]}
+    varied = {
+        "mu": [0.2, 0.8],
+        "fabric": ["gray-interlock", "camel-ponte-roma"],
+        "pull": [0.0, 0.02],
+    }
     return {
         "kind": "cloth_scene",
         "scene": scene,
@@ -72,7 +88,17 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service
         running = Service(tmp_path / "data", "--store", "s3://lab/one")
         try:
             running.start()
-            words = ["dispatch", "--url", running.url, "--store", "s3://lab/one", "--name", "second", "--max-cpus", "1"]
+            words = [
+                "dispatch",
+                "--url",
+                running.url,
+                "--store",
+                "s3://lab/one",
+                "--name",
+                "second",
+                "--max-cpus",
+                "1",
+            ]
             words += ["--key-file", str(running.data / "worker-key")]
             second = subprocess.Popen([sys.executable, "-m", "stickslip_workers", *words])
             try:
@@ -95,7 +121,10 @@ def upload(service: Service, height: float) -> str:
 
 
 def run_job(service: Service, given: dict[str, Any], busy: set[str]) -> dict[str, Any]:
-    """Run a job to its end and return it; put the names of the dispatchers that are seen at work into `busy`."""
+    """Run a job to its end and return it.
+
+    Put the names of the dispatchers that are seen at work into `busy`.
+    """
     job = service.submit(given)
 
     def probe() -> dict[str, Any] | None:
@@ -127,7 +156,9 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     assert ran(job) == {"simulate": 8, "render": 8, "pack": 1, "publish": 1}
     pulled = tmp_path / "pulled"
     version = job["dataset"]["dataset"]
-    subprocess.run([STICKSLIP, "pull", version, pulled, "--url", service.url], check=True, capture_output=True)
+    subprocess.run(
+        [STICKSLIP, "pull", version, pulled, "--url", service.url], check=True, capture_output=True
+    )
     subprocess.run([STICKSLIP, "verify", pulled], check=True, capture_output=True)
     arrays = read_arrays(pulled)
     assert arrays["valid"].all()

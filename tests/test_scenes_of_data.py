@@ -1,4 +1,6 @@
-"""Scenes of data in the solver: each built-in one, and what the language says about holders, starts and bodies."""
+"""Scenes of data in the solver: each built-in one, and what the language says about holders, starts
+and bodies.
+"""
 
 import ast
 import re
@@ -17,7 +19,10 @@ from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 from stickslip_sim_core.scenes import cloth_scene
 from stickslip_testing.worker import BUILDS
 
-SHEET = {"material": "gray-interlock", "mesh": {"type": "grid", "size": [0.06, 0.06], "cells": [4, 4]}}
+SHEET = {
+    "material": "gray-interlock",
+    "mesh": {"type": "grid", "size": [0.06, 0.06], "cells": [4, 4]},
+}
 WEIGHT = fabric("gray-interlock").density * 0.06**2 * GRAVITY
 
 
@@ -36,7 +41,9 @@ def ran(**scene: Any) -> ClothRun:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if any(load_scene(name).files()) else pytest.mark.physics)
+        pytest.param(
+            name, marks=pytest.mark.slow if any(load_scene(name).files()) else pytest.mark.physics
+        )
         for name in scene_names()
     ],  # meshes of files cannot be made coarser
 )
@@ -51,7 +58,10 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
         if given.mesh.type == "grid"
     }
     length = {"end.at_most" if scene.end else "duration": 2.0 / scene.frame_rate}
-    looks = {"texture": "dots", "viewpoint": next(iter(getattr(scene.looks.cameras, "keys", lambda: ["front"])()))}
+    looks = {
+        "texture": "dots",
+        "viewpoint": next(iter(getattr(scene.looks.cameras, "keys", lambda: ["front"])())),
+    }
     spec = job_spec_adapter.validate_python(
         {
             "kind": "cloth_scene",
@@ -72,14 +82,30 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
         if layout.name in made:
             assert np.shape(made[layout.name]) == tuple(layout.shape), layout.name
     missing = {layout.name for layout in spec.arrays()} - set(made)
-    assert not {name for name in missing if "." in name or name.startswith(("holder", "body", "contact"))}, missing
+    assert not {
+        name for name in missing if "." in name or name.startswith(("holder", "body", "contact"))
+    }, missing
 
 
 def test_no_code_knows_the_name_of_a_scene() -> None:
-    """Names stand in the file's name alone: what a program does with a scene follows from its document."""
+    """Names stand in the file's name alone: what a program does with a scene follows from its
+    document.
+    """
     root, names = Path(__file__).parents[1], set(scene_names())
-    folders = ("schemas/src", "services/src", "workers", "training/src", "sim_core/python", "sim_core/src")
-    sources = [path for folder in folders for path in (root / folder).rglob("*.*") if "tests" not in path.parts]
+    folders = (
+        "schemas/src",
+        "services/src",
+        "workers",
+        "training/src",
+        "sim_core/python",
+        "sim_core/src",
+    )
+    sources = [
+        path
+        for folder in folders
+        for path in (root / folder).rglob("*.*")
+        if "tests" not in path.parts
+    ]
     knowing = []
     for path in sources:
         if path.suffix == ".py":
@@ -101,12 +127,19 @@ class TestLanguage:
         run = ran(sheets=sheets, bodies={"floor": {"type": "plane"}}, duration=0.5, frame_rate=10)
         assert run.record["contact_force"].shape == (6, 2, 3, 3)  # frame, sheet, (floor, a, b), xyz
         z = run.record["contact_force"][-1, :, :, 2]
-        assert z == pytest.approx(np.array([[2, 0, -1], [0, 1, 0]]) * WEIGHT, rel=2e-3, abs=1e-3 * WEIGHT)
+        assert z == pytest.approx(
+            np.array([[2, 0, -1], [0, 1, 0]]) * WEIGHT, rel=2e-3, abs=1e-3 * WEIGHT
+        )
         assert set(np.unique(run.record["b.contact"][-1])) <= {1, 2}
         assert not run.record["b.contact"][0].any()
 
-    def test_frames_within_a_step_do_not_cross_where_its_ends_do_not(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A cloth is thrown on a peg; a cubic between the ends of a step reaches through a fold that it hits."""
+    def test_frames_within_a_step_do_not_cross_where_its_ends_do_not(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A cloth is thrown on a peg.
+
+        A cubic between the ends of a step reaches through a fold that it hits.
+        """
         document = load_scene("peg").model_dump(mode="json") | {"duration": 0.6, "frame_rate": 500}
         document["sheets"]["cloth"]["mesh"]["cells"] = [8, 8]
         made = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
@@ -114,14 +147,21 @@ class TestLanguage:
         assert run.valid, run.reason
         assert not run.self_intersections.any()
         smooth = Cloth.positions_at
-        monkeypatch.setattr(Cloth, "positions_at", lambda cloth, time, straight=False: smooth(cloth, time))
+        monkeypatch.setattr(
+            Cloth, "positions_at", lambda cloth, time, straight=False: smooth(cloth, time)
+        )
         assert made.run().code == "crossings"
 
     def test_a_release_lets_go_without_a_kick(self) -> None:
         """A sheet thrown upward flies on as it was moved: the mean of z falls by g t^2/2."""
         keys = [{"time": 0}, {"time": 0.5, "move": [0, 0, 1]}]
         holder = {"vertices": list(range(24)), "grasp": [0, 0.25], "motion": {"keys": keys}}
-        run = ran(sheets={"a": SHEET | {"holders": {"hand": holder}}}, duration=0.5, frame_rate=20, preset="certified")
+        run = ran(
+            sheets={"a": SHEET | {"holders": {"hand": holder}}},
+            duration=0.5,
+            frame_rate=20,
+            preset="certified",
+        )
         z, t = run.positions[:, :24, 2].mean(axis=1), run.times[5:] - 0.25
         assert z[5] == pytest.approx(0.5, abs=1e-9)
         assert z[5:] == pytest.approx(0.5 + 3.0 * t - 0.5 * GRAVITY * t**2, abs=8e-3)
@@ -131,7 +171,12 @@ class TestLanguage:
     def test_a_grasp_takes_vertices_where_they_are(self) -> None:
         """A sheet falls, is caught at a corner, and is lifted by it."""
         keys = [{"time": 0}, {"time": 0.1}, {"time": 1, "move": [0, 0, 0.05]}]
-        hand = {"low": [0.029, 0.029], "high": [0.03, 0.03], "grasp": [0.1, 100], "motion": {"keys": keys}}
+        hand = {
+            "low": [0.029, 0.029],
+            "high": [0.03, 0.03],
+            "grasp": [0.1, 100],
+            "motion": {"keys": keys},
+        }
         run = ran(sheets={"a": SHEET | {"holders": {"hand": hand}}}, duration=2.0, frame_rate=20)
         caught = run.positions[2, -1]
         assert caught[2] == pytest.approx(-0.5 * GRAVITY * 0.1**2, abs=5e-3)
@@ -141,7 +186,12 @@ class TestLanguage:
     @pytest.mark.parametrize(("tilt", "slips"), [(0.9, False), (1.1, True)])
     def test_a_slab_that_tilts_lets_go_at_mu(self, tilt: float, slips: bool) -> None:
         keys = [{"time": 0}, {"time": 2, "turn": [0, float(np.arctan(tilt * 0.5)), 0]}]
-        slab = {"type": "box", "size": [1, 1, 0.1], "origin": [0, 0, -0.05], "motion": {"keys": keys}}
+        slab = {
+            "type": "box",
+            "size": [1, 1, 0.1],
+            "origin": [0, 0, -0.05],
+            "motion": {"keys": keys},
+        }
         run = ran(sheets={"a": SHEET}, bodies={"slab": slab}, duration=2.5, frame_rate=4)
         pose = run.record["body_pose"][-1, 0]
         along = (run.positions[-1] - pose[:, 3]) @ pose[:, 0]
@@ -149,15 +199,25 @@ class TestLanguage:
 
     def test_a_scene_ends_at_rest_and_repeats_its_last_frame(self) -> None:
         end = {"when": "rest", "at_most": 3}
-        run = ran(sheets={"a": SHEET | {"origin": [0, 0, 0.002]}}, bodies={"floor": {"type": "plane"}}, end=end)
+        run = ran(
+            sheets={"a": SHEET | {"origin": [0, 0, 0.002]}},
+            bodies={"floor": {"type": "plane"}},
+            end=end,
+        )
         assert 0.25 <= run.rest_time < 1.5
         assert len(run.positions) == 91
         assert np.array_equal(run.positions[-1], run.positions[round(run.rest_time * 30)])
 
     def test_a_hung_sheet_starts_at_rest_and_a_stretched_one_stays(self) -> None:
-        corners = {"a": {"low": [-0.03, 0.03], "high": [-0.03, 0.03]}, "b": {"low": [0.03, 0.03], "high": [0.03, 0.03]}}
+        corners = {
+            "a": {"low": [-0.03, 0.03], "high": [-0.03, 0.03]},
+            "b": {"low": [0.03, 0.03], "high": [0.03, 0.03]},
+        }
         hung = SHEET | {"turn": [1.5708, 0, 0], "start": {"type": "hung"}, "holders": corners}
-        stretched = SHEET | {"origin": [1, 0, 0], "start": {"type": "stretched", "strain": [0.02, 0.01]}}
+        stretched = SHEET | {
+            "origin": [1, 0, 0],
+            "start": {"type": "stretched", "strain": [0.02, 0.01]},
+        }
         sheets = {"hung": hung, "stretched": stretched | {"holders": {"frame": {"rim": True}}}}
         run = ran(sheets=sheets, duration=0.3, frame_rate=10, gravity=[0, 0, -9.81])
         moved = np.abs(run.positions[-1] - run.positions[0])
@@ -167,8 +227,14 @@ class TestLanguage:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"holders": {"h": {"low": [0.001, 0.001], "high": [0.002, 0.002]}}}, r"sheets.a.holders.h: must hold a"),
-            ({"holders": {"h": {"edge": "left"}, "i": {"rim": True}}}, "sheets.a.holders.i: must not hold what"),
+            (
+                {"holders": {"h": {"low": [0.001, 0.001], "high": [0.002, 0.002]}}},
+                r"sheets.a.holders.h: must hold a",
+            ),
+            (
+                {"holders": {"h": {"edge": "left"}, "i": {"rim": True}}},
+                "sheets.a.holders.i: must not hold what",
+            ),
         ],
     )
     def test_refusals(self, change: dict[str, Any], message: str) -> None:

@@ -8,7 +8,9 @@ import pytest
 import yaml
 from harness import Service, wait_for
 
-SPEC: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text())
+SPEC: dict[str, Any] = yaml.safe_load(
+    (Path(__file__).parents[1] / "examples" / "demo-rods.yaml").read_text()
+)
 RAY = str(Path(sys.executable).with_name("ray"))
 SLOW = """
 import os, sys, time
@@ -18,11 +20,18 @@ if os.environ["SLOW"] == "all" or "agent" in line:
 """
 
 # One after the other, and after those of test_chaos.py: each waits for minutes, alone.
-pytestmark = [pytest.mark.slow, pytest.mark.real, pytest.mark.timeout(1500), pytest.mark.xdist_group("chaos")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.real,
+    pytest.mark.timeout(1500),
+    pytest.mark.xdist_group("chaos"),
+]
 
 
 @pytest.mark.parametrize("what", ["agents", "all"])
-def test_a_machine_that_imports_slowly(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_that_imports_slowly(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every Python process takes 20 s to start, or every agent of Ray 25 s."""
     (tmp_path / "sitecustomize.py").write_text(SLOW)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

@@ -1,8 +1,11 @@
-"""A real Slurm with two nodes runs `deploy/slurm/stickslip.sbatch`; what it takes back is queued again and goes on.
+"""A real Slurm with two nodes runs `deploy/slurm/stickslip.sbatch`.
+
+What it takes back is queued again and goes on.
 
     pytest -m slow tests/test_slurm.py -s
 
-The nodes are machines of a network of their own, see `machines`. It needs slurmctld, slurmd, slurm-client and munge.
+The nodes are machines of a network of their own, see `machines`. It needs slurmctld, slurmd,
+slurm-client and munge.
 """
 
 import os
@@ -20,7 +23,8 @@ from machines import BUCKET, HUB, URL, Lab, Machine, dies_with_us
 SBATCH = Path(__file__).parents[1] / "deploy" / "slurm" / "stickslip.sbatch"
 NODES = ("n1", "n2")
 
-# A job that was queued again waits until no node can still trust it, two minutes unless `cred_expire` says otherwise.
+# A job that was queued again waits until no node can still trust it, two minutes unless
+# `cred_expire` says otherwise.
 CONFIG = """
 ClusterName=test
 SlurmctldHost=hub({hub})
@@ -80,21 +84,30 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     programs = {name: shutil.which(name) for name in ("munged", "slurmctld", "slurmd", "sbatch")}
     missing = [name for name, path in programs.items() if path is None]
     if missing:
-        pytest.skip(f"{', '.join(missing)} not installed: apt-get install slurmctld slurmd slurm-client munge")
+        pytest.skip(
+            f"{', '.join(missing)} not installed: apt-get install slurmctld slurmd slurm-client munge"
+        )
     shared = tmp_path / "shared"
     shared.mkdir()
     (tmp_path / "state").mkdir()
     key = tmp_path / "munge.key"
     key.write_bytes(os.urandom(1024))
     key.chmod(0o600)
-    lines = [f"NodeName={name} NodeAddr=10.213.0.{number} CPUs=1" for number, name in enumerate(NODES, 21)]
+    lines = [
+        f"NodeName={name} NodeAddr=10.213.0.{number} CPUs=1"
+        for number, name in enumerate(NODES, 21)
+    ]
     config = tmp_path / "slurm.conf"
-    config.write_text(CONFIG.format(hub=HUB, place=tmp_path, nodes="\n".join(lines), names=",".join(NODES)))
+    config.write_text(
+        CONFIG.format(hub=HUB, place=tmp_path, nodes="\n".join(lines), names=",".join(NODES))
+    )
     # The directory that all nodes see: the installation, and the key.
     prefix = Path(sys.prefix)
     (shared / ".venv").symlink_to(prefix)
     blender = os.environ.get("STICKSLIP_BLENDER_PYTHON")
-    (shared / ".venv-blender").symlink_to(Path(blender).parents[1] if blender else prefix.parent / ".venv-blender")
+    (shared / ".venv-blender").symlink_to(
+        Path(blender).parents[1] if blender else prefix.parent / ".venv-blender"
+    )
     shutil.copy(tmp_path / "worker-key", shared)
     for name, value in {
         "SLURM_CONF": str(config),
@@ -104,8 +117,18 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     }.items():
         monkeypatch.setenv(name, value)
 
-    munge = ["munged", "--foreground", "--force", f"--key-file={key}", f"--socket={tmp_path}/munge.socket"]
-    munge += [f"--pid-file={tmp_path}/munge.pid", f"--seed-file={tmp_path}/munge.seed", "--log-file=/dev/null"]
+    munge = [
+        "munged",
+        "--foreground",
+        "--force",
+        f"--key-file={key}",
+        f"--socket={tmp_path}/munge.socket",
+    ]
+    munge += [
+        f"--pid-file={tmp_path}/munge.pid",
+        f"--seed-file={tmp_path}/munge.seed",
+        "--log-file=/dev/null",
+    ]
     controller = ["unshare", "--uts", "sh", "-c", "hostname hub && exec slurmctld -D"]
     with ExitStack() as stack:
         for name, command in (("munged", munge), ("slurmctld", controller)):
@@ -121,14 +144,18 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         found = Slurm(tmp_path)
 
         def all_idle() -> bool | None:
-            done = subprocess.run(["sinfo", "--noheader", "--Node", "--format=%T"], capture_output=True, text=True)
+            done = subprocess.run(
+                ["sinfo", "--noheader", "--Node", "--format=%T"], capture_output=True, text=True
+            )
             return True if done.stdout.split() == ["idle"] * len(NODES) else None
 
         wait_for("the nodes", all_idle, 60)
         yield found
         if found.job:
             found("scancel", found.job)
-            wait_for("an empty queue", lambda: True if not found("squeue", "--noheader") else None, 60)
+            wait_for(
+                "an empty queue", lambda: True if not found("squeue", "--noheader") else None, 60
+            )
 
 
 def test_an_array_goes_on_where_slurm_takes_its_nodes(
@@ -150,20 +177,36 @@ def test_an_array_goes_on_where_slurm_takes_its_nodes(
         return slurm.states()[task] == (expected, restarts)
 
     slurm.submit("--array=1-2", "--time=30")
-    say("submitted: both nodes have done tasks", lab.wait("both", lambda: all(done(task) > 3 for task in "12")))
+    say(
+        "submitted: both nodes have done tasks",
+        lab.wait("both", lambda: all(done(task) > 3 for task in "12")),
+    )
     assert {slurm.node_of(task) for task in "12"} == set(NODES)
 
     # What Slurm does a minute before the end of the time.
     slurm("scancel", "--batch", "--signal=TERM", f"{slurm.job}_1")
     name = worker("1")
-    say("TERM: its tasks are free", lab.wait("tasks that are given back", lambda: not lab.held(name)))
-    say("TERM: it waits in the queue again", lab.wait("the queue", lambda: slurm.states()["1"][1] == 1))
-    # What an administrator does, or a job of higher priority: Slurm ends all processes of the job, Ray's, too.
+    say(
+        "TERM: its tasks are free",
+        lab.wait("tasks that are given back", lambda: not lab.held(name)),
+    )
+    say(
+        "TERM: it waits in the queue again",
+        lab.wait("the queue", lambda: slurm.states()["1"][1] == 1),
+    )
+    # What an administrator does, or a job of higher priority: Slurm ends all processes of the job,
+    # Ray's, too.
     slurm("scontrol", "requeue", f"{slurm.job}_2")
     for task in "12":
-        say(f"task {task} runs again", lab.wait("its turn", lambda task=task: state(task, "RUNNING", 1)))  # type: ignore[misc]
+        say(
+            f"task {task} runs again",
+            lab.wait("its turn", lambda task=task: state(task, "RUNNING", 1)),
+        )  # type: ignore[misc]
     before = {task: done(task) for task in "12"}
-    say("both have done more", lab.wait("more", lambda: all(done(task) > before[task] for task in "12")))
+    say(
+        "both have done more",
+        lab.wait("more", lambda: all(done(task) > before[task] for task in "12")),
+    )
 
     ended = lab.finished()
     assert ended == ["succeeded"] * len(ended)
@@ -173,4 +216,6 @@ def test_an_array_goes_on_where_slurm_takes_its_nodes(
     gone = ["CANCELLED"] * len(NODES)
     wait_for("the end", lambda: [state for state, _ in slurm.states().values()] == gone or None, 90)
     text = "".join(path.read_text() for path in tmp_path.glob("stickslip-*.log"))
-    assert text.count("registered as worker-") == 4  # each worker twice, and nothing came back after that
+    assert (
+        text.count("registered as worker-") == 4
+    )  # each worker twice, and nothing came back after that

@@ -1,9 +1,11 @@
 """A moving sheet of some samples of a dataset of clips: one label by rows, another by columns.
 
-    .venv/bin/python tools/dataset_sheet.py DATASET OUT.webp --rows material --columns mu [--only texture=floral ...]
+    .venv/bin/python tools/dataset_sheet.py DATASET OUT.webp --rows material --columns mu [--only
+    texture=floral ...]
 
-docs/figures/cloth-friction.webp and cloth-textures.webp are such sheets; `examples/thesis_cloth_clips.py` makes data.
---only takes several values of a label, as in mu=0.1,0.5.
+docs/figures/cloth-friction.webp and cloth-textures.webp are such sheets;
+`examples/thesis_cloth_clips.py` makes data. --only takes several values of a label, as in
+mu=0.1,0.5.
 """
 
 import argparse
@@ -26,7 +28,9 @@ def main() -> None:
     arguments.add_argument("out", type=Path)
     arguments.add_argument("--rows", required=True)
     arguments.add_argument("--columns", required=True)
-    arguments.add_argument("--only", nargs="*", default=[], metavar="LABEL=VALUE,...", help="which samples")
+    arguments.add_argument(
+        "--only", nargs="*", default=[], metavar="LABEL=VALUE,...", help="which samples"
+    )
     arguments.add_argument("--frames", type=int, default=15)
     arguments.add_argument("--side", type=int, default=112, help="of a picture [px]")
     arguments.add_argument("--quality", type=int, default=45, help="of the WebP, 1 to 100")
@@ -51,7 +55,9 @@ def main() -> None:
 def _named(reader: DatasetReader, name: str) -> Any:
     """Return a label of all slots as texts."""
     values, categories = reader.label(name), reader.categories(name)
-    return np.array([categories[value] if categories else f"{value:.3g}" for value in values.tolist()])
+    return np.array(
+        [categories[value] if categories else f"{value:.3g}" for value in values.tolist()]
+    )
 
 
 if __name__ == "__main__":

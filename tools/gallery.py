@@ -3,9 +3,10 @@
     .venv/bin/python tools/gallery.py [SCENE ...] [--out pictures] [--views] [--axis NAME=VALUE ...]
                                       [--set PATH=VALUE ...] [--record FILE]
 
-Simulates one sample of each scene with its default parameters, and renders it from the camera `high`, or from all with
---views, one below the other. --record takes the arrays of a sample that `benchmarks/scenes.py --keep` has simulated. No
-coordinator is needed, but the environment of Blender is.
+Simulates one sample of each scene with its default parameters, and renders it from the camera
+`high`, or from all with --views, one below the other. --record takes the arrays of a sample that
+`benchmarks/scenes.py --keep` has simulated. No coordinator is needed, but the environment of
+Blender is.
 """
 
 import argparse
@@ -19,7 +20,13 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 from PIL import Image
-from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, SimulateOutput, SimulateTask
+from stickslip_schemas.documents.tasks import (
+    RecordRef,
+    RenderOutput,
+    RenderTask,
+    SimulateOutput,
+    SimulateTask,
+)
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
@@ -36,7 +43,9 @@ SIDE = 160
 BLENDER_PYTHON = Path(sys.prefix).parent / ".venv-blender/bin/python"
 
 
-def strip(name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views: bool, record: Path | None) -> Any:
+def strip(
+    name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views: bool, record: Path | None
+) -> Any:
     """Return pictures of a sample of a scene, from one camera or from all: (height, width, 3)."""
     cameras = load_scene(name).looks.cameras
     views = list(cameras) if isinstance(cameras, dict) else list(FRAMING)
@@ -57,16 +66,26 @@ def strip(name: str, axes: dict[str, Any], change: dict[str, Any], *, all_views:
             open_store(store).publish(data)
         if record is None:
             done = replay(
-                SimulateTask(simulation=spec.simulation(points[0])), store=store, blender_python=BLENDER_PYTHON
+                SimulateTask(simulation=spec.simulation(points[0])),
+                store=store,
+                blender_python=BLENDER_PYTHON,
             )
             if not isinstance(done.output, SimulateOutput):
                 sys.exit(f"{name}: {done.message}")
             found = done.output.record
         else:
             with np.load(record) as arrays, (Path(store) / "record.npz").open("wb") as file:
-                np.savez(file, allow_pickle=False, **{key: values[None] for key, values in arrays.items()})
-            found = RecordRef(digest=open_store(store).publish((Path(store) / "record.npz").read_bytes()), row=0)
-        return np.concatenate([_clip(RenderTask(render=spec.render(point), record=found), store) for point in points])
+                np.savez(
+                    file,
+                    allow_pickle=False,
+                    **{key: values[None] for key, values in arrays.items()},
+                )
+            found = RecordRef(
+                digest=open_store(store).publish((Path(store) / "record.npz").read_bytes()), row=0
+            )
+        return np.concatenate(
+            [_clip(RenderTask(render=spec.render(point), record=found), store) for point in points]
+        )
 
 
 def _clip(task: RenderTask, store: str) -> npt.NDArray[np.uint8]:
@@ -87,20 +106,27 @@ def main() -> None:
     arguments.add_argument("--views", action="store_true", help="all cameras, one below the other")
     arguments.add_argument("--axis", nargs="*", default=[], metavar="NAME=VALUE")
     arguments.add_argument("--set", nargs="*", default=[], metavar="PATH=VALUE")
-    arguments.add_argument("--record", type=Path, help="arrays of a sample that was simulated before")
+    arguments.add_argument(
+        "--record", type=Path, help="arrays of a sample that was simulated before"
+    )
     options = arguments.parse_args()
     axes, change = (
-        {k: yaml.safe_load(v) for k, v in (one.split("=", 1) for one in many)} for many in (options.axis, options.set)
+        {k: yaml.safe_load(v) for k, v in (one.split("=", 1) for one in many)}
+        for many in (options.axis, options.set)
     )
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
         begin = time.perf_counter()
         found = strip(name, axes, change, all_views=options.views, record=options.record)
         picture = Image.fromarray(found)
-        small = picture.resize((INSTANTS * SIDE, picture.height * SIDE // CLIP_SIZE), Image.Resampling.LANCZOS)
+        small = picture.resize(
+            (INSTANTS * SIDE, picture.height * SIDE // CLIP_SIZE), Image.Resampling.LANCZOS
+        )
         path = options.out / f"{name}.webp"
         small.save(path, quality=70, method=6)
-        sys.stdout.write(f"{path}: {path.stat().st_size / 1e3:.0f} kB, {time.perf_counter() - begin:.0f} s\n")
+        sys.stdout.write(
+            f"{path}: {path.stat().st_size / 1e3:.0f} kB, {time.perf_counter() - begin:.0f} s\n"
+        )
 
 
 if __name__ == "__main__":

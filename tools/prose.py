@@ -34,15 +34,21 @@ def phrases() -> tuple[re.Pattern[str], list[str]]:
     lines = [line for line in PHRASES.read_text().splitlines() if line and not line.startswith("#")]
     pairs = [line.split(" -> ", 1) for line in lines]
     groups = (bad.replace("(", "(?:").replace(" ", r"[\s#/*]+") for bad, _ in pairs)
-    return re.compile("|".join(rf"(\b(?:{group})\b)" for group in groups), re.IGNORECASE), [good for _, good in pairs]
+    return re.compile("|".join(rf"(\b(?:{group})\b)" for group in groups), re.IGNORECASE), [
+        good for _, good in pairs
+    ]
 
 
 def complaints(path: Path, bad: re.Pattern[str], instead: list[str]) -> Iterator[str]:
-    """Yield a line for every bad phrase of a file, and for every complaint of proselint about Markdown."""
+    """Yield a line for every bad phrase of a file, and for every complaint of proselint about
+    Markdown.
+    """
     text = path.read_text()
     if path.suffix == ".md":
         text = re.sub(r"^```.*?^```|`[^`\n]*`", _blank, text, flags=re.DOTALL | re.MULTILINE)
-        for result in LintFile(str(path), text).lint({"max_errors": 100, "checks": dict.fromkeys(CHECKS, True)}):
+        for result in LintFile(str(path), text).lint(
+            {"max_errors": 100, "checks": dict.fromkeys(CHECKS, True)}
+        ):
             yield f"{path.relative_to(ROOT)}:{result.pos[0]}: {result.check_result.message}"
     for match in bad.finditer(text):
         line = 1 + text.count("\n", 0, match.start())
@@ -58,7 +64,9 @@ def main(arguments: list[str]) -> int:
     """Print every complaint; return 1 if there is one."""
     CheckRegistry().register_many(__register__)
     command = ["git", "ls-files", *(f"*.{suffix}" for suffix in SUFFIXES)]
-    tracked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
+    tracked = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\n")
     paths = [ROOT / name for name in arguments or tracked if name and name != "tools/prose.py"]
     bad, instead = phrases()
     found = [line for path in paths if path.exists() for line in complaints(path, bad, instead)]

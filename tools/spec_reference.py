@@ -54,13 +54,20 @@ Rows = dict[str, str]
 
 
 def reference() -> str:
-    """Return the page: what all kinds share, what all kinds of cloth share, then each kind, then custom entries."""
+    """Return the page: what all kinds share, what all kinds of cloth share, then each kind, then
+    custom entries.
+    """
     keys = {name: _keys(kind) for name, kind in KINDS.items()}
     axes = {name: _axes(kind) for name, kind in KINDS.items()}
     cloth = [name for name, kind in KINDS.items() if issubclass(kind, ClipSpec)]
     every, every_cloth = _shared(keys.values()), _shared(keys[name] for name in cloth)
     cloth_axes = _shared(axes[name] for name in cloth)
-    lines = [HEAD, "## Keys of every kind\n", *_table(KEY_HEAD, every), "## Keys of every kind of cloth\n"]
+    lines = [
+        HEAD,
+        "## Keys of every kind\n",
+        *_table(KEY_HEAD, every),
+        "## Keys of every kind of cloth\n",
+    ]
     lines += _table(AXIS_HEAD, cloth_axes) + _table(KEY_HEAD, _without(every_cloth, every))
     for name, kind in KINDS.items():
         lines += [f"## `{name}`\n", f"{(kind.__doc__ or '').splitlines()[0]}\n"]
@@ -70,7 +77,9 @@ def reference() -> str:
     for key, what, model in CUSTOM:
         meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
         schema = model.model_json_schema()
-        rows = {name: _field_row(name, field, schema) for name, field in schema["properties"].items()}
+        rows = {
+            name: _field_row(name, field, schema) for name, field in schema["properties"].items()
+        }
         lines += [f"## Custom {what}s\n", f"Entries of `{key}`. {meaning}\n"]
         lines += _table(KEY_HEAD, rows)
     return "\n".join(lines)
@@ -79,7 +88,9 @@ def reference() -> str:
 def _shared(tables: Iterable[Rows]) -> Rows:
     """Return the rows that all tables have, in the order of the first table."""
     first, *others = tables
-    return {name: row for name, row in first.items() if all(table.get(name) == row for table in others)}
+    return {
+        name: row for name, row in first.items() if all(table.get(name) == row for table in others)
+    }
 
 
 def _without(table: Rows, known: Rows) -> Rows:
@@ -107,7 +118,9 @@ def _axes(kind: type[JobSpec]) -> Rows:
 
 def _keys(kind: type[JobSpec]) -> Rows:
     schema = kind.model_json_schema()
-    fields = {name: field for name, field in schema["properties"].items() if name not in ("axes", "kind")}
+    fields = {
+        name: field for name, field in schema["properties"].items() if name not in ("axes", "kind")
+    }
     if issubclass(kind, ClothDragSpec):
         fields["frames"] = {**fields["frames"], "maximum": kind.instants}
     return {name: _field_row(name, field, schema) for name, field in fields.items()}
@@ -116,17 +129,25 @@ def _keys(kind: type[JobSpec]) -> Rows:
 def _field_row(name: str, field: dict[str, Any], schema: dict[str, Any]) -> str:
     value = _resolved(field, schema)
     meaning = field.get("description") or value.get("description", "")
-    default = "required" if name in schema["required"] else f"`{json.dumps(field.get('default', {}))}`"
+    default = (
+        "required" if name in schema["required"] else f"`{json.dumps(field.get('default', {}))}`"
+    )
     cost = f". Cost: {field['x-cost']}" if "x-cost" in field else ""
     cells = (f"`{name}`", _allowed(value), default, _first_line(meaning) + cost)
     return f"| {' | '.join(cells)} |"
 
 
 def _resolved(value: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of a value with its references resolved; a nullable value becomes its other alternative."""
+    """Return the schema of a value with its references resolved.
+
+    A nullable value becomes its other alternative.
+    """
     found = value
     if "$ref" in found:
-        found = {**schema["$defs"][found["$ref"].rpartition("/")[2]], **{k: v for k, v in found.items() if k != "$ref"}}
+        found = {
+            **schema["$defs"][found["$ref"].rpartition("/")[2]],
+            **{k: v for k, v in found.items() if k != "$ref"},
+        }
     kinds = [kind for kind in found.get("anyOf", ()) if kind != {"type": "null"}]
     if len(kinds) == 1:
         nullable = {"x-null": True, **{k: v for k, v in found.items() if k != "anyOf"}}
@@ -146,7 +167,12 @@ def _allowed(value: dict[str, Any]) -> str:
         *(f"≤ {value[key]:,.10g}" for key in ("maximum",) if key in value),
         *(f"< {value[key]:,.10g}" for key in ("exclusiveMaximum",) if key in value),
     ]
-    words = {"number": "number", "integer": "integer", "boolean": "`true`, `false`", "object": "mapping"}
+    words = {
+        "number": "number",
+        "integer": "integer",
+        "boolean": "`true`, `false`",
+        "object": "mapping",
+    }
     kind = words.get(value.get("type", ""), "name" if value.get("type") == "string" else "list")
     if "anyOf" in value:
         kind = "a name, or a mapping"

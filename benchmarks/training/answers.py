@@ -1,9 +1,11 @@
-"""Draw one clip of each file with the true friction and the answer of a reader, the last of them half a leg too late.
+"""Draw one clip of each file with the true friction and the answer of a reader, the last of them
+half a leg too late.
 
     python benchmarks/training/answers.py PICTURE CLIPS.npz ... [--model FILE] [--seed 0]
 
-CLIPS.npz is of `blender_clips.py --segmentation`. Clips are drawn from the seed, each of another fabric. For
-docs/figures/answers.webp: the files matt, patterned, bright, oak, room and oak again of `cloth-2.mk`, seed 1.
+CLIPS.npz is of `blender_clips.py --segmentation`. Clips are drawn from the seed, each of another
+fabric. For docs/figures/answers.webp: the files matt, patterned, bright, oak, room and oak again of
+`cloth-2.mk`, seed 1.
 """
 
 import argparse
@@ -34,16 +36,27 @@ def main() -> None:
         clips, about = clips_of_file(path, model.materials)
         with np.load(path) as file:
             videos = file["video"]
-        one = next(clip for clip in random.permutation(len(about)) if about[clip]["material"] not in fabrics)
+        one = next(
+            clip
+            for clip in random.permutation(len(about))
+            if about[clip]["material"] not in fabrics
+        )
         fabrics.add(about[one]["material"])
         read = clips[np.array([one])]
         if late := place == len(args.clips) - 1:
             read.crops[:] = read.crops[:, LATE]
         found, reason = estimates(model.estimate(read).mu, model.bins), model.judge(read)[1][0]
-        answer = f"{found.median[0]:.2f} ({found.low[0]:.2f} to {found.high[0]:.2f})" if reason is None else "no answer"
+        answer = (
+            f"{found.median[0]:.2f} ({found.low[0]:.2f} to {found.high[0]:.2f})"
+            if reason is None
+            else "no answer"
+        )
         axes = figure.add_subplot(2, columns, place + 1)
         axes.imshow(videos[one][LATE[SHOWN] if late else SHOWN])
-        axes.set_title(f"true friction {about[one]['mu']:.2f}\n{answer}{f': {reason}' if reason else ''}", fontsize=11)
+        axes.set_title(
+            f"true friction {about[one]['mu']:.2f}\n{answer}{f': {reason}' if reason else ''}",
+            fontsize=11,
+        )
         axes.set_axis_off()
     figure.savefig(args.picture)
 

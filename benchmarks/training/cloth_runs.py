@@ -1,14 +1,16 @@
 """Simulate drop-and-drag for training, and pack meshes of the instants that clips show.
 
-    python benchmarks/training/cloth_runs.py RUNS [--fabrics NAME ...] [--runs 30] [--vertices 21] [--preset fast]
-        [--density LOW HIGH] [--bending LOW HIGH] [--stretching LOW HIGH] [--seed 0] [--frames 300]
-        [--self-friction F] [--pack FILE]
+    python benchmarks/training/cloth_runs.py RUNS [--fabrics NAME ...] [--runs 30] [--vertices 21]
+        [--preset fast] [--density LOW HIGH] [--bending LOW HIGH] [--stretching LOW HIGH] [--seed 0]
+        [--frames 300] [--self-friction F] [--pack FILE]
 
-Each run is a file of RUNS, and a call goes on where another stopped; two may share a folder. mu is a Sobol sequence of
-[0, 1.6] for each fabric, and every run has a seed of its own, so that both sides occur. With a range of factors the
-numbers of each run's fabric are multiplied by a factor of its own, spread evenly over the logarithm: further dimensions
-of the same sequence. `--pack` writes all runs of the folder into one file, as `stickslip_training.cloth.runs` reads it:
-positions in whole steps of 10 um. Runs of finer meshes are packed at the vertices of the coarsest, by cubic splines.
+Each run is a file of RUNS, and a call goes on where another stopped; two may share a folder. mu is
+a Sobol sequence of [0, 1.6] for each fabric, and every run has a seed of its own, so that both
+sides occur. With a range of factors the numbers of each run's fabric are multiplied by a factor of
+its own, spread evenly over the logarithm: further dimensions of the same sequence. `--pack` writes
+all runs of the folder into one file, as `stickslip_training.cloth.runs` reads it: positions in
+whole steps of 10 um. Runs of finer meshes are packed at the vertices of the coarsest, by cubic
+splines.
 """
 
 import argparse
@@ -49,10 +51,16 @@ class Point:
     """Of the fabric's numbers, by name."""
 
 
-def points(fabric: str, runs: int, seed: int, ranges: dict[str, tuple[float, float]]) -> list[Point]:
-    """Return the points of the runs of a fabric: a scrambled Sobol sequence of its own over mu and what varies."""
+def points(
+    fabric: str, runs: int, seed: int, ranges: dict[str, tuple[float, float]]
+) -> list[Point]:
+    """Return the points of the runs of a fabric: a scrambled Sobol sequence of its own over mu and
+    what varies.
+    """
     varied = [name for name in FACTORS if ranges[name][0] < ranges[name][1]]
-    engine = qmc.Sobol(1 + len(varied), seed=np.random.default_rng((seed, fabric_names().index(fabric))))
+    engine = qmc.Sobol(
+        1 + len(varied), seed=np.random.default_rng((seed, fabric_names().index(fabric)))
+    )
     count = 1 << (runs - 1).bit_length()
     found = []
     for mu, *shares in engine.random(count)[:runs].tolist():
@@ -70,17 +78,31 @@ def instants_of(frames: int) -> list[int]:
 
 
 def simulate(
-    name: str, point: Point, vertices: int, preset: str, seed: int, frames: int, self_friction: float | None
+    name: str,
+    point: Point,
+    vertices: int,
+    preset: str,
+    seed: int,
+    frames: int,
+    self_friction: float | None,
 ) -> dict[str, object]:
     """Run one simulation, and return what is kept of it."""
     started = time.process_time()
     fabric = fabric_named(name).scaled(**point.factors)
     scene = cloth_drag.scene(
-        fabric, point.mu, mesh=vertices, preset=preset, seed=seed, frames=frames, self_friction=self_friction
+        fabric,
+        point.mu,
+        mesh=vertices,
+        preset=preset,
+        seed=seed,
+        frames=frames,
+        self_friction=self_friction,
     ).run()
     held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
     edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
-    fell = scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
+    fell = (
+        scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
+    )
     about = {
         "material": name,
         "mu": point.mu,
@@ -99,7 +121,9 @@ def simulate(
         "cpu_s": round(time.process_time() - started, 2),
     }
     instants = instants_of(frames)
-    shown = scene.positions[instants] if scene.valid else np.zeros((len(instants), len(scene.rest), 3))
+    shown = (
+        scene.positions[instants] if scene.valid else np.zeros((len(instants), len(scene.rest), 3))
+    )
     return {
         "positions": np.round(shown / STEP).astype(np.int16),
         "rest": scene.rest.astype(np.float32),
@@ -110,7 +134,9 @@ def simulate(
 
 
 def at_vertices(run: dict[str, Any], rest: Any) -> Any:
-    """Return the positions of a run at the vertices of a mesh that is as fine or coarser, (frames, V, 3)."""
+    """Return the positions of a run at the vertices of a mesh that is as fine or coarser, (frames,
+    V, 3).
+    """
     if np.array_equal(run["rest"], rest):
         return run["positions"]
     order = grid_order(rest)
@@ -123,7 +149,10 @@ def at_vertices(run: dict[str, Any], rest: Any) -> Any:
 
 
 def write_packed(file: Path, positions: Any, mesh: Mapping[str, Any], about: Sequence[str]) -> None:
-    """Write positions (runs, frames, V, 3) in whole steps of `STEP`; `mesh` has rest, triangles and instants."""
+    """Write positions (runs, frames, V, 3) in whole steps of `STEP`.
+
+    `mesh` has rest, triangles and instants.
+    """
     # Differences of consecutive instants, low and high bytes apart, pack best.
     differences = np.diff(positions, axis=1, prepend=np.int16(0))
     bytes_apart = np.ascontiguousarray(differences).view(np.uint8).reshape(*differences.shape, 2)
@@ -145,13 +174,17 @@ def pack(folder: Path, file: Path) -> None:
     first = min(runs, key=lambda run: len(run["rest"]))
     for run in runs:
         finer = len(run["rest"]) > len(first["rest"])
-        corners, wanted = (np.stack([mesh["rest"].min(axis=0), mesh["rest"].max(axis=0)]) for mesh in (run, first))
+        corners, wanted = (
+            np.stack([mesh["rest"].min(axis=0), mesh["rest"].max(axis=0)]) for mesh in (run, first)
+        )
         if not (
             np.allclose(corners, wanted, atol=1e-6)
             and np.array_equal(run["instants"], first["instants"])
             and (finer or np.array_equal(run["triangles"], first["triangles"]))
         ):
-            raise ValueError(f"the runs in {folder} must be of one square and as many frames: pack a folder for each")
+            raise ValueError(
+                f"the runs in {folder} must be of one square and as many frames: pack a folder for each"
+            )
         run["positions"] = at_vertices(run, first["rest"])
     about = [str(run["about"]) for run in runs]
     write_packed(file, np.stack([run["positions"] for run in runs]), first, about)
@@ -167,10 +200,18 @@ def main() -> None:
     parser.add_argument("--vertices", type=int, default=21)
     parser.add_argument("--preset", default="fast")
     for name in FACTORS:
-        parser.add_argument(f"--{name}", type=float, nargs=2, default=(1.0, 1.0), metavar=("LOW", "HIGH"))
+        parser.add_argument(
+            f"--{name}", type=float, nargs=2, default=(1.0, 1.0), metavar=("LOW", "HIGH")
+        )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--frames", type=int, default=FRAMES, help="to simulate, 2.4 a second; all are 300")
-    parser.add_argument("--self-friction", type=float, help="of the cloth with itself; none: it passes through itself")
+    parser.add_argument(
+        "--frames", type=int, default=FRAMES, help="to simulate, 2.4 a second; all are 300"
+    )
+    parser.add_argument(
+        "--self-friction",
+        type=float,
+        help="of the cloth with itself; none: it passes through itself",
+    )
     parser.add_argument("--pack", type=Path, help="simulate nothing, and write this file")
     args = parser.parse_args()
     if args.pack is not None:
@@ -182,15 +223,29 @@ def main() -> None:
     args.folder.mkdir(parents=True, exist_ok=True)
     for number in range(args.runs):
         for fabric in args.fabrics:
-            path = args.folder / f"{fabric}-{args.vertices}-{args.preset}-{args.seed}-{number:03d}.npz"
+            path = (
+                args.folder / f"{fabric}-{args.vertices}-{args.preset}-{args.seed}-{number:03d}.npz"
+            )
             claim = path.with_suffix(".claim")
             try:
                 claim.touch(exist_ok=False)
             except FileExistsError:
                 continue  # done, or another process is at it
             point = points(fabric, args.runs, args.seed, ranges)[number]
-            seed = int(np.random.SeedSequence((args.seed, fabric_names().index(fabric), number)).generate_state(1)[0])
-            run = simulate(fabric, point, args.vertices, args.preset, seed % 2**31, args.frames, args.self_friction)
+            seed = int(
+                np.random.SeedSequence(
+                    (args.seed, fabric_names().index(fabric), number)
+                ).generate_state(1)[0]
+            )
+            run = simulate(
+                fabric,
+                point,
+                args.vertices,
+                args.preset,
+                seed % 2**31,
+                args.frames,
+                args.self_friction,
+            )
             np.savez_compressed(path, **run)  # type: ignore[arg-type]  # its stub takes no objects
             print(run["about"], flush=True)
 

@@ -21,12 +21,16 @@ def main() -> None:
     parser.add_argument("spec", type=Path)
     parser.add_argument("dataset")
     parser.add_argument("--about", required=True)
-    parser.add_argument("--all", action="store_true", help="all samples are to answer, and not the split test")
+    parser.add_argument(
+        "--all", action="store_true", help="all samples are to answer, and not the split test"
+    )
     args = parser.parse_args()
     split: Split | None = None if args.all else "test"
     folder = Path(stickslip_training.benchmark.__path__[0]) / "sets"
     with DatasetReader(args.dataset) as reader:
-        document, seen = frozen(args.name, args.about, yaml.safe_load(args.spec.read_text()), split, reader)
+        document, seen = frozen(
+            args.name, args.about, yaml.safe_load(args.spec.read_text()), split, reader
+        )
     for suffix, data in ((".json", document), (".npz", seen)):
         (folder / f"{args.name}{suffix}").write_bytes(data)
         print(f"{folder / args.name}{suffix}: {len(data) / 1e3:.1f} kB")

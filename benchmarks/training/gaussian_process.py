@@ -2,13 +2,15 @@
 
     python benchmarks/training/gaussian_process.py TRAIN.npz CLIPS.npz ... [--seed 0]
 
-TRAIN.npz is a packed file of `cloth_runs.py`; CLIPS.npz are of `blender_clips.py`, of other simulations.
-Training clips are rendered in torch in drawn worlds. The mask network of the package finds the cloth in all clips. The
-process sees 40 principal components of the six silhouettes at 4 x 4 pixels, and the direction of view.
+TRAIN.npz is a packed file of `cloth_runs.py`; CLIPS.npz are of `blender_clips.py`, of other
+simulations. Training clips are rendered in torch in drawn worlds. The mask network of the package
+finds the cloth in all clips. The process sees 40 principal components of the six silhouettes at 4 x
+4 pixels, and the direction of view.
 
     k(x, y) = a^2 exp(-|x - y|^2 / 2 l^2) + n^2 [x = y]
 
-The length l and the ratio n / a have the largest marginal likelihood [Rasmussen and Williams 2006, Eq. 2.30].
+The length l and the ratio n / a have the largest marginal likelihood [Rasmussen and Williams 2006,
+Eq. 2.30].
 """
 
 import argparse
@@ -56,7 +58,9 @@ class Process:
         centred = values - mean
 
         def solved(log_length: float, log_noise: float) -> tuple[tuple[Array, bool], Array, float]:
-            kernel = np.exp(-0.5 * squared / np.exp(2 * log_length)) + np.exp(2 * log_noise) * np.eye(len(known))
+            kernel = np.exp(-0.5 * squared / np.exp(2 * log_length)) + np.exp(
+                2 * log_noise
+            ) * np.eye(len(known))
             factor = cho_factor(kernel, lower=True)
             weights = cho_solve(factor, centred)
             return factor, weights, float(centred @ weights) / len(known)
@@ -68,15 +72,27 @@ class Process:
         first = np.array([0.5 * np.log(np.median(squared)), np.log(0.1)])
         best = minimize(loss, first, method="Nelder-Mead", options={"maxfev": 60}).x
         factor, weights, variance = solved(*best)
-        return Process(known, mean, float(np.exp(best[0])), float(np.exp(best[1])), variance**0.5, factor, weights)
+        return Process(
+            known,
+            mean,
+            float(np.exp(best[0])),
+            float(np.exp(best[1])),
+            variance**0.5,
+            factor,
+            weights,
+        )
 
     def predict(self, seen: Array) -> Estimates:
-        """Return mu at `seen` (clips, n), with the central interval of the share `SHARE`, within the known mu."""
+        """Return mu at `seen` (clips, n), with the central interval of the share `SHARE`, within
+        the known mu.
+        """
         kernel = np.exp(-0.5 * cdist(seen, self.known, "sqeuclidean") / self.length**2)
         left = 1 + self.noise**2 - np.einsum("ij,ji->i", kernel, cho_solve(self.factor, kernel.T))
         half = norm.ppf(0.5 + SHARE / 2) * self.amplitude * np.sqrt(np.maximum(left, 0.0))
         median = self.mean + kernel @ self.weights
-        return Estimates(*(np.clip(part, 0.0, MU_BINS.high) for part in (median, median - half, median + half)))
+        return Estimates(
+            *(np.clip(part, 0.0, MU_BINS.high) for part in (median, median - half, median + half))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +109,16 @@ class Reader:
         pixels = silhouettes(model.net, clips).reshape(len(clips), -1)
         mean = pixels.mean(axis=0)
         components = np.linalg.svd(pixels - mean, full_matrices=False)[2][:COMPONENTS]
-        process = Process.of(np.hstack([(pixels - mean) @ components.T, clips.direction.numpy()]), clips.mu)
+        process = Process.of(
+            np.hstack([(pixels - mean) @ components.T, clips.direction.numpy()]), clips.mu
+        )
         return Reader(model, mean, components, process)
 
     def read(self, clips: Clips) -> Estimates:
         pixels = silhouettes(self.model.net, clips).reshape(len(clips), -1)
-        return self.process.predict(np.hstack([(pixels - self.mean) @ self.components.T, clips.direction.numpy()]))
+        return self.process.predict(
+            np.hstack([(pixels - self.mean) @ self.components.T, clips.direction.numpy()])
+        )
 
 
 def main() -> None:
@@ -113,15 +133,27 @@ def main() -> None:
     train = load_runs(args.runs).named(model.materials)
     reader = Reader.of(model, render_clips(train, RENDERS, args.seed, drawn_world=True))
     fitted = reader.process
-    print(f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise {fitted.noise:.3g}")
+    print(
+        f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise {fitted.noise:.3g}"
+    )
     shown = {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
     shown["all files"] = Clips.joined(list(shown.values()))
     if set(shown["all files"].mu.tolist()) & set(train.mu.tolist()):
-        raise ValueError(f"{', '.join(map(str, args.clips))} must show no simulation of {args.runs}")
+        raise ValueError(
+            f"{', '.join(map(str, args.clips))} must show no simulation of {args.runs}"
+        )
     for name, clips in shown.items():
         told = errors(reader.read(clips), clips.mu, clips.run)
-        parts = {key: round(getattr(told, key).value, 3) for key in ("mae", "within_01", "within_02", "coverage")}
-        print(json.dumps({"clips of": name, "clips": told.clips, "simulations": told.simulations, **parts}), flush=True)
+        parts = {
+            key: round(getattr(told, key).value, 3)
+            for key in ("mae", "within_01", "within_02", "coverage")
+        }
+        print(
+            json.dumps(
+                {"clips of": name, "clips": told.clips, "simulations": told.simulations, **parts}
+            ),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
 """What a phone's films cost: the same simulations as films and as clips, read by one model.
 
-    python benchmarks/training/phone_films.py meshes RUNS.npz MESHES.npz --only RUN ...
-    $BLENDER_PY benchmarks/training/blender_clips.py MESHES.npz FILMS.npz --instants all --clips N
-    python benchmarks/training/phone_films.py measure FILMS.npz ... [--model MODEL] [--record RECORD.json]
+    python benchmarks/training/phone_films.py meshes RUNS.npz MESHES.npz --only RUN ... $BLENDER_PY
+    benchmarks/training/blender_clips.py MESHES.npz FILMS.npz --instants all --clips N python
+    benchmarks/training/phone_films.py measure FILMS.npz ... [--model MODEL] [--record RECORD.json]
 
-RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: nine a second, from before
-the holders start. After them come the instants of a clip. Blender renders both with one look. `measure` makes an H.264
-film of the former, through a lens, as a hand holds a phone, and reads it as `cloth predict --camera` does. It reads the
-film again with half a second cut off either end.
+RUNS.npz is of `cloth_runs.py --pack`. `meshes` writes the meshes of every frame of a film: nine a
+second, from before the holders start. After them come the instants of a clip. Blender renders both
+with one look. `measure` makes an H.264 film of the former, through a lens, as a hand holds a phone,
+and reads it as `cloth predict --camera` does. It reads the film again with half a second cut off
+either end.
 """
 
 import argparse
@@ -38,16 +39,20 @@ SHAKE = 0.05
 CLIP = "frames at the instants, without a phone"
 
 VARIANTS = {"whole": (0, 0), "start cut by 0.5 s": (20, 0), "end cut by 0.5 s": (0, 14)}
-"""Frames that are left out at the start and at the end. The holders start in frame 15, and nine frames follow the last
-instant that is read."""
+"""Frames that are left out at the start and at the end. The holders start in frame 15, and nine
+frames follow the last instant that is read."""
 
 
 def meshes(source: Path, out: Path, only: list[int]) -> None:
-    """Write the meshes of films and clips as a packed file of runs, whose instants are the numbers of the pictures."""
+    """Write the meshes of films and clips as a packed file of runs, whose instants are the numbers
+    of the pictures.
+    """
     runs = load_runs(source)
     film = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
     seconds = np.concatenate([film, np.array(INSTANTS) / RATE])
-    positions = np.stack([meshes_at(runs[np.array([run])], seconds).reshape(len(seconds), -1, 3) for run in only])
+    positions = np.stack(
+        [meshes_at(runs[np.array([run])], seconds).reshape(len(seconds), -1, 3) for run in only]
+    )
     with np.load(source) as file:
         order = grid_order(file["rest"]).ravel()
         mesh = {
@@ -55,12 +60,17 @@ def meshes(source: Path, out: Path, only: list[int]) -> None:
             "triangles": np.argsort(order)[file["triangles"]].astype(np.int16),
             "instants": np.arange(len(seconds), dtype=np.int16),
         }
-        write_packed(out, np.rint(positions / STEP).astype(np.int16), mesh, file["about"][only].tolist())
-    print(f"{out}: {len(only)} runs, {len(film)} frames of a film and {len(INSTANTS)} of a clip each")
+        write_packed(
+            out, np.rint(positions / STEP).astype(np.int16), mesh, file["about"][only].tolist()
+        )
+    print(
+        f"{out}: {len(only)} runs, {len(film)} frames of a film and {len(INSTANTS)} of a clip each"
+    )
 
 
 def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel) -> dict[str, Any]:
-    """Return what the model says of a film, of its variants and of the clip that ends `video` (F, H, W, 3).
+    """Return what the model says of a film, of its variants and of the clip that ends `video` (F,
+    H, W, 3).
 
     An answer is mu with its interval, why there is none, or why the film is refused.
     """
@@ -79,7 +89,9 @@ def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
             moved = shake[some] - shake[first]
-            write_film(path, frames[some], camera, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=moved)
+            write_film(
+                path, frames[some], camera, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=moved
+            )
             try:
                 imported = import_video(path, lens)[0]
             except ValueError as error:
@@ -98,14 +110,22 @@ def summary(told: list[dict[str, Any]], name: str) -> dict[str, Any]:
     said = [film.get(name, "refused: as the film") for film in told]
     read = [place for place, each in enumerate(said) if not isinstance(each, str)]
     refused = sum(isinstance(each, str) and each.startswith("refused") for each in said)
-    row: dict[str, Any] = {"clips of": name, "refused": refused, "no_answer": len(said) - len(read) - refused}
+    row: dict[str, Any] = {
+        "clips of": name,
+        "refused": refused,
+        "no_answer": len(said) - len(read) - refused,
+    }
     if read:
         mu = np.array([told[place]["mu"] for place in read])
         scores = errors(
-            Estimates(*np.array([said[place] for place in read]).T), mu, np.unique(mu, return_inverse=True)[1]
+            Estimates(*np.array([said[place] for place in read]).T),
+            mu,
+            np.unique(mu, return_inverse=True)[1],
         )
         row |= {"clips": scores.clips, "simulations": scores.simulations}
-        row |= {each: round(getattr(scores, each).value, 3) for each in ("mae", "within_01", "coverage")}
+        row |= {
+            each: round(getattr(scores, each).value, 3) for each in ("mae", "within_01", "coverage")
+        }
         whole = [(said[place][0], told[place]["whole"]) for place in read]
         off = [abs(median - film[0]) for median, film in whole if not isinstance(film, str)]
         row["from_whole"] = {"mean": round(float(np.mean(off)), 4), "largest": round(max(off), 4)}

@@ -1,4 +1,5 @@
-"""Answer a test set of rods by our methods: one file of predictions each, for `stickslip-train benchmark score`.
+"""Answer a test set of rods by our methods: one file of predictions each, for `stickslip-train
+benchmark score`.
 
     python benchmarks/training/rod_entries.py INPUTS.npz OUT [--table-5-1 MODEL.pt]
 
@@ -44,7 +45,10 @@ def network(net: torch.nn.Module) -> Callable[[Lines], npt.NDArray[np.float64]]:
 
 
 def rod_by_rod(fit: Callable[[Any], Any]) -> Callable[[Lines], list[Answer]]:
-    """Return a fit of `stickslip_sim_core` as answers; null where no rod nearby hangs in a stable equilibrium."""
+    """Return a fit of `stickslip_sim_core` as answers.
+
+    Null where no rod nearby hangs in a stable equilibrium.
+    """
 
     def answers(lines: Lines) -> list[Answer]:
         found: list[Answer] = []
@@ -89,7 +93,10 @@ def main() -> None:
             for slot, answer in zip(slots, method(seen), strict=True)
         ]
         (args.out / f"{name}.json").write_text(json.dumps(answers) + "\n")
-        print(f"{name}: {1e3 * (time.process_time() - started) / len(answers):.2f} CPU ms a rod", flush=True)
+        print(
+            f"{name}: {1e3 * (time.process_time() - started) / len(answers):.2f} CPU ms a rod",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

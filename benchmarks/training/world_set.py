@@ -1,13 +1,16 @@
-"""Score a reader of friction on `cloth-2`: clips of Blender as a phone would film them, and clips without an answer.
+"""Score a reader of friction on `cloth-2`: clips of Blender as a phone would film them, and clips
+without an answer.
 
-    $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz FLOOR.npz --segmentation ... # for each sort of floor
-    python benchmarks/training/world_set.py MODEL RUNS.npz FLOOR.npz ... --record RECORD.json
+    $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz FLOOR.npz --segmentation ... # for
+    each sort of floor python benchmarks/training/world_set.py MODEL RUNS.npz FLOOR.npz ... --record
+    RECORD.json
 
-RUNS.npz is of `cloth_runs.py --vertices 41 --preset certified --self-friction 0.5`, with a seed that was never trained
-on. Every clip is read as it was rendered; with one thing at a time, drawn from a fixed seed: a clamp, hands, a shadow,
-a focal length wrong by up to 3 %, a roll by up to 1.5 degrees, a camera that stands 1 cm elsewhere, H.264, noise and
-exposure; and with all of them. Then sorts of clips without an answer are made of the same
-runs. None of them is one that the reader has as an example.
+RUNS.npz is of `cloth_runs.py --vertices 41 --preset certified --self-friction 0.5`, with a seed
+that was never trained on. Every clip is read as it was rendered; with one thing at a time, drawn
+from a fixed seed: a clamp, hands, a shadow, a focal length wrong by up to 3 %, a roll by up to 1.5
+degrees, a camera that stands 1 cm elsewhere, H.264, noise and exposure; and with all of them. Then
+sorts of clips without an answer are made of the same runs. None of them is one that the reader has
+as an example.
 """
 
 import argparse
@@ -41,12 +44,18 @@ COLUMNS = ("mae", "within_01", "within_02", "coverage", "interval")
 
 def clamp(video: Any, camera: Camera, random: Random) -> Any:
     """Draw a bulldog clip over each held patch."""
-    wide, high, level = random.uniform(6, 16) / 1000, random.uniform(6, 16) / 1000, random.uniform(20, 200)
+    wide, high, level = (
+        random.uniform(6, 16) / 1000,
+        random.uniform(6, 16) / 1000,
+        random.uniform(20, 200),
+    )
     for frame, points in zip(video, holder_points(np.array(INSTANTS, dtype=float)), strict=True):
         pixels, depth = camera.project(points)
         for (u, v), far in zip(pixels, depth, strict=True):
             w, h = wide * camera.fx / far / 2, high * camera.fx / far / 2
-            box = np.array([[u - w, v - h], [u + w, v - h], [u + 0.7 * w, v + h], [u - 0.7 * w, v + h]])
+            box = np.array(
+                [[u - w, v - h], [u + w, v - h], [u + 0.7 * w, v + h], [u - 0.7 * w, v + h]]
+            )
             cv2.fillConvexPoly(frame, box.round().astype(np.int32), (level,) * 3, cv2.LINE_AA)
     return video
 
@@ -62,14 +71,28 @@ def hands(video: Any, camera: Camera, random: Random) -> Any:
             place = (round(u), round(v - 0.015 * m))
             end = (round(u + side * 0.2 * m), round(v - 0.25 * m))
             cv2.line(frame, place, end, skin.tolist(), max(2, round(0.03 * m)), cv2.LINE_AA)
-            cv2.ellipse(frame, place, (round(0.017 * m), round(0.02 * m)), 0, 0, 360, skin.tolist(), -1, cv2.LINE_AA)
+            cv2.ellipse(
+                frame,
+                place,
+                (round(0.017 * m), round(0.02 * m)),
+                0,
+                0,
+                360,
+                skin.tolist(),
+                -1,
+                cv2.LINE_AA,
+            )
     return video
 
 
 def shadow(video: Any, camera: Camera, random: Random) -> Any:
     """Darken what is beyond a soft line that stays, and a blot that moves."""
     rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
-    angle, place, soft = random.uniform(0, 2 * np.pi), random.uniform(-50, 50), random.uniform(2, 15)
+    angle, place, soft = (
+        random.uniform(0, 2 * np.pi),
+        random.uniform(-50, 50),
+        random.uniform(2, 15),
+    )
     across = (columns - camera.cx) * np.cos(angle) + (rows - camera.cy) * np.sin(angle) - place
     still = 1 - random.uniform(0.2, 0.55) / (1 + np.exp(-across / soft))
     return np.clip(video * still[None, :, :, None], 0, 255).astype(np.uint8)
@@ -81,12 +104,17 @@ def warped(video: Any, camera: Camera, zoom: float, roll: float, shift: Any) -> 
     matrix[:, 2] += shift
     size = (camera.width, camera.height)
     return np.stack(
-        [cv2.warpAffine(frame, matrix, size, None, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE) for frame in video]
+        [
+            cv2.warpAffine(frame, matrix, size, None, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
+            for frame in video
+        ]
     )
 
 
 def focal(video: Any, camera: Camera, random: Random) -> Any:
-    return warped(video, camera, 1 + random.choice([-1, 1]) * random.uniform(0.01, 0.03), 0.0, (0.0, 0.0))
+    return warped(
+        video, camera, 1 + random.choice([-1, 1]) * random.uniform(0.01, 0.03), 0.0, (0.0, 0.0)
+    )
 
 
 def roll(video: Any, camera: Camera, random: Random) -> Any:
@@ -94,8 +122,12 @@ def roll(video: Any, camera: Camera, random: Random) -> Any:
 
 
 def position(video: Any, camera: Camera, random: Random) -> Any:
-    """Move the camera 1 cm: about as much as the holders are off in the picture, which registration then takes back."""
-    return warped(video, camera, 1 + random.uniform(-0.007, 0.007), 0.0, random.uniform(-0.6, 0.6, 2))
+    """Move the camera 1 cm: about as much as the holders are off in the picture, which registration
+    then takes back.
+    """
+    return warped(
+        video, camera, 1 + random.uniform(-0.007, 0.007), 0.0, random.uniform(-0.6, 0.6, 2)
+    )
 
 
 def h264(video: Any, camera: Camera, random: Random) -> Any:
@@ -114,8 +146,14 @@ def h264(video: Any, camera: Camera, random: Random) -> Any:
 
 def sensor(video: Any, camera: Camera, random: Random) -> Any:
     """Change exposure, white balance and gamma; blur, and add noise."""
-    light = (video / 255.0) ** random.uniform(0.8, 1.25) * random.uniform(0.75, 1.3) * random.uniform(0.9, 1.1, 3)
-    blurred = np.stack([cv2.GaussianBlur(frame, (0, 0), random.uniform(0.3, 0.8)) for frame in light])
+    light = (
+        (video / 255.0) ** random.uniform(0.8, 1.25)
+        * random.uniform(0.75, 1.3)
+        * random.uniform(0.9, 1.1, 3)
+    )
+    blurred = np.stack(
+        [cv2.GaussianBlur(frame, (0, 0), random.uniform(0.3, 0.8)) for frame in light]
+    )
     noise = random.normal(0, random.uniform(0.005, 0.02), video.shape)
     return np.clip(255 * (blurred + noise), 0, 255).astype(np.uint8)
 
@@ -150,7 +188,9 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
         for step in steps:
             if len(steps) == 1 or step not in (clamp, hands) or step is holds:
                 video = step(np.ascontiguousarray(video.copy()), camera, random)
-        crops.append(cut(grey(torch.from_numpy(video[None])), holder_crops(Cameras.of([camera]), INSTANTS)))
+        crops.append(
+            cut(grey(torch.from_numpy(video[None])), holder_crops(Cameras.of([camera]), INSTANTS))
+        )
     return replace(clips, crops=torch.cat(crops))
 
 
@@ -161,7 +201,9 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
     held = holders_at(INSTANTS)
 
     def shown(positions: Any, seed: int) -> Clips:
-        return render_clips(replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True)
+        return render_clips(
+            replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True
+        )
 
     meshes = runs.positions
     lifted = hanging(meshes, held) + np.array([0, 0, 0.06], np.float32)
@@ -190,7 +232,9 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
         "half a leg out of phase": shown(reordered(meshes, held, [1, 2, 3, 4, 5, 0]), 10),
         "no cloth": shown(empty, 11),
         "upside down": replace(good, crops=good.crops.flip(2)),
-        "a crop that is off by 6 and 8 px": replace(good, crops=torch.roll(good.crops, (6, 8), (2, 3))),
+        "a crop that is off by 6 and 8 px": replace(
+            good, crops=torch.roll(good.crops, (6, 8), (2, 3))
+        ),
         "noise": replace(good, crops=noise),
     }
 
@@ -201,7 +245,9 @@ def main() -> None:
     parser.add_argument("model", type=Path, nargs="?", default=WEIGHTS)
     parser.add_argument("runs", type=Path)
     parser.add_argument("clips", type=Path, nargs="+")
-    parser.add_argument("--factors", nargs="+", choices=FACTORS, default=list(FACTORS), metavar="FACTOR")
+    parser.add_argument(
+        "--factors", nargs="+", choices=FACTORS, default=list(FACTORS), metavar="FACTOR"
+    )
     parser.add_argument("--record", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -209,7 +255,9 @@ def main() -> None:
     rows: dict[str, Any] = {}
     started = time.process_time()
     for name in args.factors:
-        films = [(f" / {path.stem}", filmed(path, model.materials, FACTORS[name])) for path in args.clips]
+        films = [
+            (f" / {path.stem}", filmed(path, model.materials, FACTORS[name])) for path in args.clips
+        ]
         for floor, clips in [("", Clips.joined([clips for _, clips in films])), *films]:
             found = estimates(model.estimate(clips).mu, model.bins)
             told = errors(found, clips.mu, clips.run)
@@ -230,7 +278,9 @@ def main() -> None:
     print("without an answer", flagged["all"], f"{time.process_time() - started:.0f} CPU s")
     if args.record is not None:
         listed = [{"clips of": name, **row} for name, row in rows.items()]
-        listed += [{"sort without an answer": name, "flagged": share} for name, share in flagged.items()]
+        listed += [
+            {"sort without an answer": name, "flagged": share} for name, share in flagged.items()
+        ]
         record = {"rows": listed}
         write_durably(args.record, (json.dumps(record, indent=1) + "\n").encode())
 

@@ -1,6 +1,7 @@
 """A coordinator on a temporary directory: in the process with a clock of its own, or as a server.
 
-Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL only as slow tests.
+Tests marked `databases` run on SQLite and on PostgreSQL; with `databases(slow=True)` on PostgreSQL
+only as slow tests.
 """
 
 import itertools
@@ -53,7 +54,9 @@ def postgresql() -> Iterator["PostgresqlServer"]:
 @pytest.fixture(scope="session")
 def s3() -> Iterator["Proxy"]:
     """An S3 server behind a proxy, started with the first test that needs it."""
-    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    pytest.importorskip(
+        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+    )
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
     from stickslip_testing.s3 import s3_proxy
 
@@ -85,13 +88,17 @@ def database(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.fixture
-def empty_database(database: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Callable[[], Database]]:
+def empty_database(
+    database: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[Callable[[], Database]]:
     """Makes databases without tables."""
     made: list[Database] = []
 
     def make() -> Database:
         url = None if database == "sqlite" else request.getfixturevalue("postgresql").empty()
-        made.append(connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url)))
+        made.append(
+            connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url))
+        )
         return made[-1]
 
     yield make
@@ -113,7 +120,10 @@ def clock() -> ManualClock:
 
 @pytest.fixture
 def settings(tmp_path: Path, database: str, request: pytest.FixtureRequest) -> Settings:
-    """Settings of a coordinator; parametrise it indirectly with a dictionary for others than the defaults."""
+    """Settings of a coordinator.
+
+    Parametrise it indirectly with a dictionary for others than the defaults.
+    """
     return Settings(data=tmp_path / "data", durable=False, **getattr(request, "param", {}))
 
 

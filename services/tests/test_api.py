@@ -39,7 +39,9 @@ def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
 
 
 @pytest.fixture(scope="module")
-def untouched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, PretendWorker]]:
+def untouched(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[httpx.Client, PretendWorker]]:
     """A coordinator for requests that are all refused."""
     app = make_app(Settings(data=tmp_path_factory.mktemp("untouched"), durable=False))
     headers = {"Authorization": f"Bearer {app.state.worker_key}"}
@@ -66,17 +68,26 @@ CLOTH_AXES = {"material": "gray-interlock", "mu": 0.2, "texture": "dots", "viewp
 MANY = {"type": "linspace", "start": 0, "stop": 9, "num": 10_000}
 
 BAD_SPECS: dict[str, tuple[Any, str]] = {
-    "unknown material": ({"kind": "cloth_drag", "axes": CLOTH_AXES | {"material": "silk"}}, "/axes/material"),
+    "unknown material": (
+        {"kind": "cloth_drag", "axes": CLOTH_AXES | {"material": "silk"}},
+        "/axes/material",
+    ),
     "negative mu": ({"kind": "cloth_drag", "axes": CLOTH_AXES | {"mu": -0.1}}, "/axes/mu"),
     "empty axis": (with_axis(gamma=[]), "/axes/gamma"),
     "a value twice": (with_axis(gamma=[1.0, 1.0]), "/axes/gamma"),
     "a million million samples": (
         with_axis(
-            **{name: {"type": "linspace", "start": 0, "stop": 9, "num": 10_000} for name in ("gamma", "phi0", "phi1")}
+            **{
+                name: {"type": "linspace", "start": 0, "stop": 9, "num": 10_000}
+                for name in ("gamma", "phi0", "phi1")
+            }
         ),
         "",
     ),
-    "too many values": (with_axis(gamma={"type": "linspace", "start": 0, "stop": 9, "num": 10**12}), "/axes/gamma/num"),
+    "too many values": (
+        with_axis(gamma={"type": "linspace", "start": 0, "stop": 9, "num": 10**12}),
+        "/axes/gamma/num",
+    ),
     "unknown field": (with_axis() | {"colour": "red"}, "/colour"),
     "unknown kind": (with_axis() | {"kind": "hair"}, ""),
     "no kind": ({"axes": {}}, ""),
@@ -87,7 +98,10 @@ BAD_SPECS: dict[str, tuple[Any, str]] = {
     "true for a number": (with_axis(gamma=[True]), "/axes/gamma"),
     "a list": ([], ""),
     "null": (None, ""),
-    "splits of more than all": (with_axis() | {"splits": {"train": 1.0, "validation": 1.0, "test": 0.0}}, "/splits"),
+    "splits of more than all": (
+        with_axis() | {"splits": {"train": 1.0, "validation": 1.0, "test": 0.0}},
+        "/splits",
+    ),
     "zipped axes of two lengths": (with_axis(gamma=[1.0, 2.0]) | {"combine": "zip"}, ""),
     "a name with a slash": (with_axis() | {"name": "../x"}, "/name"),
 }
@@ -102,7 +116,9 @@ def test_a_bad_spec_is_refused_with_its_place(
     spec, pointer = BAD_SPECS[what]
     response = client.post(path, content=json.dumps(spec), headers=JSON)
     document = problem(response, 422, "validation_failed")
-    assert any(error["pointer"].startswith(pointer) and error["rule"] for error in document["errors"])
+    assert any(
+        error["pointer"].startswith(pointer) and error["rule"] for error in document["errors"]
+    )
     assert all(len(error["value"]) <= 200 for error in document["errors"])
     assert client.get("/v1/jobs").json()["items"] == []
     assert worker.lease() == ()
@@ -139,15 +155,27 @@ def test_a_key_twice_is_refused_in_a_message_that_is_right_otherwise(
 
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e400"])
-def test_a_number_that_is_not_finite_is_refused_with_its_place(client: httpx.Client, number: str) -> None:
+def test_a_number_that_is_not_finite_is_refused_with_its_place(
+    client: httpx.Client, number: str
+) -> None:
     body = json.dumps(with_axis()).replace("[1.0]", number).encode()
-    document = problem(client.post("/v1/jobs", content=body, headers=JSON), 422, "validation_failed")
+    document = problem(
+        client.post("/v1/jobs", content=body, headers=JSON), 422, "validation_failed"
+    )
     assert document["errors"][0]["pointer"] == "/axes/gamma"
 
 
 def test_a_report_with_nan_in_its_labels_is_refused(client: httpx.Client) -> None:
-    output = {"stage": "simulate", "record": {"digest": "0" * 64, "row": 0}, "labels": {"energy": float("nan")}}
-    report = {"task_id": "simulate-0", "token": 1, "result": {"outcome": "succeeded", "output": output}}
+    output = {
+        "stage": "simulate",
+        "record": {"digest": "0" * 64, "row": 0},
+        "labels": {"energy": float("nan")},
+    }
+    report = {
+        "task_id": "simulate-0",
+        "token": 1,
+        "result": {"outcome": "succeeded", "output": output},
+    }
     body = json.dumps({"worker_id": "worker-0", "reports": [report]}).encode()
     problem(client.post("/v1/worker/report", content=body, headers=JSON), 400, "malformed_body")
 
@@ -155,8 +183,14 @@ def test_a_report_with_nan_in_its_labels_is_refused(client: httpx.Client) -> Non
 @pytest.mark.parametrize(
     ("body", "rule"),
     [
-        (json.dumps({"kind": "rod_hang"} | {f"key-{n}": 1 for n in range(150_000)}), "there is no such field"),
-        ("{" + ",".join(f'"key-{n}": 1' for n in range(150_000)) + ', "key-149999": 2}', "'key-149999' is there twice"),
+        (
+            json.dumps({"kind": "rod_hang"} | {f"key-{n}": 1 for n in range(150_000)}),
+            "there is no such field",
+        ),
+        (
+            "{" + ",".join(f'"key-{n}": 1' for n in range(150_000)) + ', "key-149999": 2}',
+            "'key-149999' is there twice",
+        ),
         ('{"axes":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
     ],
     ids=["unknown", "doubled", "nested"],
@@ -178,9 +212,15 @@ def test_browsers_do_not_guess_types(client: httpx.Client) -> None:
 
 def test_another_content_type_is_refused(client: httpx.Client) -> None:
     body = json.dumps(with_axis()).encode()
-    problem(client.post("/v1/jobs", content=body, headers={"Content-Type": "text/plain"}), 415, "malformed_body")
+    problem(
+        client.post("/v1/jobs", content=body, headers={"Content-Type": "text/plain"}),
+        415,
+        "malformed_body",
+    )
     problem(client.post("/v1/jobs", content=body), 415, "malformed_body")
-    assert client.post("/v1/jobs", content=body, headers={"Content-Type": "application/json; charset=utf-8"}).is_success
+    assert client.post(
+        "/v1/jobs", content=body, headers={"Content-Type": "application/json; charset=utf-8"}
+    ).is_success
 
 
 def test_a_large_body_is_refused(client: httpx.Client, settings: Settings) -> None:
@@ -200,12 +240,19 @@ def test_unknown_places_and_methods_are_problems(client: httpx.Client) -> None:
     assert client.get("/v1/jobs/job-0:cancel").status_code == 404
     assert client.options("/v1/jobs/job-0:cancel").headers["allow"] == "POST"
     problem(client.put("/v1/jobs"), 405, "method_not_allowed")
-    problem(client.get("/v1/datasets/ds-0/versions/999999999999999999999"), 422, "validation_failed")
+    problem(
+        client.get("/v1/datasets/ds-0/versions/999999999999999999999"), 422, "validation_failed"
+    )
 
 
 def test_a_request_id_is_echoed(client: httpx.Client) -> None:
-    assert client.get("/livez", headers={"X-Request-Id": "mine-1"}).headers["x-request-id"] == "mine-1"
-    assert client.get("/livez", headers={"X-Request-Id": "bad id!"}).headers["x-request-id"] != "bad id!"
+    assert (
+        client.get("/livez", headers={"X-Request-Id": "mine-1"}).headers["x-request-id"] == "mine-1"
+    )
+    assert (
+        client.get("/livez", headers={"X-Request-Id": "bad id!"}).headers["x-request-id"]
+        != "bad id!"
+    )
 
 
 def test_a_job_is_accepted_and_shown(client: httpx.Client, worker: PretendWorker) -> None:
@@ -236,17 +283,27 @@ def test_an_idempotency_key_makes_one_job(client: httpx.Client, worker: PretendW
     other = client.post("/v1/jobs", json=rods(gamma=(5.0,)), headers=headers)
     problem(other, 422, "idempotency_key_reused")
     assert len(client.get("/v1/jobs").json()["items"]) == 1
-    problem(client.post("/v1/jobs", json=rods(), headers={"Idempotency-Key": "k" * 256}), 422, "validation_failed")
+    problem(
+        client.post("/v1/jobs", json=rods(), headers={"Idempotency-Key": "k" * 256}),
+        422,
+        "validation_failed",
+    )
 
 
-def test_a_kind_that_no_worker_makes_is_a_problem(client: httpx.Client, worker: PretendWorker) -> None:
+def test_a_kind_that_no_worker_makes_is_a_problem(
+    client: httpx.Client, worker: PretendWorker
+) -> None:
     response = client.post("/v1/jobs", json={"kind": "cloth_drag", "axes": CLOTH_AXES})
     problem(response, 409, "kind_not_available")
 
 
 def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> None:
     before = client.post("/v1/jobs:validate", json=rods()).json()
-    assert (before["sample_count"], before["simulation_count"], before["cached_count"]) == (4, 4, None)
+    assert (before["sample_count"], before["simulation_count"], before["cached_count"]) == (
+        4,
+        4,
+        None,
+    )
     context = app.state.context
     worker = PretendWorker(DirectApi(context), context.store).register()
     assert client.post("/v1/jobs:validate", json=rods()).json()["cached_count"] == 0
@@ -259,14 +316,20 @@ def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> No
     assert (usual["measured"], usual["wall_seconds"]) == ([], None)
     assert 0.1 < usual["cpu_seconds"]["median"] < 10
     assert costs["measured"] == ["pack", "simulate", "render"]
-    assert costs["cpu_seconds"]["median"] == pytest.approx(2 * (6 + 6 + 3), abs=1)  # PretendWorker reports 2 s each
+    assert costs["cpu_seconds"]["median"] == pytest.approx(
+        2 * (6 + 6 + 3), abs=1
+    )  # PretendWorker reports 2 s each
     assert costs["cpu_seconds"]["low"] < 30 < costs["cpu_seconds"]["high"]
-    assert costs["wall_seconds"]["median"] == pytest.approx(costs["cpu_seconds"]["median"] / worker.slots)
+    assert costs["wall_seconds"]["median"] == pytest.approx(
+        costs["cpu_seconds"]["median"] / worker.slots
+    )
     assert len(client.get("/v1/jobs").json()["items"]) == 1
 
 
 def test_pages_stay_what_they_are_while_jobs_come(client: httpx.Client) -> None:
-    made = [client.post("/v1/jobs", json=rods(name=f"job{number}")).json()["id"] for number in range(5)]
+    made = [
+        client.post("/v1/jobs", json=rods(name=f"job{number}")).json()["id"] for number in range(5)
+    ]
     page = client.get("/v1/jobs", params={"page_size": 2}).json()
     seen = [item["id"] for item in page["items"]]
     while page["next_page_token"]:
@@ -278,7 +341,9 @@ def test_pages_stay_what_they_are_while_jobs_come(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("token", ["x", "%", "LTE", "MTIzNDU2Nzg5MDEyMzQ1Njc4OTA", "é", ""])
-def test_a_foreign_page_token_is_refused(untouched: tuple[httpx.Client, PretendWorker], token: str) -> None:
+def test_a_foreign_page_token_is_refused(
+    untouched: tuple[httpx.Client, PretendWorker], token: str
+) -> None:
     response = untouched[0].get("/v1/jobs", params={"page_token": token})
     problem(response, 422, "validation_failed")
 
@@ -286,16 +351,22 @@ def test_a_foreign_page_token_is_refused(untouched: tuple[httpx.Client, PretendW
 def test_samples_are_listed_by_slot(client: httpx.Client, worker: PretendWorker) -> None:
     job = client.post("/v1/jobs", json=rods()).json()["id"]
     first = client.get(f"/v1/jobs/{job}/samples", params={"page_size": 3}).json()
-    assert [(item["slot"], item["state"]) for item in first["items"]] == [(slot, "pending") for slot in range(3)]
+    assert [(item["slot"], item["state"]) for item in first["items"]] == [
+        (slot, "pending") for slot in range(3)
+    ]
     query = {"page_size": 3, "page_token": first["next_page_token"]}
     rest = client.get(f"/v1/jobs/{job}/samples", params=query).json()
     assert [item["slot"] for item in rest["items"]] == [3]
     assert rest["items"][0]["labels"] == {"gamma": 2.0, "phi0": 0.0, "phi1": 3.0}
     assert rest["next_page_token"] is None
-    problem(client.get(f"/v1/jobs/{job}/samples", params={"state": "odd"}), 422, "validation_failed")
+    problem(
+        client.get(f"/v1/jobs/{job}/samples", params={"state": "odd"}), 422, "validation_failed"
+    )
 
 
-def test_previews_are_served_and_nothing_else_is(client: httpx.Client, worker: PretendWorker) -> None:
+def test_previews_are_served_and_nothing_else_is(
+    client: httpx.Client, worker: PretendWorker
+) -> None:
     job = client.post("/v1/jobs", json=rods()).json()["id"]
     assert client.get(f"/v1/jobs/{job}/previews").json() == []
     worker.work()
@@ -307,7 +378,9 @@ def test_previews_are_served_and_nothing_else_is(client: httpx.Client, worker: P
     problem(client.get(f"/v1/previews/{manifest}"), 404, "not_found")
 
 
-def test_workers_are_listed(client: httpx.Client, worker: PretendWorker, clock: ManualClock) -> None:
+def test_workers_are_listed(
+    client: httpx.Client, worker: PretendWorker, clock: ManualClock
+) -> None:
     client.post("/v1/jobs", json=rods())
     worker.lease(simulate=3)
     (shown,) = client.get("/v1/workers").json()
@@ -323,7 +396,10 @@ def test_the_worker_api_speaks_in_problems(client: httpx.Client, worker: Pretend
     assert client.post("/v1/worker/lease", json=body).json()["leases"] == []
     PretendWorker(worker.api, worker.store).register()
     problem(client.post("/v1/worker/lease", json=body), 409, "conflict")
-    report = {"worker_id": worker.id, "reports": [{"task_id": "nonsense", "token": 1, "result": None}]}
+    report = {
+        "worker_id": worker.id,
+        "reports": [{"task_id": "nonsense", "token": 1, "result": None}],
+    }
     assert client.post("/v1/worker/report", json=report).json()["verdicts"][0]["verdict"] == "stale"
     report["reports"] = [{"task_id": "simulate-" + "0" * 64, "token": 10**40, "result": None}]
     assert client.post("/v1/worker/report", json=report).json()["verdicts"][0]["verdict"] == "stale"
@@ -338,7 +414,9 @@ def test_health_and_metrics(client: httpx.Client, worker: PretendWorker) -> None
     assert 'stickslip_tasks{stage="simulate",state="leased"} 2.0' in text
     assert 'stickslip_jobs{state="running"} 1.0' in text
     assert 'stickslip_leases{worker="pretend"} 2.0' in text
-    assert 'stickslip_request_seconds_count{method="POST",route="/v1/jobs",status="202"} 1.0' in text
+    assert (
+        'stickslip_request_seconds_count{method="POST",route="/v1/jobs",status="202"} 1.0' in text
+    )
 
 
 def test_metrics_count_unknown_methods_as_one(client: httpx.Client) -> None:
@@ -346,11 +424,15 @@ def test_metrics_count_unknown_methods_as_one(client: httpx.Client) -> None:
     for word in ("BREW", "POUR"):
         client.request(word, "/v1/jobs")
     text = client.get("/metrics").text
-    assert 'stickslip_request_seconds_count{method="other",route="/v1/jobs",status="405"} 2.0' in text
+    assert (
+        'stickslip_request_seconds_count{method="other",route="/v1/jobs",status="405"} 2.0' in text
+    )
     assert not any(word in text for word in ("BREW", "POUR"))
 
 
-def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: httpx.Client) -> None:
+def test_metrics_tell_how_tasks_ended_and_what_is_stored(
+    app: FastAPI, client: httpx.Client
+) -> None:
     api = HttpApi(str(client.base_url), app.state.worker_key)
 
     def judge(task: Any) -> Any:
@@ -365,8 +447,14 @@ def test_metrics_tell_how_tasks_ended_and_what_is_stored(app: FastAPI, client: h
     text = client.get("/metrics").text
     assert 'stickslip_task_seconds_count{outcome="succeeded",stage="simulate"} 2.0' in text
     assert 'stickslip_task_seconds_sum{outcome="rejected",stage="simulate"} 2.0' in text
-    assert 'stickslip_task_failures_total{outcome="rejected",reason="solver_diverged",stage="simulate"} 2.0' in text
-    assert 'stickslip_task_failures_total{outcome="failed",reason="renderer_crash",stage="render"} 2.0' in text
+    assert (
+        'stickslip_task_failures_total{outcome="rejected",reason="solver_diverged",stage="simulate"} 2.0'
+        in text
+    )
+    assert (
+        'stickslip_task_failures_total{outcome="failed",reason="renderer_crash",stage="render"} 2.0'
+        in text
+    )
     assert 'stickslip_store_disk_bytes{state="free"}' in text
     assert "stickslip_dataset_versions 0.0" in text
     assert 'stickslip_info{version="' in text
@@ -388,17 +476,27 @@ def test_a_job_has_a_priority_that_can_be_changed(client: httpx.Client) -> None:
     problem(client.patch("/v1/jobs/job-0", json={"priority": 1}), 404, "not_found")
     for wrong in ({"priority": 101}, {"priority": 1.5}, {}, {"priority": 1, "state": "failed"}):
         problem(client.patch(f"/v1/jobs/{job['id']}", json=wrong), 422, "validation_failed")
-    problem(client.post("/v1/jobs", params={"priority": 101}, json=rods()), 422, "validation_failed")
+    problem(
+        client.post("/v1/jobs", params={"priority": 101}, json=rods()), 422, "validation_failed"
+    )
     client.post(f"/v1/jobs/{job['id']}:cancel")
     problem(client.patch(f"/v1/jobs/{job['id']}", json={"priority": 1}), 409, "conflict")
 
 
-def test_workers_show_what_they_run_and_how_far_it_is(client: httpx.Client, worker: PretendWorker) -> None:
+def test_workers_show_what_they_run_and_how_far_it_is(
+    client: httpx.Client, worker: PretendWorker
+) -> None:
     job = client.post("/v1/jobs", json=rods()).json()["id"]
     running, _ = worker.lease(simulate=2)
-    state = {"task_id": running.task_id, "token": running.token, "started": True, "frames": [40, 300]}
+    state = {
+        "task_id": running.task_id,
+        "token": running.token,
+        "started": True,
+        "frames": [40, 300],
+    }
     client.post(
-        "/v1/worker/heartbeat", json={"worker_id": worker.id, "leases": [state], "condition": {"slots": 2}}
+        "/v1/worker/heartbeat",
+        json={"worker_id": worker.id, "leases": [state], "condition": {"slots": 2}},
     ).raise_for_status()
     (shown,) = client.get("/v1/workers").json()
     assert shown["leased"] == 2
@@ -410,4 +508,7 @@ def test_workers_show_what_they_run_and_how_far_it_is(client: httpx.Client, work
         [40, 300],
     )
     assert "40 of 300" in client.get("/workers").text
-    assert client.get(f"/v1/jobs/{job}").json()["progress"]["stages"]["simulate"]["frames"] == [40, 300]
+    assert client.get(f"/v1/jobs/{job}").json()["progress"]["stages"]["simulate"]["frames"] == [
+        40,
+        300,
+    ]

@@ -9,7 +9,16 @@ import pytest
 from click.testing import CliRunner
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
-from stickslip_services.access.keys import NOBODY, Asker, Scope, asking, create_key, read_audit_log, revoke_key, sealer
+from stickslip_services.access.keys import (
+    NOBODY,
+    Asker,
+    Scope,
+    asking,
+    create_key,
+    read_audit_log,
+    revoke_key,
+    sealer,
+)
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
@@ -50,7 +59,9 @@ def test_every_change_of_a_job_has_its_line(context: Context, worker: PretendWor
     ]
 
 
-def test_what_is_refused_or_fails_leaves_no_line(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_refused_or_fails_leaves_no_line(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     with pytest.raises(NotFoundError):
         pause_job(context, "job-0")
@@ -67,13 +78,21 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
     with asking(Asker("user ada")), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
         revoke_key(connection, key, 2.0)
-        hook, sign = create_webhook(connection, sealer(context.settings), "https://example.org/hook", 3.0)
+        hook, sign = create_webhook(
+            connection, sealer(context.settings), "https://example.org/hook", 3.0
+        )
         retry_webhook(connection, hook, 4.0)
         delete_webhook(connection, hook, 5.0)
     found = lines(context)
     assert [(actor, action) for actor, action, _ in found] == [
         ("user ada", action)
-        for action in ("key.create", "key.revoke", "webhook.create", "webhook.retry", "webhook.delete")
+        for action in (
+            "key.create",
+            "key.revoke",
+            "webhook.create",
+            "webhook.retry",
+            "webhook.delete",
+        )
     ]
     assert found[0][2] == {"name": "bert", "scopes": ["read", "submit"], "project": ""}
     assert not any(secret in json.dumps(found) for secret in (secret, sign))
@@ -83,30 +102,44 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
 def test_no_line_can_be_changed(context: Context, change: Any) -> None:
     submit_job(context, parsed(rods()), None)
     before = lines(context)
-    with pytest.raises(DBAPIError, match="the audit log is append-only"), context.database.write() as connection:
+    with (
+        pytest.raises(DBAPIError, match="the audit log is append-only"),
+        context.database.write() as connection,
+    ):
         connection.execute(change)
     assert lines(context) == before != []
 
 
-def test_requests_are_told_apart_by_their_keys(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_are_told_apart_by_their_keys(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also when many come at once: each is noted with its own."""
     application = make_app(settings.model_copy(update={"require_keys": True}))
     with serving(application) as url:
         with application.state.context.database.write() as connection:
-            made = [create_key(connection, name, [Scope.submit], time.time()) for name in ("ada", "bert")]
+            made = [
+                create_key(connection, name, [Scope.submit], time.time())
+                for name in ("ada", "bert")
+            ]
         time.sleep(1.1)  # so long a key may take to count
         for _ in range(3):
             for _, secret in made:
                 headers = {"Authorization": f"Bearer {secret}"}
-                answer = httpx.post(f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30)
+                answer = httpx.post(
+                    f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30
+                )
                 assert answer.status_code == 202, answer.text
-        found = [actor for actor, action, _ in lines(application.state.context) if action == "job.submit"]
+        found = [
+            actor for actor, action, _ in lines(application.state.context) if action == "job.submit"
+        ]
     assert found == [f"{made[number % 2][0]} {('ada', 'bert')[number % 2]}" for number in range(6)]
 
 
 def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     def cli(*words: str) -> Any:
-        result = CliRunner().invoke(app, [*words, "--data", str(settings.data)], env={"COLUMNS": "200"})
+        result = CliRunner().invoke(
+            app, [*words, "--data", str(settings.data)], env={"COLUMNS": "200"}
+        )
         assert result.exit_code == 0, result.output
         return result
 

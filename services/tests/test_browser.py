@@ -1,7 +1,8 @@
-"""The dashboard in Chromium: every page at two widths, in light and dark, accessible, live, and by keyboard.
+"""The dashboard in Chromium: every page at two widths, in light and dark, accessible, live, and by
+keyboard.
 
-Needs Chromium (`apt-get install chromium`): Playwright brings no browser of its own here. Accessibility is checked with
-axe-core, which `axe-playwright-python` brings.
+Needs Chromium (`apt-get install chromium`): Playwright brings no browser of its own here.
+Accessibility is checked with axe-core, which `axe-playwright-python` brings.
 """
 
 from collections.abc import Iterator
@@ -67,7 +68,9 @@ def worker(app: FastAPI, url: str) -> PretendWorker:
         kinds=("rod_hang", "cloth_scene"),
         whole=True,
         judge=lambda task: (
-            rejection() if task.stage == "simulate" and getattr(task.simulation, "gamma", None) == 1.0 else None
+            rejection()
+            if task.stage == "simulate" and getattr(task.simulation, "gamma", None) == 1.0
+            else None
         ),
     ).register()
 
@@ -93,19 +96,42 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
         for upload in uploads
     ]
-    shown = [page for job, clip in clips for page in (job, clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")]
-    return ["/", *jobs, "/datasets", root, *samples, "/certificates", *certificates, "/workers", "/docs", *shown]
+    shown = [
+        page
+        for job, clip in clips
+        for page in (job, clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")
+    ]
+    return [
+        "/",
+        *jobs,
+        "/datasets",
+        root,
+        *samples,
+        "/certificates",
+        *certificates,
+        "/workers",
+        "/docs",
+        *shown,
+    ]
 
 
 SCENES = (
-    ("turning-ball", {"duration": 1.0, "sheets.napkin.mesh.cells": [6, 6], "bodies.ball.motion.spin.begin": 0.0}),
+    (
+        "turning-ball",
+        {"duration": 1.0, "sheets.napkin.mesh.cells": [6, 6], "bodies.ball.motion.spin.begin": 0.0},
+    ),
     ("over-the-edge", {"duration": 1.0, "sheets.strip.mesh.cells": [24, 2]}),
 )
 """Small scenes: one with a floor and a ball, one with a table and a holder, but without a floor."""
 
 
-def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict[str, Any]) -> tuple[str, str]:
-    """Make a dataset of true motions and invented pictures; return the pages of the job and of the dataset."""
+def make_cloth(
+    context: Context, worker: PretendWorker, scene: str, values: dict[str, Any]
+) -> tuple[str, str]:
+    """Make a dataset of true motions and invented pictures.
+
+    Return the pages of the job and of the dataset.
+    """
     spec = parsed(
         {
             "kind": "cloth_scene",
@@ -119,7 +145,9 @@ def make_cloth(context: Context, worker: PretendWorker, scene: str, values: dict
             "samples_per_shard": 2,
         }
     )
-    (outcome,) = KIND.simulate([{"scene": with_arrays(spec.stage, context.store.read), "seed": 1}], None)
+    (outcome,) = KIND.simulate(
+        [{"scene": with_arrays(spec.stage, context.store.read), "seed": 1}], None
+    )
     assert not outcome.reason
     worker.record = outcome.record
     submitted = submit_job(context, spec, None)
@@ -182,13 +210,22 @@ def test_every_page_is_whole(browser: Any, url: str, paths: list[str], width: in
     context = browser.new_context(viewport={"width": width, "height": 900}, reduced_motion="reduce")
     page = context.new_page()
     faults: list[str] = []
-    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    page.on(
+        "console", lambda message: faults.append(message.text) if message.type == "error" else None
+    )
     page.on("pageerror", lambda error: faults.append(str(error)))
-    page.on("request", lambda request: None if request.url.startswith((url, "data:")) else faults.append(request.url))
+    page.on(
+        "request",
+        lambda request: (
+            None if request.url.startswith((url, "data:")) else faults.append(request.url)
+        ),
+    )
     for path in paths:
         page.goto(url + path)
         page.wait_for_load_state("load")
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{path} is wider than {width} px"
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
+            f"{path} is wider than {width} px"
+        )
         assert page.locator("h1").count() == 1
         if path.startswith("/v1/"):
             continue  # inert: its policy lets no script run, axe neither
@@ -196,7 +233,11 @@ def test_every_page_is_whole(browser: Any, url: str, paths: list[str], width: in
         for scheme, options in SCHEMES[width].items():
             page.emulate_media(color_scheme=scheme)
             violations = page.evaluate(f"axe.run({options})")["violations"]
-            serious = [(v["id"], v["nodes"][0]["html"]) for v in violations if v["impact"] in ("serious", "critical")]
+            serious = [
+                (v["id"], v["nodes"][0]["html"])
+                for v in violations
+                if v["impact"] in ("serious", "critical")
+            ]
             assert serious == [], (path, scheme)
     assert faults == []
     context.close()
@@ -213,7 +254,9 @@ def test_a_page_follows_the_job_and_its_buttons_work(
     wait_until(lambda: page.locator(".state").first.inner_text() == "running")
     before = page.locator("progress").first.get_attribute("value")
     worker.finish(*worker.lease(simulate=2))
-    wait_until(lambda: page.locator("progress").first.get_attribute("value") != before)  # nobody reloaded
+    wait_until(
+        lambda: page.locator("progress").first.get_attribute("value") != before
+    )  # nobody reloaded
     page.close()
 
 
@@ -234,7 +277,9 @@ def test_the_keyboard_is_enough(browser: Any, url: str, paths: list[str]) -> Non
     page.close()
 
 
-def test_a_sample_in_space_turns_and_follows_the_cursor(browser: Any, url: str, paths: list[str]) -> None:
+def test_a_sample_in_space_turns_and_follows_the_cursor(
+    browser: Any, url: str, paths: list[str]
+) -> None:
     page = browser.new_page()
     page.goto(url + next(path for path in paths if path.endswith("/samples/1")))
     canvas = page.locator(".space canvas")
@@ -259,14 +304,19 @@ def test_a_sample_in_space_turns_and_follows_the_cursor(browser: Any, url: str, 
     page.close()
 
 
-def test_two_samples_share_the_cursor_and_the_layer(browser: Any, url: str, paths: list[str]) -> None:
+def test_two_samples_share_the_cursor_and_the_layer(
+    browser: Any, url: str, paths: list[str]
+) -> None:
     page = browser.new_page()
     page.goto(url + next(path for path in paths if "?beside=" in path))
     page.locator("select").select_option("depth")
     page.locator(".time").focus()
     page.keyboard.press("End")
     shown = [image.get_attribute("src") for image in page.locator(".clip > img").all()]
-    assert [source.rpartition("samples")[2] for source in shown] == ["/0/depth/4.png", "/1/depth/4.png"]
+    assert [source.rpartition("samples")[2] for source in shown] == [
+        "/0/depth/4.png",
+        "/1/depth/4.png",
+    ]
     assert page.locator(".mp4").first.get_attribute("href").endswith("/samples/0/depth.mp4")
     assert page.locator(".space[data-drawn]").count() == 2
     page.close()

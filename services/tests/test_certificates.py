@@ -25,7 +25,9 @@ from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker
 KINDS = ("rod_hang", "cloth_drag", "cloth_scene")
 
 
-def upload(*, protocols: tuple[str, ...] = ("stick-slip", *CONTACT_PROTOCOLS), **changes: Any) -> Certificate:
+def upload(
+    *, protocols: tuple[str, ...] = ("stick-slip", *CONTACT_PROTOCOLS), **changes: Any
+) -> Certificate:
     error = changes.pop("error", 0.001)
     report = {
         "x": "strain",
@@ -35,7 +37,9 @@ def upload(*, protocols: tuple[str, ...] = ("stick-slip", *CONTACT_PROTOCOLS), *
         "passed": error <= 0.01,
         "settings": {},
         "build_hash": "d" * 64,
-        "curves": [{"parameters": {}, "x": [0.1], "measured": [1.0], "master": [1.0], "errors": [error]}],
+        "curves": [
+            {"parameters": {}, "x": [0.1], "measured": [1.0], "master": [1.0], "errors": [error]}
+        ],
     }
     content = {
         "preset": "certified",
@@ -87,7 +91,9 @@ class TestTheRule:
         [{"preset": "fast"}, {"sim_core": "8" * 64}, {"extent": "quick"}, {"error": 0.02}],
         ids=["preset", "build", "quick", "failed"],
     )
-    def test_no_other_certificate_will_do(self, context: Context, weaver: PretendWorker, other: dict[str, Any]) -> None:
+    def test_no_other_certificate_will_do(
+        self, context: Context, weaver: PretendWorker, other: dict[str, Any]
+    ) -> None:
         register_certificate(context.database, context.store, upload(**other), context.clock())
         with pytest.raises(PresetNotCertifiedError):
             submit_job(context, cloth(), None)
@@ -97,11 +103,20 @@ class TestTheRule:
         self, context: Context, weaver: PretendWorker, missing: str
     ) -> None:
         has = tuple(name for name in ("stick-slip", *CONTACT_PROTOCOLS) if name != missing)
-        added = register_certificate(context.database, context.store, upload(protocols=has), context.clock())
-        over = parsed({"kind": "cloth_scene", "scene": "on-cloth", "axes": {"texture": "dots", "viewpoint": "high"}})
+        added = register_certificate(
+            context.database, context.store, upload(protocols=has), context.clock()
+        )
+        over = parsed(
+            {
+                "kind": "cloth_scene",
+                "scene": "on-cloth",
+                "axes": {"texture": "dots", "viewpoint": "high"},
+            }
+        )
         for touching in (cloth(), cloth(self_friction=0.0), over):
             with pytest.raises(
-                PresetNotCertifiedError, match=f"it must have {missing}, since .* `self_friction: null`"
+                PresetNotCertifiedError,
+                match=f"it must have {missing}, since .* `self_friction: null`",
             ):
                 submit_job(context, touching, None)
         assert validate_spec(context, cloth(self_friction=None)).certificate == added.digest
@@ -114,7 +129,9 @@ class TestTheRule:
     ) -> None:
         register_certificate(context.database, context.store, upload(), context.clock())
         with context.database.write() as connection:
-            connection.execute(update(certificates).values(protocols=""))  # as the migration leaves it
+            connection.execute(
+                update(certificates).values(protocols="")
+            )  # as the migration leaves it
         assert validate_spec(context, cloth()).refusal
         assert not validate_spec(context, cloth(self_friction=None)).refusal
         register_certificate(context.database, context.store, upload(), context.clock())
@@ -124,7 +141,9 @@ class TestTheRule:
         self, context: Context, weaver: PretendWorker, clock: ManualClock
     ) -> None:
         good = register_certificate(context.database, context.store, upload(), context.clock())
-        register_certificate(context.database, context.store, upload(extent="quick", error=0.5), context.clock())
+        register_certificate(
+            context.database, context.store, upload(extent="quick", error=0.5), context.clock()
+        )
         assert validate_spec(context, cloth()).certificate == good.digest
         register_certificate(context.database, context.store, upload(error=0.02), context.clock())
         assert validate_spec(context, cloth()).refusal
@@ -132,7 +151,9 @@ class TestTheRule:
         register_certificate(context.database, context.store, upload(), context.clock())
         assert validate_spec(context, cloth()).certificate == good.digest
 
-    def test_uncertified_where_the_spec_says_so(self, context: Context, weaver: PretendWorker) -> None:
+    def test_uncertified_where_the_spec_says_so(
+        self, context: Context, weaver: PretendWorker
+    ) -> None:
         job = submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
         manifest = manifest_of(context, job)
@@ -157,11 +178,15 @@ class TestTheRule:
         weaver.work()
         assert {name.partition("-")[0] for name in weaver.ran[before:]} == {"publish"}
 
-    def test_rods_need_none_and_carry_what_there_is(self, context: Context, worker: PretendWorker) -> None:
+    def test_rods_need_none_and_carry_what_there_is(
+        self, context: Context, worker: PretendWorker
+    ) -> None:
         job = submit_job(context, parsed(rods()), None)
         worker.work()
         assert manifest_of(context, job).certificate is None
-        added = register_certificate(context.database, context.store, upload(preset="rods"), context.clock())
+        added = register_certificate(
+            context.database, context.store, upload(preset="rods"), context.clock()
+        )
         job = submit_job(context, parsed(rods()), None)
         worker.work()
         assert manifest_of(context, job).certificate == added.digest
@@ -194,7 +219,11 @@ class TestHttp:
             assert first.headers["location"] == entry["href"]
             shown = client.get(entry["href"])
             assert Certificate.model_validate_json(shown.content).digest == entry["digest"]
-            for path in ("/v1/certificates/abc", f"/v1/certificates/{'0' * 64}", "/v1/certificates/..%2f..%2fx"):
+            for path in (
+                "/v1/certificates/abc",
+                f"/v1/certificates/{'0' * 64}",
+                "/v1/certificates/..%2f..%2fx",
+            ):
                 assert client.get(path).json()["code"] == "not_found"
 
     def test_a_lying_certificate_is_refused(self, app: FastAPI) -> None:
@@ -208,7 +237,9 @@ class TestHttp:
 
     def test_the_refusal_says_where_and_what_to_do(self, app: FastAPI) -> None:
         with serving(app) as url, httpx.Client(base_url=url) as client:
-            PretendWorker(DirectApi(app.state.context), app.state.context.store, kinds=KINDS).register()
+            PretendWorker(
+                DirectApi(app.state.context), app.state.context.store, kinds=KINDS
+            ).register()
             answer = client.post("/v1/jobs", json=cloth(preset="fast").model_dump(mode="json"))
             problem = answer.json()
             assert (answer.status_code, problem["code"]) == (409, "preset_not_certified")

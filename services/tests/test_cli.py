@@ -33,7 +33,9 @@ def write(path: Path, spec: Any) -> Path:
     return path
 
 
-def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningServer, tmp_path: Path) -> None:
+def test_a_grid_becomes_a_verified_directory(
+    cli: Any, shared_server: RunningServer, tmp_path: Path
+) -> None:
     spec = write(tmp_path / "spec.yaml", rods(name="cli", gamma=(1.0, 2.0)))
     worker = shared_server.worker()
     rejected: list[str] = []
@@ -71,7 +73,10 @@ def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningSer
     assert f"{dataset['id']}:v1" in cli("datasets").stdout
     pulled = cli("pull", dataset["id"], tmp_path / "d")
     assert "8 files downloaded" in pulled.stdout, pulled.output
-    assert "0 files downloaded (0 B), 8 already there" in cli("pull", f"{dataset['id']}:v1", tmp_path / "d").stdout
+    assert (
+        "0 files downloaded (0 B), 8 already there"
+        in cli("pull", f"{dataset['id']}:v1", tmp_path / "d").stdout
+    )
     assert cli("verify", tmp_path / "d").exit_code == 0
     (tmp_path / "d" / "views/c/0/0").write_bytes(b"")
     wrong = cli("verify", tmp_path / "d")
@@ -82,7 +87,9 @@ def test_a_grid_becomes_a_verified_directory(cli: Any, shared_server: RunningSer
     assert "has ended" in cli("cancel", job).stderr
 
 
-def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: RunningServer) -> None:
+def test_a_cancelled_job_is_no_success(
+    cli: Any, tmp_path: Path, shared_server: RunningServer
+) -> None:
     job = cli("submit", write(tmp_path / "spec.json", rods(gamma=(31.0,)))).stdout.strip()
     assert "cancelled" in cli("cancel", job).stdout
     watched = cli("watch", job)
@@ -97,7 +104,10 @@ def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: 
             "kind: rod_hang\naxes: {gamma: -1e0, phi0: 0.0, phi1: 0.0}",
             ["axes.gamma", "greater than or equal to 0", "-1.0"],
         ),
-        ("kind: rod_hang\naxes: {gamma: .nan, phi0: 0.0, phi1: 0.0}", ["axes.gamma must be a finite number", "nan"]),
+        (
+            "kind: rod_hang\naxes: {gamma: .nan, phi0: 0.0, phi1: 0.0}",
+            ["axes.gamma must be a finite number", "nan"],
+        ),
         ("kind: rod_hang\nkind: rod_hang", ["the key 'kind' is there twice"]),
         ("kind: [", ["is not YAML"]),
         ("- 1", ["must hold a mapping"]),
@@ -105,7 +115,8 @@ def test_a_cancelled_job_is_no_success(cli: Any, tmp_path: Path, shared_server: 
         ("1: 2", ["the key 1 is no word"]),
         ("kind: &a {axes: *a}", ["must not nest so deeply: does an alias name what it is in?"]),
         (
-            "a: &a [1, 1]" + "".join(f"\n{to}: &{to} [*{of}, *{of}]" for of, to in pairwise("abcdefghijklm")),
+            "a: &a [1, 1]"
+            + "".join(f"\n{to}: &{to} [*{of}, *{of}]" for of, to in pairwise("abcdefghijklm")),
             ["must hold at most 5000 values, with aliases written out"],
         ),
         ("kind: cloth_scene\nscene: a.yaml", ["there is no file"]),
@@ -149,7 +160,9 @@ def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
     results: list[Result] = []
 
     def watch() -> None:
-        results.append(CliRunner().invoke(app, ["submit", str(spec), "--watch", "--url", server.url]))
+        results.append(
+            CliRunner().invoke(app, ["submit", str(spec), "--watch", "--url", server.url])
+        )
 
     watching = threading.Thread(target=watch)
     watching.start()
@@ -158,7 +171,9 @@ def test_watching_survives_a_restart_of_the_coordinator(tmp_path: Path) -> None:
     server.process.wait()
     server.stop()
     again = start_server(tmp_path / "data", port)
-    wait_until(lambda: worker.work() > 0)  # the one that was leased is given back: its holder is alive
+    wait_until(
+        lambda: worker.work() > 0
+    )  # the one that was leased is given back: its holder is alive
     worker.register()
     wait_until(lambda: worker.work() > 0 or bool(results))
     watching.join(30)
@@ -196,8 +211,12 @@ def test_without_a_coordinator_it_fails_at_once_and_validates_all_the_same(tmp_p
     assert "samples                    4" in valid.stdout
     assert "No coordinator answers" in valid.stderr
     wrong = write(tmp_path / "wrong.yaml", rods(gamma=(-1.0,)))
-    costs = json.loads(runner.invoke(app, ["validate", str(spec), "--json"], env=env).stdout)["estimate"]
-    assert costs["cpu_seconds"]["low"] < costs["cpu_seconds"]["median"] < costs["cpu_seconds"]["high"]
+    costs = json.loads(runner.invoke(app, ["validate", str(spec), "--json"], env=env).stdout)[
+        "estimate"
+    ]
+    assert (
+        costs["cpu_seconds"]["low"] < costs["cpu_seconds"]["median"] < costs["cpu_seconds"]["high"]
+    )
     assert "CPU time, render" in valid.stdout
     invalid = runner.invoke(app, ["validate", str(wrong)], env=env)
     assert invalid.exit_code == 1

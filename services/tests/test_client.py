@@ -1,4 +1,6 @@
-"""The client: a job from its spec to its files, also from asynchronous programs, and restarts of the coordinator."""
+"""The client: a job from its spec to its files, also from asynchronous programs, and restarts of
+the coordinator.
+"""
 
 import asyncio
 from collections.abc import Iterator
@@ -10,7 +12,14 @@ from fastapi import FastAPI
 from stickslip_schemas.base import JobState
 from stickslip_schemas.documents.responses import DatasetPublishedEvent, JobStateEvent
 from stickslip_services.app import make_app
-from stickslip_services.client import Client, ClientError, ProblemError, UnreachableError, pull, verify
+from stickslip_services.client import (
+    Client,
+    ClientError,
+    ProblemError,
+    UnreachableError,
+    pull,
+    verify,
+)
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
@@ -40,7 +49,9 @@ def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
         assert isinstance(events[-1], JobStateEvent)
         (made,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
         assert (
-            len(list(client.samples(job.id))) == len(client.request("GET", f"/v1/jobs/{job.id}/previews").json()) == 4
+            len(list(client.samples(job.id)))
+            == len(client.request("GET", f"/v1/jobs/{job.id}/previews").json())
+            == 4
         )
         pulled = pull(client, made.dataset.dataset, 1, tmp_path / "dataset")
         assert pulled.downloaded_files == pulled.files
@@ -54,14 +65,18 @@ def test_asynchronous_programs_call_the_client_in_threads(app: FastAPI) -> None:
         with Client(url) as client:
             specs = [rods(gamma=(value,)) for value in (5.0, 6.0, 7.0)]
             made = await asyncio.gather(*(asyncio.to_thread(client.submit, spec) for spec in specs))
-            assert {job.id for job in made} == {job.id for job in await asyncio.to_thread(list, client.jobs())}
+            assert {job.id for job in made} == {
+                job.id for job in await asyncio.to_thread(list, client.jobs())
+            }
 
     with serving(app) as url:
         asyncio.run(use(url))
 
 
 def test_a_url_without_a_scheme_is_refused() -> None:
-    with pytest.raises(ClientError, match=r"must begin with http:// or https://: it is 'localhost:8765'"):
+    with pytest.raises(
+        ClientError, match=r"must begin with http:// or https://: it is 'localhost:8765'"
+    ):
         Client("localhost:8765")
 
 
@@ -77,7 +92,10 @@ def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for()
             return answer
         raise answer
 
-    with Client("http://127.0.0.1:9", patience=60, sleep=slept.append) as client, pytest.raises(UnreachableError):
+    with (
+        Client("http://127.0.0.1:9", patience=60, sleep=slept.append) as client,
+        pytest.raises(UnreachableError),
+    ):
         client.workers()
     assert slept == []
     with Client(transport=httpx.MockTransport(handler), sleep=slept.append) as client:

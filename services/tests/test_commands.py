@@ -33,7 +33,9 @@ def test_the_list_says_what_the_command_says(name: str) -> None:
     listed = app.get_command(click.Context(app), name)
     assert listed is not None
     assert listed.help
-    assert listed.help.split("\n\n")[0].split() == (_loaded(name).help or "").split("\n\n")[0].split()
+    assert (
+        listed.help.split("\n\n")[0].split() == (_loaded(name).help or "").split("\n\n")[0].split()
+    )
 
 
 def test_a_command_that_does_not_exist() -> None:
@@ -53,7 +55,10 @@ def test_narrow_terminals_show_fewer_columns_and_break_no_word(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(common, "room", lambda: 40)
-    rows = [("ds-0123456789abcdef:v1", "a-long-name", "succeeded"), ("ds-1", "b", click.style("failed", fg="red"))]
+    rows = [
+        ("ds-0123456789abcdef:v1", "a-long-name", "succeeded"),
+        ("ds-1", "b", click.style("failed", fg="red")),
+    ]
     common.print_table(("dataset", "name", "state"), rows)
     shown = capsys.readouterr()
     assert [line.split() for line in click.unstyle(shown.out).splitlines()] == [
@@ -63,7 +68,9 @@ def test_narrow_terminals_show_fewer_columns_and_break_no_word(
     ]
     assert "not shown in 40 columns: state; --json shows all" in shown.err
     common.print_table(
-        ("slot", "message"), [("3", "its centreline leaves the frame by 12 px at the left")], sentences=True
+        ("slot", "message"),
+        [("3", "its centreline leaves the frame by 12 px at the left")],
+        sentences=True,
     )
     assert [line.strip() for line in click.unstyle(capsys.readouterr().out).splitlines()] == [
         "slot  message",
@@ -75,8 +82,15 @@ def test_narrow_terminals_show_fewer_columns_and_break_no_word(
 @pytest.mark.parametrize(("shell", "file"), [("bash", ".bashrc"), ("zsh", ".zshrc")])
 def test_completion_is_installed_once(shell: str, file: str, tmp_path: Path) -> None:
     for _ in range(2):
-        assert CliRunner().invoke(app, ["--install-completion", shell], env={"HOME": str(tmp_path)}).exit_code == 0
-    assert (tmp_path / file).read_text() == f'eval "$(_STICKSLIP_COMPLETE={shell}_source stickslip)"\n'
+        assert (
+            CliRunner()
+            .invoke(app, ["--install-completion", shell], env={"HOME": str(tmp_path)})
+            .exit_code
+            == 0
+        )
+    assert (
+        tmp_path / file
+    ).read_text() == f'eval "$(_STICKSLIP_COMPLETE={shell}_source stickslip)"\n'
 
 
 def test_commands_and_options_are_completed() -> None:

@@ -1,4 +1,6 @@
-"""Clients that take their time: half-open headers and bodies are closed, and the API serves meanwhile."""
+"""Clients that take their time: half-open headers and bodies are closed, and the API serves
+meanwhile.
+"""
 
 import json
 import resource
@@ -101,7 +103,9 @@ def test_drop_by_drop_is_too_slow_as_well(quick: str, opening: bytes) -> None:
 def test_a_steady_body_may_take_its_time(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(middleware, "LEAST_RATE", 100)
     body = json.dumps(rods()).encode()
-    with connect(quick, HEADERS + f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()) as connection:
+    with connect(
+        quick, HEADERS + f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()
+    ) as connection:
         begin = time.monotonic()
         for start in range(0, len(body), 25):
             connection.sendall(body[start : start + 25])
@@ -112,7 +116,9 @@ def test_a_steady_body_may_take_its_time(quick: str, monkeypatch: pytest.MonkeyP
 
 def test_an_answer_may_take_as_long_as_it_takes(quick: str) -> None:
     job = httpx.post(f"{quick}/v1/jobs", json=rods(), trust_env=False).json()["id"]
-    with httpx.stream("GET", f"{quick}/v1/jobs/{job}/events", trust_env=False, timeout=10) as stream:
+    with httpx.stream(
+        "GET", f"{quick}/v1/jobs/{job}/events", trust_env=False, timeout=10
+    ) as stream:
         lines = stream.iter_lines()
         begin = time.monotonic()
         threading.Timer(1.5, httpx.post, (f"{quick}/v1/jobs/{job}:cancel",)).start()
@@ -140,7 +146,9 @@ def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.Monkey
     assert httpx.get(f"{quick}/v1/jobs", trust_env=False).status_code == 200
 
 
-def test_idle_connections_are_kept_longer_than_clients_keep_them(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_connections_are_kept_longer_than_clients_keep_them(
+    quick: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With equal times, a request now and then meets a connection that is being closed, and fails."""
     assert middleware.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
     monkeypatch.setattr(middleware, "IDLE_SECONDS", 0.3)

@@ -1,4 +1,7 @@
-"""What tasks cost decides on limits and on the time left; what ends its process again and again is quarantined."""
+"""What tasks cost decides on limits and on the time left.
+
+What ends its process again and again is quarantined.
+"""
 
 import pytest
 from sqlalchemy import select
@@ -9,7 +12,14 @@ from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, prioritise_job, sweep
-from stickslip_services.queue.eta import KEPT_RUNS, MEASURED, TIMES, Cost, StageTimings, limit_seconds
+from stickslip_services.queue.eta import (
+    KEPT_RUNS,
+    MEASURED,
+    TIMES,
+    Cost,
+    StageTimings,
+    limit_seconds,
+)
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_testing.invariants import violations
@@ -30,13 +40,16 @@ def check(context: Context) -> None:
         assert violations(connection) == []
 
 
-def finish(worker: PretendWorker, lease: Lease, seconds: float, *, call: float | None = None) -> None:
+def finish(
+    worker: PretendWorker, lease: Lease, seconds: float, *, call: float | None = None
+) -> None:
     """Report a result that took so long; `call`: the whole call, the same unless told otherwise."""
     took = {"wall_seconds": seconds, "call_seconds": seconds if call is None else call}
     worker.report((lease, worker.result(lease.task).model_copy(update=took)))
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
+# --- limits
+# -----------------------------------------------------------------------------------------------------------
 
 
 def timings(*durations: float) -> StageTimings:
@@ -58,7 +71,9 @@ def test_a_limit_is_three_times_what_is_expected_and_doubles_with_each_try() -> 
     assert limit_seconds(long, 0, floor=FLOOR) == 3000.0
 
 
-def test_leases_carry_the_limit_of_their_group(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_leases_carry_the_limit_of_their_group(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context, gamma=(1.0, 2.0, 3.0, 4.0), quality="draft")
     simulations = worker.lease(simulate=8)
     assert {lease.limit_seconds for lease in simulations} == {None}
@@ -78,7 +93,9 @@ def test_leases_carry_the_limit_of_their_group(context: Context, worker: Pretend
     assert {lease.limit_seconds for lease in worker.lease(render=10)} == {None}
 
 
-def test_a_call_that_is_not_to_be_gone_by_is_not_counted(context: Context, worker: PretendWorker) -> None:
+def test_a_call_that_is_not_to_be_gone_by_is_not_counted(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context)
     (lease,) = worker.lease(simulate=1)
     worker.report((lease, worker.result(lease.task).model_copy(update={"call_seconds": None})))
@@ -86,8 +103,12 @@ def test_a_call_that_is_not_to_be_gone_by_is_not_counted(context: Context, worke
         assert connection.execute(select(cost_groups)).all() == []
 
 
-def test_quick_rejections_do_not_shorten_the_time_left(context: Context, worker: PretendWorker) -> None:
-    """Pictures out of frame are found in milliseconds: after three of them nothing is known of the others."""
+def test_quick_rejections_do_not_shorten_the_time_left(
+    context: Context, worker: PretendWorker
+) -> None:
+    """Pictures out of frame are found in milliseconds: after three of them nothing is known of the
+    others.
+    """
     job = submit(context, gamma=tuple(1.0 + value for value in range(12)), phi1=(1.0,))
     for lease in worker.lease(simulate=12):
         finish(worker, lease, 0.1)
@@ -103,7 +124,9 @@ def test_quick_rejections_do_not_shorten_the_time_left(context: Context, worker:
 
 
 def test_what_was_measured_long_ago_fades(context: Context, worker: PretendWorker) -> None:
-    submit(context, gamma=tuple(float(value) for value in range(1, 200)), phi1=(1.0, 2.0), views=None)
+    submit(
+        context, gamma=tuple(float(value) for value in range(1, 200)), phi1=(1.0, 2.0), views=None
+    )
     for lease in worker.lease(simulate=KEPT_RUNS + 1):
         finish(worker, lease, 10.0)
     with context.database.read() as connection:
@@ -116,7 +139,8 @@ def test_what_was_measured_long_ago_fades(context: Context, worker: PretendWorke
     assert tuple(after) == ((KEPT_RUNS + 1) // 2 + 1, 10.0 * (KEPT_RUNS + 1) / 2 + 1.0)
 
 
-# --- quarantine -------------------------------------------------------------------------------------------------------
+# --- quarantine
+# -------------------------------------------------------------------------------------------------------
 
 
 def poison_of(worker: PretendWorker, clock: ManualClock, context: Context, reason: Reason) -> str:
@@ -141,12 +165,16 @@ def test_a_task_that_ends_its_process_each_time_is_quarantined(
     poison = poison_of(worker, clock, context, reason)
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.running, Reason.quarantined)
-    assert f"task {poison} was quarantined after 3 tries, at last {reason}: it is gone" in job.message
+    assert (
+        f"task {poison} was quarantined after 3 tries, at last {reason}: it is gone" in job.message
+    )
     assert "stickslip_workers replay" in job.message
     sweep(context)
     assert show_job(context, job_id).message == job.message  # the message stays while the job runs
     check(context)
-    assert worker.work() == 3 + 3 + 1  # everything else: simulations, renders, and the shard that needs no poison
+    assert (
+        worker.work() == 3 + 3 + 1
+    )  # everything else: simulations, renders, and the shard that needs no poison
     assert poison not in worker.ran
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.quarantined)
@@ -169,7 +197,11 @@ def test_a_job_of_which_too_much_is_quarantined_fails_at_once(
     for tries in range(3):
         assert show_job(context, job_id).state is JobState.running
         if tries:
-            bad = tuple(lease for lease in worker.lease(simulate=100) if lease.task_id in {old.task_id for old in bad})
+            bad = tuple(
+                lease
+                for lease in worker.lease(simulate=100)
+                if lease.task_id in {old.task_id for old in bad}
+            )
         worker.finish(*bad)
         worker.register()  # the others go back
         clock.advance(10)
@@ -197,7 +229,9 @@ def test_a_job_that_shares_the_task_is_told_as_well(
 def test_a_lost_worker_charges_no_task_until_it_is_no_accident(
     context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    """By a heartbeat that does not come, by a new session of the name, and by a worker's own report of a lost node."""
+    """By a heartbeat that does not come, by a new session of the name, and by a worker's own report
+    of a lost node.
+    """
     job_id = submit(context, gamma=(1.0,), phi1=(1.0,))
     for loss in range(context.settings.max_losses):
         assert show_job(context, job_id).state in (JobState.queued, JobState.running), loss
@@ -212,18 +246,23 @@ def test_a_lost_worker_charges_no_task_until_it_is_no_accident(
             worker.report((lease, failure(Reason.worker_lost, "its node has died")))
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.quarantined)
-    assert f"quarantined after {context.settings.max_losses} tries, at last worker_lost" in job.message
+    assert (
+        f"quarantined after {context.settings.max_losses} tries, at last worker_lost" in job.message
+    )
     check(context)
 
 
-# --- priorities -------------------------------------------------------------------------------------------------------
+# --- priorities
+# -------------------------------------------------------------------------------------------------------
 
 
 def jobs_of(context: Context, leases: tuple[Lease, ...]) -> list[float]:
     return [lease.task.simulation.gamma for lease in leases]  # type: ignore[union-attr]
 
 
-def test_the_highest_priority_comes_first_and_equals_share(context: Context, worker: PretendWorker) -> None:
+def test_the_highest_priority_comes_first_and_equals_share(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context, gamma=(1.0,), phi1=(1.0, 2.0, 3.0))
     submit(context, gamma=(2.0,), phi1=(1.0, 2.0, 3.0), priority=5)
     submit(context, gamma=(3.0,), phi1=(1.0, 2.0, 3.0), priority=5)
@@ -263,7 +302,9 @@ def test_tasks_known_to_be_long_can_be_left_out(context: Context, worker: Preten
     worker.register()
 
     def lease_short(at_most: float | None) -> set[str]:
-        request = LeaseRequest(worker_id=worker.id, wanted={Stage.render: 10}, at_most_seconds=at_most)
+        request = LeaseRequest(
+            worker_id=worker.id, wanted={Stage.render: 10}, at_most_seconds=at_most
+        )
         leases = lease_tasks(context, request).leases
         worker.report(*((lease, None) for lease in leases))
         return {str(lease.task.render.quality) for lease in leases}  # type: ignore[union-attr]
@@ -273,7 +314,8 @@ def test_tasks_known_to_be_long_can_be_left_out(context: Context, worker: Preten
     assert lease_short(None) == {"draft", "high"}
 
 
-# --- progress and the time left ---------------------------------------------------------------------------------------
+# --- progress and the time left
+# ---------------------------------------------------------------------------------------
 
 
 def test_frames_of_running_simulations_are_shown(context: Context, worker: PretendWorker) -> None:
@@ -283,9 +325,13 @@ def test_frames_of_running_simulations_are_shown(context: Context, worker: Prete
 
     def beat(*frames: tuple[Lease, tuple[int, int] | None]) -> None:
         states = [
-            LeaseState(task_id=lease.task_id, token=lease.token, started=True, frames=told) for lease, told in frames
+            LeaseState(task_id=lease.task_id, token=lease.token, started=True, frames=told)
+            for lease, told in frames
         ]
-        heartbeat(context, Heartbeat(worker_id=worker.id, leases=tuple(states), condition=worker.condition))
+        heartbeat(
+            context,
+            Heartbeat(worker_id=worker.id, leases=tuple(states), condition=worker.condition),
+        )
 
     def told() -> tuple[int, int] | None:
         return show_job(context, job_id).progress.stages[Stage.simulate].frames
@@ -302,7 +348,9 @@ def test_frames_of_running_simulations_are_shown(context: Context, worker: Prete
     assert told() is None  # what an earlier session has told does not count either
 
 
-def test_no_time_is_told_before_enough_was_measured(context: Context, worker: PretendWorker) -> None:
+def test_no_time_is_told_before_enough_was_measured(
+    context: Context, worker: PretendWorker
+) -> None:
     job_id = submit(context, gamma=(1.0, 2.0, 3.0, 4.0, 5.0), phi1=(1.0,), views=None)
     leases = worker.lease(simulate=5)
     for done, lease in enumerate(leases[: MEASURED + 1]):
@@ -311,7 +359,9 @@ def test_no_time_is_told_before_enough_was_measured(context: Context, worker: Pr
 
 
 def test_the_time_left_goes_by_groups(context: Context, worker: PretendWorker) -> None:
-    """Draft pictures take 1 s and high ones 100 s: a job of high ones alone is not told the mean of both."""
+    """Draft pictures take 1 s and high ones 100 s: a job of high ones alone is not told the mean of
+    both.
+    """
     for quality, seconds in (("draft", 1.0), ("high", 100.0)):
         submit(context, gamma=(1.0, 2.0, 3.0, 4.0), phi1=(1.0,), quality=quality)
         while leases := worker.lease():
@@ -347,7 +397,9 @@ def test_frames_shorten_the_time_left(context: Context, worker: PretendWorker) -
 def test_a_failed_result_tells_no_cost(context: Context, worker: PretendWorker) -> None:
     submit(context)
     (lease,) = worker.lease(simulate=1)
-    result = TaskResult(outcome="failed", reason=Reason.exec_timeout, message="", wall_seconds=9.0, call_seconds=9.0)
+    result = TaskResult(
+        outcome="failed", reason=Reason.exec_timeout, message="", wall_seconds=9.0, call_seconds=9.0
+    )
     worker.report((lease, result))
     with context.database.read() as connection:
         assert connection.execute(select(cost_groups)).all() == []

@@ -1,4 +1,6 @@
-"""Bits that flip in rows of the database: what a dataset is made from is right, or the job says that it is damaged."""
+"""Bits that flip in rows of the database: what a dataset is made from is right, or the job says
+that it is damaged.
+"""
 
 import random
 from pathlib import Path
@@ -35,7 +37,9 @@ def pretend(context: Context) -> PretendWorker:
     return PretendWorker(
         DirectApi(context),
         context.store,
-        judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 2.0 else None,
+        judge=lambda task: (
+            rejection() if task.stage == "simulate" and task.simulation.gamma == 2.0 else None
+        ),
     ).register()
 
 
@@ -44,7 +48,9 @@ def half_made(place: Path, clock: ManualClock) -> str:
     context = Context.open(Settings(data=place, database=None, durable=False), clock)
     start(context)
     worker = pretend(context)
-    job: str = submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0), samples_per_shard=4)), None).id  # type: ignore[union-attr]
+    job: str = submit_job(
+        context, parsed(rods(gamma=(1.0, 2.0, 3.0), samples_per_shard=4)), None
+    ).id  # type: ignore[union-attr]
     worker.finish(*worker.lease(simulate=100))
     worker.finish(*worker.lease(render=100))
     context.close()
@@ -55,24 +61,34 @@ def flip(context: Context, rng: random.Random) -> str:
     """Flip a bit of a value that a dataset is made from; return where."""
     table = rng.choice([tasks, samples, samples, tasks, jobs])
     column = table.c[rng.choice(COLUMNS[table])]
-    made = [] if table is not tasks else [tasks.c.state.in_((TaskState.succeeded, TaskState.rejected))]
+    made = (
+        [] if table is not tasks else [tasks.c.state.in_((TaskState.succeeded, TaskState.rejected))]
+    )
     if column.name in ("key", "payload"):
         made = []
     with context.database.write() as connection:
         rowid = {tasks: "seq", jobs: "seq", samples: "slot"}[table]
-        rows = connection.execute(select(table.c[rowid], column).where(column.is_not(None), *made)).all()
+        rows = connection.execute(
+            select(table.c[rowid], column).where(column.is_not(None), *made)
+        ).all()
         if not rows:
             return "nothing"
         row, value = rng.choice(rows)
-        data = bytearray(value.encode() if isinstance(value, str) else value if isinstance(value, bytes) else b"")
+        data = bytearray(
+            value.encode() if isinstance(value, str) else value if isinstance(value, bytes) else b""
+        )
         if isinstance(value, int):
             new = f"{value ^ (1 << rng.randrange(max(1, value.bit_length())))}"
         elif not data:
             return "nothing"
         else:
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-            new = f"x'{data.hex()}'" if isinstance(value, bytes) else f"CAST(x'{data.hex()}' AS TEXT)"
-        connection.execute(text(f"UPDATE OR IGNORE {table.name} SET {column.name} = {new} WHERE {rowid} = {row}"))
+            new = (
+                f"x'{data.hex()}'" if isinstance(value, bytes) else f"CAST(x'{data.hex()}' AS TEXT)"
+            )
+        connection.execute(
+            text(f"UPDATE OR IGNORE {table.name} SET {column.name} = {new} WHERE {rowid} = {row}")
+        )
     return f"{table.name}.{column.name} of {row}"
 
 
@@ -95,8 +111,13 @@ def read_samples(context: Context, job: str) -> Any:
         return list_samples(connection, find_job(connection, job).seq, page, None)
 
 
-def outcome_of_a_flip(place: Path, half: Path, job: str, seed: int, right: tuple[Any, Any] | None) -> tuple[Any, Any]:
-    """Flip a bit, make the dataset, and return its manifest and its samples; compare them with the right ones."""
+def outcome_of_a_flip(
+    place: Path, half: Path, job: str, seed: int, right: tuple[Any, Any] | None
+) -> tuple[Any, Any]:
+    """Flip a bit, make the dataset, and return its manifest and its samples.
+
+    Compare them with the right ones.
+    """
     clock = ManualClock()
     copytree(half, place)
     context = Context.open(Settings(data=place, database=None, durable=False), clock)
@@ -129,5 +150,7 @@ def test_no_flip_in_a_row_is_silent(tmp_path: Path, clock: ManualClock) -> None:
     job = half_made(tmp_path / "half", clock)
     right = outcome_of_a_flip(tmp_path / "right", tmp_path / "half", job, 0, None)
     assert None not in right
-    found = [outcome_of_a_flip(tmp_path / str(n), tmp_path / "half", job, n, right) for n in range(FLIPS)]
+    found = [
+        outcome_of_a_flip(tmp_path / str(n), tmp_path / "half", job, n, right) for n in range(FLIPS)
+    ]
     assert sum(manifest is not None for manifest, _ in found) > FLIPS / 4  # results are recomputed

@@ -42,12 +42,17 @@ def test_the_spread_of_what_is_to_come_counts_by_itself() -> None:
     """Known to the last digit (very many measured), one task left: its own spread remains."""
     measured = StageTimings(10**12, 3.0 * 10**12, 13.0 * 10**12)
     without = QUANTILE_80 * 3.0 * MODEL_ERROR
-    assert half_width(1, measured, 1) == pytest.approx(QUANTILE_80 * sqrt(4.0 + (3.0 * MODEL_ERROR) ** 2), rel=1e-6)
+    assert half_width(1, measured, 1) == pytest.approx(
+        QUANTILE_80 * sqrt(4.0 + (3.0 * MODEL_ERROR) ** 2), rel=1e-6
+    )
     assert half_width(1, measured, 1) > 2.0 * without
 
 
 def test_the_error_of_a_mean_of_few_grows_with_what_is_left() -> None:
-    few, many = timings(1.0, 5.0), StageTimings(10**12, 3.0 * 10**12, 17.0 * 10**12)  # variance 8 both
+    few, many = (
+        timings(1.0, 5.0),
+        StageTimings(10**12, 3.0 * 10**12, 17.0 * 10**12),
+    )  # variance 8 both
     assert few.variance == pytest.approx(8.0)
     assert many.variance == pytest.approx(8.0)
     ratio = half_width(1000, few, 1) / half_width(1000, many, 1)
@@ -57,11 +62,16 @@ def test_the_error_of_a_mean_of_few_grows_with_what_is_left() -> None:
 
 
 def test_stages_add_up_and_one_waits_for_the_other() -> None:
-    work = {Stage.simulate: [StageWork(4, timings(10.0, 10.0))], Stage.render: [StageWork(2, timings(3.0, 3.0))]}
+    work = {
+        Stage.simulate: [StageWork(4, timings(10.0, 10.0))],
+        Stage.render: [StageWork(2, timings(3.0, 3.0))],
+    }
     eta = estimate(work, slots=2)
     assert eta is not None
     assert eta.seconds == pytest.approx((40.0 + 6.0) / 2)
     eta = estimate(work, slots=100)
     assert eta is not None
     assert eta.seconds == pytest.approx(13.0)
-    assert (eta.high - eta.seconds) == pytest.approx(QUANTILE_80 * MODEL_ERROR * sqrt(40.0**2 + 6.0**2) / 100)
+    assert (eta.high - eta.seconds) == pytest.approx(
+        QUANTILE_80 * MODEL_ERROR * sqrt(40.0**2 + 6.0**2) / 100
+    )

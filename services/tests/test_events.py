@@ -55,12 +55,18 @@ def words(events: list[ServerSentEvent]) -> list[str]:
     return [json.loads(event.data)["state"] for event in events if event.event == "job.state"]
 
 
-def test_a_finished_job_is_told_from_the_beginning(client: httpx.Client, worker: PretendWorker) -> None:
+def test_a_finished_job_is_told_from_the_beginning(
+    client: httpx.Client, worker: PretendWorker
+) -> None:
     job = submit(client)
     worker.work()
     events = list(follow(client, job))
     assert words(events) == ["queued", "running", "succeeded"]
-    assert [event.event for event in events[-3:]] == ["dataset.published", "job.progress", "job.state"]
+    assert [event.event for event in events[-3:]] == [
+        "dataset.published",
+        "job.progress",
+        "job.state",
+    ]
     ids = [int(event.id) for event in events if event.event != "job.progress"]
     assert ids == sorted(set(ids))
     progress = json.loads(events[-2].data)["progress"]
@@ -115,7 +121,10 @@ def test_a_quiet_stream_says_that_it_lives_and_holds_no_connection(
 def test_many_watchers_hear_the_end(client: httpx.Client, worker: PretendWorker) -> None:
     job = submit(client)
     ends: list[list[str]] = []
-    threads = [threading.Thread(target=lambda: ends.append(words(list(follow(client, job))))) for _ in range(8)]
+    threads = [
+        threading.Thread(target=lambda: ends.append(words(list(follow(client, job)))))
+        for _ in range(8)
+    ]
     for thread in threads:
         thread.start()
     worker.work()
@@ -125,7 +134,11 @@ def test_many_watchers_hear_the_end(client: httpx.Client, worker: PretendWorker)
 
 
 def test_watchers_share_one_look_at_the_database_and_miss_nothing(
-    app: FastAPI, client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, clock: ManualClock
+    app: FastAPI,
+    client: httpx.Client,
+    worker: PretendWorker,
+    monkeypatch: pytest.MonkeyPatch,
+    clock: ManualClock,
 ) -> None:
     """Twenty watchers, each from another event on, while old events have left the feed's memory."""
     looks: list[int] = []
@@ -144,9 +157,14 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     heard: dict[str | None, list[str]] = {}
 
     def listen(last_id: str | None) -> None:
-        heard[last_id] = [event.id for event in follow(client, job, last_id) if event.event != "job.progress"]
+        heard[last_id] = [
+            event.id for event in follow(client, job, last_id) if event.event != "job.progress"
+        ]
 
-    threads = [threading.Thread(target=listen, args=(last_id,)) for last_id in (None, *known[::2], *known[1::2])]
+    threads = [
+        threading.Thread(target=listen, args=(last_id,))
+        for last_id in (None, *known[::2], *known[1::2])
+    ]
     for thread in threads:
         thread.start()
     for _ in range(3):

@@ -1,4 +1,6 @@
-"""Files of datasets over HTTP: ranges, validators, digests, and nothing but what the manifest names."""
+"""Files of datasets over HTTP: ranges, validators, digests, and nothing but what the manifest
+names.
+"""
 
 import base64
 import hashlib
@@ -60,7 +62,9 @@ def test_a_whole_file(published: Published) -> None:
     digest = hashlib.sha256(data)
     assert (response.status_code, response.content) == (200, data)
     assert response.headers["etag"] == f'"{digest.hexdigest()}"'
-    assert response.headers["repr-digest"] == f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
+    assert (
+        response.headers["repr-digest"] == f"sha-256=:{base64.b64encode(digest.digest()).decode()}:"
+    )
     assert response.headers["content-length"] == str(len(data))
     assert "immutable" in response.headers["cache-control"]
     head = published.client.head(f"{published.root}/files/{PATH}")
@@ -85,9 +89,15 @@ def test_a_range(published: Published, header: str, part: slice) -> None:
     response = published.client.get(f"{published.root}/files/{PATH}", headers={"Range": header})
     assert (response.status_code, response.content) == (206, data[part])
     first = data.index(data[part]) if part.start != -7 else len(data) - 7
-    assert response.headers["content-range"] == f"bytes {first}-{first + len(data[part]) - 1}/{len(data)}"
+    assert (
+        response.headers["content-range"]
+        == f"bytes {first}-{first + len(data[part]) - 1}/{len(data)}"
+    )
     whole = published.client.head(f"{published.root}/files/{PATH}").headers
-    assert (response.headers["repr-digest"], response.headers["etag"]) == (whole["repr-digest"], whole["etag"])
+    assert (response.headers["repr-digest"], response.headers["etag"]) == (
+        whole["repr-digest"],
+        whole["etag"],
+    )
 
 
 @pytest.mark.parametrize("header", ["bytes=99999999-", "bytes=-0"])
@@ -98,7 +108,9 @@ def test_a_range_outside_the_file(published: Published, header: str) -> None:
     assert response.headers["content-type"] == "application/problem+json"
 
 
-@pytest.mark.parametrize("header", ["bytes=5-2", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,4-5", ""])
+@pytest.mark.parametrize(
+    "header", ["bytes=5-2", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,4-5", ""]
+)
 def test_a_range_that_is_none_is_ignored(published: Published, header: str) -> None:
     response = published.client.get(f"{published.root}/files/{PATH}", headers={"Range": header})
     assert (response.status_code, response.content) == (200, content(published))
@@ -149,7 +161,11 @@ def test_the_manifest_is_a_file_too(published: Published) -> None:
     first = published.client.get(f"{published.root}/manifest")
     second = published.client.get(f"{published.root}/files/manifest.json")
     assert first.content == second.content
-    assert first.headers["etag"] == second.headers["etag"] == f'"{hashlib.sha256(first.content).hexdigest()}"'
+    assert (
+        first.headers["etag"]
+        == second.headers["etag"]
+        == f'"{hashlib.sha256(first.content).hexdigest()}"'
+    )
     assert first.headers["content-type"] == "application/json"
     assert published.client.get(f"{published.root[:-1]}2/manifest").status_code == 404
 

@@ -1,4 +1,6 @@
-"""The rules of leasing, each by itself: fencing, expiry, retries, back-off, losses, priorities, cancelling, quotas."""
+"""The rules of leasing, each by itself: fencing, expiry, retries, back-off, losses, priorities,
+cancelling, quotas.
+"""
 
 import asyncio
 import threading
@@ -39,7 +41,9 @@ def gammas(leases: Any) -> list[float]:
 
 
 @pytest.mark.parametrize("is_leased", [False, True])
-def test_cancelling_a_job_frees_its_quota(context: Context, worker: PretendWorker, is_leased: bool) -> None:
+def test_cancelling_a_job_frees_its_quota(
+    context: Context, worker: PretendWorker, is_leased: bool
+) -> None:
     with context.database.write() as connection:
         set_quota(connection, "lab", max_samples=4, max_jobs=1, now=context.clock())
     job_id = submit(context, project="lab")
@@ -56,13 +60,19 @@ def test_cancelling_a_job_frees_its_quota(context: Context, worker: PretendWorke
 
 
 @pytest.mark.parametrize("settings", [{"max_tries": 5, "retry_seconds": 3.0}], indirect=True)
-def test_the_wait_before_a_retry_doubles(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_the_wait_before_a_retry_doubles(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context, gamma=(1.0,), phi1=(1.0,))
     for tries, wait in enumerate((3.0, 6.0, 12.0, 24.0), start=1):
         (lease,) = worker.lease(simulate=1)
         worker.report((lease, failure()))
         failed = row(context, lease.task_id)
-        assert (failed.state, failed.tries, failed.retry_at) == (TaskState.soft_failed, tries, clock.now + wait)
+        assert (failed.state, failed.tries, failed.retry_at) == (
+            TaskState.soft_failed,
+            tries,
+            clock.now + wait,
+        )
         clock.advance(wait - 0.01)
         sweep(context)
         assert worker.lease() == ()
@@ -82,7 +92,9 @@ def test_unstarted_tasks_of_a_lost_worker_are_not_charged(
     assert (kept.state, kept.attempts, kept.losses, kept.tries) == (TaskState.pending, 0, 0, 0)
 
 
-def test_each_lease_of_a_task_has_a_higher_token(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_each_lease_of_a_task_has_a_higher_token(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context, gamma=(1.0,), phi1=(1.0,))
     tokens = []
     for _ in range(3):
@@ -134,7 +146,9 @@ def test_the_first_result_wins(context: Context, worker: PretendWorker) -> None:
     assert row(context, lease.task_id).state == TaskState.succeeded
 
 
-def test_a_task_fails_with_its_last_try(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_task_fails_with_its_last_try(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     job_id = submit(context, gamma=(1.0,), phi1=(1.0,))
     for _ in range(context.settings.max_tries):
         assert show_job(context, job_id).state in (JobState.queued, JobState.running)
@@ -148,7 +162,9 @@ def test_a_task_fails_with_its_last_try(context: Context, worker: PretendWorker,
 
 
 @pytest.mark.parametrize("settings", [{"max_losses": 2}], indirect=True)
-def test_a_task_is_quarantined_with_its_last_loss(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_task_is_quarantined_with_its_last_loss(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context, gamma=(1.0,), phi1=(1.0,))
     for state in (TaskState.pending, TaskState.failed):
         (lease,) = worker.lease(simulate=1)
@@ -159,7 +175,9 @@ def test_a_task_is_quarantined_with_its_last_loss(context: Context, worker: Pret
     assert row(context, lease.task_id).reason == Reason.quarantined
 
 
-def test_the_job_of_the_highest_priority_comes_first(context: Context, worker: PretendWorker) -> None:
+def test_the_job_of_the_highest_priority_comes_first(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context, gamma=(1.0,))
     submit(context, gamma=(2.0,), priority=5)
     submit(context, gamma=(3.0,), priority=-5)
@@ -182,13 +200,19 @@ def test_cancelling_stops_waiting_tasks_at_once_and_running_ones_with_the_heartb
     assert cancel_job(context, job_id).state is JobState.cancelling
     assert worker.lease() == ()
     with context.database.read() as connection:
-        states = set(connection.scalars(select(tasks.c.state).where(tasks.c.key != task_key(running.task_id))))
+        states = set(
+            connection.scalars(
+                select(tasks.c.state).where(tasks.c.key != task_key(running.task_id))
+            )
+        )
     assert states == {TaskState.cancelled}
     assert worker.beat(running) == (running.task_id,)
     assert show_job(context, job_id).state is JobState.cancelled
 
 
-def test_a_superseded_session_gets_no_tasks_and_keeps_none(context: Context, worker: PretendWorker) -> None:
+def test_a_superseded_session_gets_no_tasks_and_keeps_none(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context)
     (lease,) = worker.lease(simulate=1)
     PretendWorker(DirectApi(context), context.store).register()
@@ -253,7 +277,9 @@ def test_a_lease_that_its_worker_does_not_know_of_is_taken_back(
     assert row(context, known.task_id).owner == worker.id
 
 
-def test_heartbeats_that_wait_are_answered_together(context: Context, worker: PretendWorker) -> None:
+def test_heartbeats_that_wait_are_answered_together(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context)
     other = PretendWorker(DirectApi(context), context.store, name="other").register()
     (kept,), (lost,) = worker.lease(simulate=1), other.lease(simulate=1)
@@ -264,11 +290,18 @@ def test_heartbeats_that_wait_are_answered_together(context: Context, worker: Pr
             leases=(LeaseState(task_id=lease.task_id, token=lease.token, started=False),),
             condition=worker.condition,
         )
-        for of, lease in ((worker.id, kept), (other.id, lost), ("worker-nobody", kept), (other.id, kept))
+        for of, lease in (
+            (worker.id, kept),
+            (other.id, lost),
+            ("worker-nobody", kept),
+            (other.id, kept),
+        )
     ]
     left = renew_leases(context, messages)
     assert left == [None, *(list(message.leases) for message in messages[1:])]
-    for message, states, drop in zip(messages[1:], left[1:], ((lost.task_id,), None, (kept.task_id,)), strict=True):
+    for message, states, drop in zip(
+        messages[1:], left[1:], ((lost.task_id,), None, (kept.task_id,)), strict=True
+    ):
         assert states is not None
         if drop is None:
             with pytest.raises(UnknownWorkerError):
@@ -335,7 +368,9 @@ def test_a_worker_that_was_heard_in_the_future_can_be_lost(
     assert row(context, lease.task_id).owner is None
 
 
-def test_a_sweep_retries_due_tasks_only(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_sweep_retries_due_tasks_only(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context)
     first, second = worker.lease(simulate=2)
     worker.report((first, failure()))

@@ -20,7 +20,9 @@ INDEXES = {
 
 
 def _plain(sql: str | None) -> str:
-    """Return the definition of an index without casts and brackets: PostgreSQL writes the same in several ways."""
+    """Return the definition of an index without casts and brackets: PostgreSQL writes the same in
+    several ways.
+    """
     return re.sub(r"::[a-z ]+(\[\])?|[()]", "", sql or "")
 
 
@@ -30,7 +32,9 @@ def test_tables_are_those_of_the_migrations(empty_database: Callable[[], Databas
         command.check(migration(connection))
 
 
-def test_indexes_are_partial_where_the_tables_say_so(empty_database: Callable[[], Database]) -> None:
+def test_indexes_are_partial_where_the_tables_say_so(
+    empty_database: Callable[[], Database],
+) -> None:
     """Alembic's check does not look at the conditions of indexes."""
     statements = []
     for name in ("migrated", "direct"):
@@ -40,7 +44,9 @@ def test_indexes_are_partial_where_the_tables_say_so(empty_database: Callable[[]
             else:
                 metadata.create_all(connection)
             rows = connection.execute(text(INDEXES[connection.dialect.name]))
-            statements.append([_plain(row.sql) for row in rows if "alembic_version" not in row.name])
+            statements.append(
+                [_plain(row.sql) for row in rows if "alembic_version" not in row.name]
+            )
     assert statements[0] == statements[1]
     assert sum("WHERE" in sql for sql in statements[0]) == 4
 

@@ -1,6 +1,7 @@
 """Coordinators and two workers: kill -9 any of them, again and again.
 
-One coordinator on SQLite and a directory, then two on one PostgreSQL database and one bucket that fails at times.
+One coordinator on SQLite and a directory, then two on one PostgreSQL database and one bucket that
+fails at times.
 
 The workers only pretend to simulate and to render, but lease, publish and report as dispatchers do.
 tests/test_chaos.py does the same with real ones, and takes hours where this takes minutes.
@@ -33,7 +34,9 @@ from stickslip_testing.servers import wait_until
 
 KILLS = int(os.environ.get("STICKSLIP_KILLS", "12"))
 PATIENCE = 300.0
-"""How long an answer or progress may take [s]: both coordinators may be starting, on a busy machine."""
+"""How long an answer or progress may take [s]: both coordinators may be starting, on a busy
+machine.
+"""
 SAMPLES = 60
 """Samples of each of the jobs that run while processes are killed."""
 FAULTS = {"503": 0.02, "late": 0.01, "lost answer": 0.01}
@@ -41,7 +44,9 @@ FAULTS = {"503": 0.02, "late": 0.01, "lost answer": 0.01}
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+def settings(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Settings:
     if request.param == "sqlite":
         return Settings.chosen(data=tmp_path / "a", durable=False)
     bucket = request.getfixturevalue("bucket")
@@ -60,13 +65,25 @@ def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
     place = settings.data.parent
     made = []
     for name, url in zip("ab", urls, strict=False):
-        words = ["--data", str(place / name), "--port", url.rsplit(":", 1)[1], "--store", settings.store_place]
+        words = [
+            "--data",
+            str(place / name),
+            "--port",
+            url.rsplit(":", 1)[1],
+            "--store",
+            settings.store_place,
+        ]
         made.append(Node(f"coordinator {name}", COORDINATOR, words, place / f"{name}.log"))
     try:
         for name, url in zip("ab", urls * 2, strict=False):
             wait_until(lambda url=url: is_ready(url), seconds=PATIENCE)  # type: ignore[misc]
             of = name if len(urls) == 2 else "a"
-            words = [f"worker-{name}", (place / of / "worker-key").read_text().strip(), settings.store_place, url]
+            words = [
+                f"worker-{name}",
+                (place / of / "worker-key").read_text().strip(),
+                settings.store_place,
+                url,
+            ]
             made.append(Node(f"worker {name}", WORKER, words, place / f"worker-{name}.log"))
         yield made
     finally:
@@ -103,19 +120,31 @@ def test_every_sample_once_whoever_is_killed(
     kills: Counter[str] = Counter()
 
     def job(name: str) -> dict[str, object]:
-        return dict(asked(urls, lambda url: httpx.get(f"{url}/v1/jobs/{name}", trust_env=False, timeout=60)).json())
+        return dict(
+            asked(
+                urls, lambda url: httpx.get(f"{url}/v1/jobs/{name}", trust_env=False, timeout=60)
+            ).json()
+        )
 
     def done() -> int:
         """Return how many tasks there are results of; keep a job at work."""
         if not jobs or job(jobs[-1])["finished_at"] is not None:
-            spec = rods(gamma=tuple(float(number) for number in range(1, SAMPLES + 1)), phi1=(1.0 + len(jobs),))
+            spec = rods(
+                gamma=tuple(float(number) for number in range(1, SAMPLES + 1)),
+                phi1=(1.0 + len(jobs),),
+            )
             spec["samples_per_shard"] = 10
             headers = {"Idempotency-Key": f"job {len(jobs)}"}  # it may be killed before it answers
             answer = asked(
-                urls, lambda url: httpx.post(f"{url}/v1/jobs", json=spec, headers=headers, trust_env=False, timeout=60)
+                urls,
+                lambda url: httpx.post(
+                    f"{url}/v1/jobs", json=spec, headers=headers, trust_env=False, timeout=60
+                ),
             )
             jobs.append(answer.json()["id"])
-        text = asked(urls, lambda url: httpx.get(f"{url}/metrics", trust_env=False, timeout=60)).text
+        text = asked(
+            urls, lambda url: httpx.get(f"{url}/metrics", trust_env=False, timeout=60)
+        ).text
         lines = [line for line in text.splitlines() if line.startswith("stickslip_tasks{")]
         return sum(int(float(line.split()[-1])) for line in lines if 'state="succeeded"' in line)
 
@@ -138,8 +167,18 @@ def test_every_sample_once_whoever_is_killed(
         node.kill()
 
     database, store = connect(settings), open_store(settings.store_place)
-    words = ["gc", "--older-than", "0", "--data", str(settings.data), "--store", settings.store_place]
-    assert CliRunner().invoke(app, [*words, "--delete"]).exit_code == 0  # what calls that were killed had written
+    words = [
+        "gc",
+        "--older-than",
+        "0",
+        "--data",
+        str(settings.data),
+        "--store",
+        settings.store_place,
+    ]
+    assert (
+        CliRunner().invoke(app, [*words, "--delete"]).exit_code == 0
+    )  # what calls that were killed had written
     assert CliRunner().invoke(app, words).output.startswith("0 files")
     with database.read() as connection:
         assert violations(connection) == []
@@ -152,4 +191,6 @@ def test_every_sample_once_whoever_is_killed(
         assert damaged_files(store, version.manifest, version.group_digest) == {}
     with capsys.disabled():
         print(f"\n{KILLS} kills ({dict(kills)}) in {(time.monotonic() - began) / 60:.1f} min")
-        print(f"{len(jobs)} jobs, each of {len(jobs) * SAMPLES} samples once; longest wait {longest:.1f} s")
+        print(
+            f"{len(jobs)} jobs, each of {len(jobs) * SAMPLES} samples once; longest wait {longest:.1f} s"
+        )

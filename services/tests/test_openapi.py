@@ -12,7 +12,9 @@ COMMITTED = Path(__file__).parents[2] / "docs" / "openapi.json"
 
 
 def test_the_committed_document_is_up_to_date() -> None:
-    assert COMMITTED.read_text() == made(), "run: python -m stickslip_services.app --openapi > docs/openapi.json"
+    assert COMMITTED.read_text() == made(), (
+        "run: python -m stickslip_services.app --openapi > docs/openapi.json"
+    )
 
 
 def test_every_reference_leads_somewhere() -> None:
@@ -31,4 +33,8 @@ def test_every_route_names_its_problems() -> None:
         for method, operation in methods.items():
             for status, response in operation["responses"].items():
                 if int(status) >= 400:
-                    assert list(response["content"]) == ["application/problem+json"], (method, path, status)
+                    assert list(response["content"]) == ["application/problem+json"], (
+                        method,
+                        path,
+                        status,
+                    )

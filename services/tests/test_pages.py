@@ -1,4 +1,6 @@
-"""The dashboard: every page answers, shows what it should, escapes what it is given, and changes jobs."""
+"""The dashboard: every page answers, shows what it should, escapes what it is given, and changes
+jobs.
+"""
 
 import asyncio
 import html
@@ -33,13 +35,18 @@ def app(settings: Settings, clock: ManualClock) -> FastAPI:
 
 @pytest.fixture
 def client(app: FastAPI) -> Iterator[httpx.Client]:
-    with serving(app) as url, httpx.Client(base_url=url, timeout=20, follow_redirects=True) as client:
+    with (
+        serving(app) as url,
+        httpx.Client(base_url=url, timeout=20, follow_redirects=True) as client,
+    ):
         yield client
 
 
 @pytest.fixture
 def worker(app: FastAPI, client: httpx.Client) -> PretendWorker:
-    return PretendWorker(DirectApi(app.state.context), app.state.context.store, whole=True).register()
+    return PretendWorker(
+        DirectApi(app.state.context), app.state.context.store, whole=True
+    ).register()
 
 
 GAMMA = [1.0, 2.0, 3.0]
@@ -82,7 +89,8 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert "have been read since" not in read(client, "/workers")
     worker.work()
     assert re.search(
-        r"All datasets have been read since 20[\d: -]+ UTC: 0 files were damaged", read(client, "/workers")
+        r"All datasets have been read since 20[\d: -]+ UTC: 0 files were damaged",
+        read(client, "/workers"),
     )
     page = read(client, f"/jobs/{job}")
     assert "succeeded" in page
@@ -93,7 +101,9 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     slowest = read(client, f"/ui/jobs/{job}/slowest")
     assert slowest.count("/v1/tasks/") == 8
     assert slowest.count("<td>1.0 s</td><td>2.0 s</td>") == 8  # PretendWorker reports so much each
-    assert re.search(r"[\d.]+ s of CPU time so far; without cached tasks, about [\d.]+ s is usual", page)
+    assert re.search(
+        r"[\d.]+ s of CPU time so far; without cached tasks, about [\d.]+ s is usual", page
+    )
     path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)
     assert path is not None
     dataset = read(client, path[0])
@@ -110,10 +120,14 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert f'data-motion="/ui{path[0]}/samples/3/motion.json"' in sample
     picture = client.get(f"/ui{path[0]}/samples/3/views/2.png")
     assert picture.headers["content-type"] == "image/png"
-    again = client.get(f"/ui{path[0]}/samples/3/views/2.png", headers={"If-None-Match": picture.headers["etag"]})
+    again = client.get(
+        f"/ui{path[0]}/samples/3/views/2.png", headers={"If-None-Match": picture.headers["etag"]}
+    )
     assert (again.status_code, again.content) == (304, b"")
     shown = np.asarray(Image.open(BytesIO(picture.content)))
-    stored = (np.arange(4 * shown.size).reshape(4, *shown.shape) + 3) % 251  # as PretendWorker fills it
+    stored = (
+        np.arange(4 * shown.size).reshape(4, *shown.shape) + 3
+    ) % 251  # as PretendWorker fills it
     assert (shown == stored[2]).all()
     motion = client.get(f"/ui{path[0]}/samples/3/motion.json").json()
     (rod,) = motion["sheets"]
@@ -123,7 +137,9 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert both.count("motion.json") == both.count("data-plot=") == 2
     assert "Labels that differ" in both
     assert '/files/views/c/1/0/0/0/0" download' in both
-    assert parsed(yaml.safe_load(client.get(f"/ui{path[0]}/spec.yaml").text)) == parsed(rods(name="first", gamma=GAMMA))
+    assert parsed(yaml.safe_load(client.get(f"/ui{path[0]}/spec.yaml").text)) == parsed(
+        rods(name="first", gamma=GAMMA)
+    )
     assert client.get(f"{path[0]}/samples/3?beside=99").status_code == 404
     assert client.get(f"/ui{path[0]}/samples/99/motion.json").status_code == 404
     for missing in ("samples/99", "samples/-1"):
@@ -135,7 +151,9 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
 
 def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> None:
     worker.judge = lambda task: (
-        rejection("it fell <b>off</b>") if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+        rejection("it fell <b>off</b>")
+        if task.stage == "simulate" and task.simulation.gamma == 1.0
+        else None
     )
     job = submit(client)
     worker.work()
@@ -147,7 +165,10 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert "(50.0 %)" in dataset
     assert "<td>50.00 %</td>" in dataset
     assert "gamma 1, phi1 1: 0 of 1 done, 1 lost" in dataset
-    counts = [re.findall(r"(\d) of 4 samples", read(client, f"{path[0]}?valid={value}")) for value in ("yes", "no", "")]
+    counts = [
+        re.findall(r"(\d) of 4 samples", read(client, f"{path[0]}?valid={value}"))
+        for value in ("yes", "no", "")
+    ]
     assert counts == [["2"], ["2"], ["4"]]
     assert "0 of 4 samples" in read(client, f"{path[0]}?gamma.from=1&gamma.to=0")
     assert "4 of 4 samples" in read(client, f"{path[0]}?psnr=30")  # of rods, nothing is measured
@@ -186,7 +207,11 @@ def test_names_cannot_break_out(client: httpx.Client) -> None:
 def test_buttons_change_jobs(client: httpx.Client, worker: PretendWorker, app: FastAPI) -> None:
     job = submit(client)
     context = app.state.context
-    for verb, state in (("pause", JobState.paused), ("resume", JobState.queued), ("cancel", JobState.cancelled)):
+    for verb, state in (
+        ("pause", JobState.paused),
+        ("resume", JobState.queued),
+        ("cancel", JobState.cancelled),
+    ):
         assert f"/ui/jobs/{job}/{verb}" in read(client, "/")
         answer = client.post(f"/ui/jobs/{job}/{verb}")
         assert (answer.status_code, answer.headers["hx-redirect"]) == (204, f"/jobs/{job}")
@@ -220,7 +245,11 @@ def test_a_page_is_told_of_changes(app: FastAPI, client: httpx.Client) -> None:
 def test_assets_are_local_and_licensed(client: httpx.Client) -> None:
     for name in ("app.css", "app.js", "space.js", "icon.svg"):
         assert client.get(f"/static/{name}").status_code == 200
-    for library, licence in (("htmx", "Zero-Clause BSD"), ("three", "MIT License"), ("uplot", "MIT License")):
+    for library, licence in (
+        ("htmx", "Zero-Clause BSD"),
+        ("three", "MIT License"),
+        ("uplot", "MIT License"),
+    ):
         assert licence in client.get(f"/static/{library}-LICENSE.txt").text
         assert client.get(f"/static/{library}.min.js").status_code == 200
     assert client.get("/static/../app.py").status_code == 404
@@ -228,7 +257,11 @@ def test_assets_are_local_and_licensed(client: httpx.Client) -> None:
 
 def test_a_plot_escapes_names_and_leaves_gaps_where_nothing_is_known() -> None:
     made = plot(table([0.0, 1.0], {'"><b>': [1.0, float("nan")]}), x_name="t", y_name="y")
-    text = _environment().from_string('{% from "macros.html" import plot %}{{ plot(made) }}').render(made=made)
+    text = (
+        _environment()
+        .from_string('{% from "macros.html" import plot %}{{ plot(made) }}')
+        .render(made=made)
+    )
     assert "<b>" not in text
     found = re.search('data-plot="([^"]*)"', text)
     assert found is not None
@@ -249,7 +282,10 @@ def test_a_scene_of_a_job_is_listed(app: FastAPI, client: httpx.Client) -> None:
     context = app.state.context
     PretendWorker(DirectApi(context), context.store, kinds=("cloth_scene",)).register()
     axes = {"texture": "dots", "viewpoint": "front"}
-    scene = load_scene("turning-ball").model_dump(mode="json") | {"name": "my-ball", "description": "<b>mine</b>"}
+    scene = load_scene("turning-ball").model_dump(mode="json") | {
+        "name": "my-ball",
+        "description": "<b>mine</b>",
+    }
     spec = {"kind": "cloth_scene", "scene": scene, "axes": axes, "allow_uncertified": True}
     assert client.post("/v1/jobs", json=spec).status_code == 202
     found = re.search(r'href="(/scenes/[0-9a-f]{64})">my-ball<', read(client, "/scenes"))
@@ -280,6 +316,8 @@ def test_a_browser_gets_errors_as_a_page(client: httpx.Client) -> None:
     page = client.get("/jobs/<b>", headers={"Accept": "text/html,*/*"})
     assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
     assert "there is no job &#39;&lt;b&gt;&#39;" in page.text
-    assert client.get("/nowhere", headers={"Accept": "text/html"}).text.startswith("<!doctype html>")
+    assert client.get("/nowhere", headers={"Accept": "text/html"}).text.startswith(
+        "<!doctype html>"
+    )
     for path in ("/jobs/nothing", "/v1/jobs/nothing"):
         assert client.get(path).headers["content-type"] == "application/problem+json"

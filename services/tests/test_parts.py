@@ -22,10 +22,15 @@ GAMMAS = (1.0, 2.0, 3.0, 4.0)
 
 @pytest.fixture(scope="module")
 def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, str]]:
-    """URL and two datasets of a coordinator. Of the first, slot n of 0 to 7 has gamma n, two slots to a shard."""
+    """URL and two datasets of a coordinator.
+
+    Of the first, slot n of 0 to 7 has gamma n, two slots to a shard.
+    """
     made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
     with serving(made) as url, Client(url) as client:
-        worker = PretendWorker(DirectApi(made.state.context), made.state.context.store, whole=True).register()
+        worker = PretendWorker(
+            DirectApi(made.state.context), made.state.context.store, whole=True
+        ).register()
         ids = []
         for gamma in (GAMMAS, GAMMAS[:2]):
             job = client.submit(rods(gamma=gamma, name=f"{len(gamma)}-rods"))
@@ -44,21 +49,41 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
-def test_a_part_has_all_labels_and_the_shards_of_chosen_samples(origin: tuple[str, str, str], tmp_path: Path) -> None:
+def test_a_part_has_all_labels_and_the_shards_of_chosen_samples(
+    origin: tuple[str, str, str], tmp_path: Path
+) -> None:
     url, dataset, _ = origin
     target = tmp_path / "d"
-    done = run("pull", dataset, target, "--url", url, "--arrays", "views", "--where", "gamma<3", "--where", "gamma>=1")
+    done = run(
+        "pull",
+        dataset,
+        target,
+        "--url",
+        url,
+        "--arrays",
+        "views",
+        "--where",
+        "gamma<3",
+        "--where",
+        "gamma>=1",
+    )
     assert done.exit_code == 0, done.output
     views = {path for path in files(target) if path.startswith("views/c/")}
     assert views == {f"views/c/{shard}/0/0/0/0" for shard in (0, 1)}  # slots 1 and 2
     assert not [path for path in files(target) if path.startswith(("centerline/", "frame/"))]
     assert "gamma/c/0" in files(target)
     part = json.loads((target / SELECTION_NAME).read_bytes())
-    assert part["selection"] == {"arrays": ["views"], "split": None, "where": ["gamma<3", "gamma>=1"]}
+    assert part["selection"] == {
+        "arrays": ["views"],
+        "split": None,
+        "where": ["gamma<3", "gamma>=1"],
+    }
     assert run("verify", target).exit_code == 0
 
 
-def test_a_part_that_is_not_whole_is_found_and_mended(origin: tuple[str, str, str], tmp_path: Path) -> None:
+def test_a_part_that_is_not_whole_is_found_and_mended(
+    origin: tuple[str, str, str], tmp_path: Path
+) -> None:
     url, dataset, _ = origin
     chosen = Selection(arrays=("views",), where=("gamma<2",))
     with Client(url) as client:
@@ -70,12 +95,18 @@ def test_a_part_that_is_not_whole_is_found_and_mended(origin: tuple[str, str, st
         pull(client, dataset, 1, tmp_path, selection=chosen)
         assert verify(tmp_path) == []
         (tmp_path / "views/c/0/0/0/0/0").unlink()
-        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [("views/c/0/0/0/0/0", "missing")]
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [
+            ("views/c/0/0/0/0/0", "missing")
+        ]
         (tmp_path / SELECTION_NAME).write_text("{}")
-        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [(SELECTION_NAME, "selection")]
+        assert [(fault.path, fault.fault) for fault in verify(tmp_path)] == [
+            (SELECTION_NAME, "selection")
+        ]
 
 
-def test_a_part_is_completed_and_not_mixed_with_another(origin: tuple[str, str, str], tmp_path: Path) -> None:
+def test_a_part_is_completed_and_not_mixed_with_another(
+    origin: tuple[str, str, str], tmp_path: Path
+) -> None:
     url, dataset, _ = origin
     with Client(url) as client:
         part = pull(client, dataset, 1, tmp_path, selection=Selection(arrays=()))
@@ -106,10 +137,15 @@ def test_what_makes_no_sense_is_refused(
 
 
 def test_an_export_is_the_training_packages_work(
-    origin: tuple[str, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    origin: tuple[str, str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     url, dataset, _ = origin
-    done = run("export", dataset, "--webdataset", tmp_path / "out", "--obj", tmp_path / "b", "--url", url)
+    done = run(
+        "export", dataset, "--webdataset", tmp_path / "out", "--obj", tmp_path / "b", "--url", url
+    )
     assert done.exit_code == 1
     assert "an export needs one of" in capfd.readouterr().err
     monkeypatch.setattr("stickslip_services.cli.datasets.find_spec", lambda _name: None)

@@ -47,13 +47,18 @@ def check(context: Context) -> None:
 
 
 def written(context: Context, job_id: str) -> tuple[Any, ...]:
-    """Return the plan of a job as it is in the database, by keys: tasks, what they build on, and samples."""
+    """Return the plan of a job as it is in the database, by keys: tasks, what they build on, and
+    samples.
+    """
     needed = tasks.alias()
     with context.database.read() as connection:
         job = connection.scalar(select(jobs.c.seq).where(jobs.c.id == job_id))
         names = dict(connection.execute(select(tasks.c.seq, tasks.c.key)).all())
         of_job = job_tasks.c.task == tasks.c.seq, job_tasks.c.job == job
-        columns = [tasks.c[name] for name in ("key", "stage", "build", "preview", "cost_group", "waiting_on")]
+        columns = [
+            tasks.c[name]
+            for name in ("key", "stage", "build", "preview", "cost_group", "waiting_on")
+        ]
         own = connection.execute(select(*columns).join(job_tasks, of_job[0]).where(of_job[1])).all()
         edges = connection.execute(
             select(tasks.c.key, needed.c.key)
@@ -62,11 +67,16 @@ def written(context: Context, job_id: str) -> tuple[Any, ...]:
             .join(job_tasks, of_job[0])
             .where(of_job[1])
         ).all()
-        slots = connection.execute(select(samples).where(samples.c.job == job).order_by(samples.c.slot)).all()
+        slots = connection.execute(
+            select(samples).where(samples.c.job == job).order_by(samples.c.slot)
+        ).all()
     return (
         sorted(map(tuple, own)),
         sorted(map(tuple, edges)),
-        [(row.slot, row.key, names[row.simulate_task], names.get(row.render_task), row.split) for row in slots],
+        [
+            (row.slot, row.key, names[row.simulate_task], names.get(row.render_task), row.split)
+            for row in slots
+        ],
     )
 
 
@@ -102,7 +112,9 @@ GRIDS = {
 
 @pytest.fixture
 def worker(context: Context) -> PretendWorker:
-    return PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
+    return PretendWorker(
+        DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")
+    ).register()
 
 
 @pytest.mark.parametrize("name", GRIDS)
@@ -171,8 +183,14 @@ def test_a_large_job_that_was_made_before_runs_nothing(
     assert shown.state is JobState.succeeded
     assert shown.dataset == show_job(context, first).dataset
     assert {
-        stage: (counted.cached, sum(counted.counts.values())) for stage, counted in shown.progress.stages.items()
-    } == {Stage.simulate: (15, 15), Stage.render: (15, 15), Stage.pack: (8, 8), Stage.publish: (1, 1)}
+        stage: (counted.cached, sum(counted.counts.values()))
+        for stage, counted in shown.progress.stages.items()
+    } == {
+        Stage.simulate: (15, 15),
+        Stage.render: (15, 15),
+        Stage.pack: (8, 8),
+        Stage.publish: (1, 1),
+    }
     check(context)
 
 
@@ -210,7 +228,9 @@ def test_it_is_cancelled_half_planned_and_finished_by_another_job(
     check(context)
 
 
-def test_a_pause_stops_the_planning_too(context: Context, worker: PretendWorker, planner: Planner) -> None:
+def test_a_pause_stops_the_planning_too(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
     job_id = submit(context)
     planner.step()
     pause_job(context, job_id)
@@ -222,7 +242,9 @@ def test_a_pause_stops_the_planning_too(context: Context, worker: PretendWorker,
     check(context)
 
 
-def test_a_task_that_fails_ends_the_planning(context: Context, worker: PretendWorker, planner: Planner) -> None:
+def test_a_task_that_fails_ends_the_planning(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
     job_id = submit(context)
     planner.step()
     for _ in range(context.settings.max_tries):
@@ -290,7 +312,9 @@ def test_another_coordinator_goes_on_when_the_first_one_has_died(
     assert written(context, job_id) == planned(GRID)
 
 
-def test_jobs_wait_for_the_first_worker_and_are_planned_then(context: Context, planner: Planner) -> None:
+def test_jobs_wait_for_the_first_worker_and_are_planned_then(
+    context: Context, planner: Planner
+) -> None:
     job_id = submit(context)
     shown = show_job(context, job_id)
     assert (shown.state, shown.reason) == (JobState.queued, Reason.waiting_for_worker)
@@ -303,7 +327,9 @@ def test_jobs_wait_for_the_first_worker_and_are_planned_then(context: Context, p
     check(context)
 
 
-def test_urgent_jobs_are_planned_first(context: Context, worker: PretendWorker, planner: Planner) -> None:
+def test_urgent_jobs_are_planned_first(
+    context: Context, worker: PretendWorker, planner: Planner
+) -> None:
     first = submit(context)
     urgent = submit(context, GRID | {"seed": 1}, priority=5)
     planner.step()
@@ -351,7 +377,9 @@ def _planned(client: httpx.Client, job_id: str) -> int:
 def test_people_see_how_far_the_plan_is(
     settings: Settings, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stickslip_services.app.PLAN_SECONDS", 1e6)  # it plans when the test calls it
+    monkeypatch.setattr(
+        "stickslip_services.app.PLAN_SECONDS", 1e6
+    )  # it plans when the test calls it
     made = make_app(settings, clock=clock)
     context: Context = made.state.context
     planner = Planner(context)
@@ -359,11 +387,18 @@ def test_people_see_how_far_the_plan_is(
         worker = PretendWorker(DirectApi(context), context.store).register()
         answer = client.post("/v1/jobs", json=GRID)
         job = answer.raise_for_status().json()
-        assert (answer.status_code, job["state"], job["progress"]["planned"]) == (202, "planning", 0)
+        assert (answer.status_code, job["state"], job["progress"]["planned"]) == (
+            202,
+            "planning",
+            0,
+        )
         assert "0 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
         planner.step()
         assert "4 of 15 samples are planned" in client.get(f"/jobs/{job['id']}").text
-        assert "4 of 15 samples are planned" in CliRunner().invoke(app, ["show", job["id"], "--url", url]).stdout
+        assert (
+            "4 of 15 samples are planned"
+            in CliRunner().invoke(app, ["show", job["id"], "--url", url]).stdout
+        )
         planner.run()
         assert client.get(f"/v1/jobs/{job['id']}").json()["state"] == "queued"
         assert "samples are planned" not in client.get(f"/jobs/{job['id']}").text

@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def settings(tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch) -> Settings:
+def settings(
+    tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest.MonkeyPatch
+) -> Settings:
     """Settings with a database on PostgreSQL, which processes find in their environment."""
     monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.clean())
     return Settings(data=tmp_path / "data", durable=False)
@@ -48,7 +50,9 @@ def settings(tmp_path: Path, postgresql: "PostgresqlServer", monkeypatch: pytest
 
 def one_more(settings: Settings, name: str) -> Settings:
     """Return the settings of another coordinator with the same database and the same store."""
-    return settings.model_copy(update={"data": settings.data.parent / name, "store": settings.store_place})
+    return settings.model_copy(
+        update={"data": settings.data.parent / name, "store": settings.store_place}
+    )
 
 
 @dataclass
@@ -61,7 +65,9 @@ class Pair:
 
     def worker(self, which: int, name: str) -> PretendWorker:
         server = self.servers[which]
-        api = HttpApi(server.url, (server.data / "worker-key").read_text().strip(), self.client.post)
+        api = HttpApi(
+            server.url, (server.data / "worker-key").read_text().strip(), self.client.post
+        )
         return PretendWorker(api, DirectoryStore(self.settings.store_place), name=name).register()
 
     def submit(self, which: int, **spec: object) -> str:
@@ -71,7 +77,9 @@ class Pair:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer") -> Iterator[Pair]:
+def pair(
+    tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer"
+) -> Iterator[Pair]:
     """Each test submits samples of its own: results of another would end its job at once."""
     place = tmp_path_factory.mktemp("pair")
 
@@ -92,7 +100,9 @@ def pair(tmp_path_factory: pytest.TempPathFactory, postgresql: "PostgresqlServer
 def test_two_coordinators_share_the_work(pair: Pair) -> None:
     """The first of their tests: it counts all tasks of the database."""
     workers = [pair.worker(number % 2, f"w{number}") for number in range(4)]
-    specs = [{"gamma": [1.0 + number, 2.0 + number, 3.0 + number]} for number in range(4)]  # they share tasks
+    specs = [
+        {"gamma": [1.0 + number, 2.0 + number, 3.0 + number]} for number in range(4)
+    ]  # they share tasks
     jobs: list[str] = []
     is_over = threading.Event()
     lost = Counter[str]()  # leases that expired before the report, as where the disk takes so long
@@ -107,12 +117,17 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
                 verdicts = worker.finish(*leases)
                 if time.monotonic() - asked > pair.settings.lease_seconds:
                     stale = [
-                        lease.task_id for lease, verdict in zip(leases, verdicts, strict=True) if verdict == "stale"
+                        lease.task_id
+                        for lease, verdict in zip(leases, verdicts, strict=True)
+                        if verdict == "stale"
                     ]
                     lost.update(stale)
 
     def states() -> set[str]:
-        return {job["state"] for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]}
+        return {
+            job["state"]
+            for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]
+        }
 
     threads = [threading.Thread(target=submit_all, args=(which,)) for which in range(2)]
     threads += [threading.Thread(target=work, args=(worker,)) for worker in workers]
@@ -174,14 +189,18 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
                 continue
             heard.append((json.loads(event.data)["state"], time.monotonic()))
             if len(heard) == 1:
-                time.sleep(2.5)  # now the stream waits for the notifier: by itself it looks again after 15 s
+                time.sleep(
+                    2.5
+                )  # now the stream waits for the notifier: by itself it looks again after 15 s
                 asked = time.monotonic()
                 pair.client.post(f"{one}/v1/jobs/{job}:cancel").raise_for_status()
     assert [state for state, _ in heard][-1] == "cancelled"
     assert heard[-1][1] - asked < 6.0
 
 
-def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings, clock: ManualClock) -> None:
+def test_leases_are_renewed_at_start_only_if_nobody_was_there(
+    settings: Settings, clock: ManualClock
+) -> None:
     first = Context.open(settings, clock)
     start(first)
     worker = PretendWorker(DirectApi(first), first.store).register()
@@ -190,7 +209,10 @@ def test_leases_are_renewed_at_start_only_if_nobody_was_there(settings: Settings
 
     def expires_at() -> float:
         with first.database.read() as connection:
-            return float(connection.scalar(select(tasks.c.expires_at).where(tasks.c.owner.is_not(None))) or 0.0)
+            return float(
+                connection.scalar(select(tasks.c.expires_at).where(tasks.c.owner.is_not(None)))
+                or 0.0
+            )
 
     leased_until = expires_at()
     clock.advance(10.0)
@@ -236,13 +258,18 @@ def test_a_heartbeat_is_two_statements_and_waits_for_no_writer(
 def test_upkeep_has_the_database_for_itself(settings: Settings) -> None:
     context = Context.open(settings)
     start(context)
-    with pytest.raises(DatabaseRefusedError, match="is in use by a coordinator"), opened(settings, Role.upkeep):
+    with (
+        pytest.raises(DatabaseRefusedError, match="is in use by a coordinator"),
+        opened(settings, Role.upkeep),
+    ):
         pass
     with opened(settings, Role.visitor):
         pass
     context.close()
     with opened(settings, Role.upkeep):
-        with pytest.raises(DatabaseRefusedError, match=r"is at work on the database postgresql.*wait until"):
+        with pytest.raises(
+            DatabaseRefusedError, match=r"is at work on the database postgresql.*wait until"
+        ):
             check(settings, Role.coordinator)
         with pytest.raises(DatabaseRefusedError, match="is in use by"):
             check(settings, Role.upkeep)
@@ -282,7 +309,10 @@ def test_a_coordinator_goes_on_after_the_server_has_closed_its_connections(
         except OperationalError:
             pass
     assert show_job(context, job.id).state is JobState.succeeded  # type: ignore[union-attr]
-    with pytest.raises(DatabaseRefusedError), opened(settings, Role.upkeep):  # it is known to be there again
+    with (
+        pytest.raises(DatabaseRefusedError),
+        opened(settings, Role.upkeep),
+    ):  # it is known to be there again
         pass
     context.close()
 
@@ -411,9 +441,13 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
     context.close()
     empty = postgresql.empty()
     lost = Settings.chosen(data=settings.data, durable=False, database=empty)
-    with pytest.raises(DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"):
+    with pytest.raises(
+        DatabaseRefusedError, match=r"is gone: run `stickslip reindex .*` with the same --database"
+    ):
         check(lost, Role.coordinator, with_store=True)
-    found_again = CliRunner().invoke(app, ["reindex", "--data", str(settings.data), "--database", empty])
+    found_again = CliRunner().invoke(
+        app, ["reindex", "--data", str(settings.data), "--database", empty]
+    )
     assert found_again.exit_code == 0, found_again.output
     again = Context.open(lost)
     start(again)
@@ -429,14 +463,19 @@ def test_nothing_is_deleted_by_an_empty_database(
     monkeypatch.setenv("STICKSLIP_DATABASE", postgresql.empty())
     arguments = ["gc", "--data", str(settings.data), "--older-than", "0", "--delete"]
     result = CliRunner().invoke(app, arguments)
-    assert (result.exit_code, "does not exist or is empty: name the --database" in result.stderr) == (1, True)
+    assert (
+        result.exit_code,
+        "does not exist or is empty: name the --database" in result.stderr,
+    ) == (1, True)
     assert DirectoryStore(settings.store_place).path(artifact).exists()
 
 
 def test_a_data_directory_with_another_database_is_refused(settings: Settings) -> None:
     with opened(settings.model_copy(update={"database": None}), Role.upkeep):
         pass
-    with pytest.raises(DatabaseRefusedError, match=r"coordinator\.sqlite3 holds another one: move that file away"):
+    with pytest.raises(
+        DatabaseRefusedError, match=r"coordinator\.sqlite3 holds another one: move that file away"
+    ):
         check(settings, Role.coordinator)
 
 
@@ -451,10 +490,15 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
     newer = postgresql.empty()
     with opened(Settings.chosen(data=tmp_path, database=newer), Role.upkeep):
         pass
-    postgresql.execute("UPDATE alembic_version SET version_num = '9042'", newer.partition("?")[0].rpartition("/")[2])
+    postgresql.execute(
+        "UPDATE alembic_version SET version_num = '9042'",
+        newer.partition("?")[0].rpartition("/")[2],
+    )
     assert "has the schema 9042, and this version of stickslip knows 0001" in refusal(newer)
     others = postgresql.empty()
-    postgresql.execute("CREATE TABLE birds (name text)", others.partition("?")[0].rpartition("/")[2])
+    postgresql.execute(
+        "CREATE TABLE birds (name text)", others.partition("?")[0].rpartition("/")[2]
+    )
     assert "is not a database of stickslip: give it one of its own" in refusal(others)
     postgresql.execute("CREATE DATABASE latin ENCODING latin1 LOCALE 'C' TEMPLATE template0")
     assert "must be UTF8, and is LATIN1" in refusal(postgresql.url("latin"))
@@ -494,7 +538,9 @@ def test_other_databases_are_refused_without_their_password(
 
 
 def test_a_password_is_not_shown(tmp_path: Path) -> None:
-    settings = Settings.chosen(data=tmp_path, database="postgresql://me:s3cret@host/name?sslpassword=s3cret")
+    settings = Settings.chosen(
+        data=tmp_path, database="postgresql://me:s3cret@host/name?sslpassword=s3cret"
+    )
     assert "s3cret" not in f"{settings!r} {settings} {settings.model_dump_json()}"
     assert settings.database_name == "postgresql://me:***@host/name"
 

@@ -8,7 +8,14 @@ import httpx
 import pytest
 from click.testing import CliRunner
 from stickslip_schemas.base import JobState
-from stickslip_services.access.keys import Asker, asking, find_project, list_projects, read_audit_log, set_quota
+from stickslip_services.access.keys import (
+    Asker,
+    asking,
+    find_project,
+    list_projects,
+    read_audit_log,
+    set_quota,
+)
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
 from stickslip_services.errors import QuotaExceededError
@@ -36,22 +43,31 @@ def limit(context: Context, project: str, **most: int | None) -> None:
         set_quota(connection, project, **limits, now=context.clock())
 
 
-def shares(context: Context, worker: PretendWorker, count: int, jobs: dict[float, str]) -> Counter[str]:
+def shares(
+    context: Context, worker: PretendWorker, count: int, jobs: dict[float, str]
+) -> Counter[str]:
     """Lease simulations, and return how many are of each project; a job is known by its gamma."""
     leases = worker.lease(simulate=count)
     return Counter(jobs[lease.task.simulation.gamma] for lease in leases)  # type: ignore[union-attr]
 
 
-def test_a_quota_of_samples_refuses_what_is_too_much(context: Context, worker: PretendWorker) -> None:
+def test_a_quota_of_samples_refuses_what_is_too_much(
+    context: Context, worker: PretendWorker
+) -> None:
     limit(context, "lab", max_samples=6)
     first = submit(context, "lab")
     assert show_job(context, first).project == "lab"
-    with pytest.raises(QuotaExceededError, match=r"samples of the project 'lab' .* at most 6: there are 4, .* be 8"):
+    with pytest.raises(
+        QuotaExceededError, match=r"samples of the project 'lab' .* at most 6: there are 4, .* be 8"
+    ):
         submit(context, "lab", gamma=(8.0, 9.0))
     submit(context, "lab", gamma=(8.0,))
     submit(context, "other", gamma=(8.0, 9.0))  # of a project without a quota
     with context.database.read() as connection:
-        assert (find_project(connection, "lab").samples, find_project(connection, "lab").jobs) == (6, 2)
+        assert (find_project(connection, "lab").samples, find_project(connection, "lab").jobs) == (
+            6,
+            2,
+        )
     worker.work()
     submit(context, "lab", gamma=(8.0, 9.0))  # all of it has ended
     limit(context, "lab")
@@ -59,13 +75,19 @@ def test_a_quota_of_samples_refuses_what_is_too_much(context: Context, worker: P
     with context.database.read() as connection:
         assert violations(connection) == []
         assert [project.name for project in list_projects(connection)] == ["", "lab", "other"]
-        assert [line.subject for line in read_audit_log(connection) if line.action == "project.quota"] == ["lab", "lab"]
+        assert [
+            line.subject for line in read_audit_log(connection) if line.action == "project.quota"
+        ] == ["lab", "lab"]
 
 
-def test_a_quota_of_jobs_counts_those_that_have_not_ended(context: Context, worker: PretendWorker) -> None:
+def test_a_quota_of_jobs_counts_those_that_have_not_ended(
+    context: Context, worker: PretendWorker
+) -> None:
     limit(context, "", max_jobs=1)
     first = submit(context, "")
-    with pytest.raises(QuotaExceededError, match=r"jobs of requests without a project .* at most 1: there are 1"):
+    with pytest.raises(
+        QuotaExceededError, match=r"jobs of requests without a project .* at most 1: there are 1"
+    ):
         submit(context, "", gamma=(7.0,))
     pause_job(context, first)
     with pytest.raises(QuotaExceededError):
@@ -83,7 +105,9 @@ def test_a_large_job_counts_before_it_is_planned(context: Context, worker: Prete
         submit(context, "lab", gamma=(7.0,))
 
 
-def test_projects_share_evenly_however_many_jobs_they_have(context: Context, worker: PretendWorker) -> None:
+def test_projects_share_evenly_however_many_jobs_they_have(
+    context: Context, worker: PretendWorker
+) -> None:
     phi1 = tuple(float(n) for n in range(1, 21))
     jobs = {}
     for gamma in (1.0, 2.0, 3.0):
@@ -112,12 +136,15 @@ def test_priorities_order_the_jobs_of_a_project(context: Context, worker: Preten
 
 
 @pytest.mark.parametrize("option", [["--samples", "5"], ["--jobs", "1"]])
-def test_the_api_answers_429_and_names_the_rule(tmp_path: Path, option: list[str], database: str) -> None:
+def test_the_api_answers_429_and_names_the_rule(
+    tmp_path: Path, option: list[str], database: str
+) -> None:
     data = tmp_path / "data"
     settings = Settings.chosen(data=data, durable=False, require_keys=True)
     with serving(make_app(settings)) as url:
         made = CliRunner().invoke(
-            app, ["keys", "create", "ann", "--scope", "submit", "--project", "lab", "--data", str(data)]
+            app,
+            ["keys", "create", "ann", "--scope", "submit", "--project", "lab", "--data", str(data)],
         )
         assert made.exit_code == 0, made.output
         done = CliRunner().invoke(app, ["projects", "quota", "lab", *option, "--data", str(data)])
@@ -131,7 +158,10 @@ def test_the_api_answers_429_and_names_the_rule(tmp_path: Path, option: list[str
             assert (refused.status_code, problem["code"]) == (429, "quota_exceeded")
             (field,) = problem["errors"]
             what = option[0][2:]
-            assert field["rule"] == f"{what} of the project 'lab' that have not ended must be at most {option[1]}"
+            assert (
+                field["rule"]
+                == f"{what} of the project 'lab' that have not ended must be at most {option[1]}"
+            )
             assert field["value"] == {"samples": "8", "jobs": "2"}[what]
             assert len(client.get("/v1/jobs").json()["items"]) == 1
             client.post(f"/v1/jobs/{first.json()['id']}:cancel")
@@ -142,6 +172,8 @@ def test_the_api_answers_429_and_names_the_rule(tmp_path: Path, option: list[str
 
 def test_a_project_needs_a_name_that_can_be_typed(tmp_path: Path, context: Context) -> None:
     data = str(context.settings.data)
-    done = CliRunner().invoke(app, ["projects", "quota", "Two Words", "--jobs", "1", "--data", data])
+    done = CliRunner().invoke(
+        app, ["projects", "quota", "Two Words", "--jobs", "1", "--data", data]
+    )
     assert done.exit_code == 1
     assert "project must be lower-case letters" in " ".join(done.stderr.split())

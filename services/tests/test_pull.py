@@ -42,7 +42,9 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]
 class Meddler(httpx.BaseTransport):
     """Passes requests on, and meddles with the answers to downloads of one file."""
 
-    def __init__(self, path: str, meddle: Callable[[httpx.Request, httpx.Response], httpx.Response]) -> None:
+    def __init__(
+        self, path: str, meddle: Callable[[httpx.Request, httpx.Response], httpx.Response]
+    ) -> None:
         self._inner = httpx.HTTPTransport()
         self._path = path
         self._meddle = meddle
@@ -78,7 +80,9 @@ class Breaks(httpx.SyncByteStream):
         raise httpx.ReadError("the connection is gone")
 
 
-def test_a_pull_brings_everything_and_a_second_one_nothing(origin: tuple[str, str], tmp_path: Path) -> None:
+def test_a_pull_brings_everything_and_a_second_one_nothing(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
     url, dataset = origin
     meddler = Meddler("nothing", lambda _request, response: response)
     with Client(url, transport=meddler) as client:
@@ -90,17 +94,25 @@ def test_a_pull_brings_everything_and_a_second_one_nothing(origin: tuple[str, st
         before = len(meddler.requests)
         second = pull(client, dataset, 1, tmp_path / "d")
         assert (second.downloaded_files, second.downloaded_bytes) == (0, 0)
-        assert len(meddler.requests) - before == 5  # the version, the three files that vouch for it, and a signature
+        assert (
+            len(meddler.requests) - before == 5
+        )  # the version, the three files that vouch for it, and a signature
     assert not list((tmp_path / "d").rglob("*.part"))
 
 
-def test_a_download_that_breaks_goes_on_where_it_stopped(origin: tuple[str, str], tmp_path: Path) -> None:
+def test_a_download_that_breaks_goes_on_where_it_stopped(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
     ranges: list[str | None] = []
 
     def meddle(request: httpx.Request, response: httpx.Response) -> httpx.Response:
         ranges.append(request.headers.get("range"))
         if len(ranges) <= 2:
-            return httpx.Response(response.status_code, headers=response.headers, stream=Breaks(response.content[:100]))
+            return httpx.Response(
+                response.status_code,
+                headers=response.headers,
+                stream=Breaks(response.content[:100]),
+            )
         return response
 
     with Client(origin[0], transport=Meddler(PATH, meddle), patience=0) as client:
@@ -109,12 +121,17 @@ def test_a_download_that_breaks_goes_on_where_it_stopped(origin: tuple[str, str]
     assert verify(tmp_path) == []
 
 
-def test_an_interrupted_pull_is_resumed_by_the_next(origin: tuple[str, str], tmp_path: Path) -> None:
+def test_an_interrupted_pull_is_resumed_by_the_next(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
     def cut(request: httpx.Request, response: httpx.Response) -> httpx.Response:
         data = b"" if "range" in request.headers else response.content[:50]
         return httpx.Response(response.status_code, headers=response.headers, stream=Breaks(data))
 
-    with Client(origin[0], transport=Meddler(PATH, cut), patience=0) as client, pytest.raises(UnreachableError):
+    with (
+        Client(origin[0], transport=Meddler(PATH, cut), patience=0) as client,
+        pytest.raises(UnreachableError),
+    ):
         pull(client, origin[1], 1, tmp_path)
     assert (tmp_path / "views/c/0/0.part").stat().st_size == 50
     assert not (tmp_path / "views/c/0/0").exists()
@@ -128,7 +145,9 @@ def test_an_interrupted_pull_is_resumed_by_the_next(origin: tuple[str, str], tmp
 
 
 @pytest.mark.parametrize("left", [b"something else", b"x" * 100_000])
-def test_a_part_of_something_else_is_thrown_away(origin: tuple[str, str], tmp_path: Path, left: bytes) -> None:
+def test_a_part_of_something_else_is_thrown_away(
+    origin: tuple[str, str], tmp_path: Path, left: bytes
+) -> None:
     part = tmp_path / "views/c/0/0.part"
     part.parent.mkdir(parents=True)
     part.write_bytes(left)
@@ -159,7 +178,10 @@ def test_what_arrives_damaged_gets_no_name(origin: tuple[str, str], tmp_path: Pa
     def corrupt(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
         return httpx.Response(200, content=b"\0" * len(response.content))
 
-    with Client(origin[0], transport=Meddler(PATH, corrupt), patience=0) as client, pytest.raises(DamagedError):
+    with (
+        Client(origin[0], transport=Meddler(PATH, corrupt), patience=0) as client,
+        pytest.raises(DamagedError),
+    ):
         pull(client, origin[1], 1, tmp_path)
     assert not (tmp_path / "views/c/0/0").exists()
     assert not (tmp_path / "manifest.json").exists()
@@ -188,14 +210,20 @@ def test_a_malicious_manifest_writes_nothing(origin: tuple[str, str], tmp_path: 
     evil = manifest.model_copy(update={"files": (evil_file,)}).model_dump_json().encode()
     assert Manifest.model_validate_json(evil)
     group = with_manifest_digest(b"{}", sha256(evil))
-    answers = {"zarr.json": group, "manifest.sha256": seal_text(sha256(evil), sha256(group)), "manifest": evil}
+    answers = {
+        "zarr.json": group,
+        "manifest.sha256": seal_text(sha256(evil), sha256(group)),
+        "manifest": evil,
+    }
 
     def lie(request: httpx.Request, response: httpx.Response) -> httpx.Response:
         name = request.url.path.rpartition("/")[2]
         if name in answers:
             return httpx.Response(200, content=answers[name])
         if request.url.path.endswith("/versions/1"):
-            return httpx.Response(200, json=response.json() | {"manifest": sha256(evil), "group": sha256(group)})
+            return httpx.Response(
+                200, json=response.json() | {"manifest": sha256(evil), "group": sha256(group)}
+            )
         return response
 
     with Client(origin[0], transport=Meddler("", lie)) as client, pytest.raises(UnsafePathError):
@@ -205,15 +233,25 @@ def test_a_malicious_manifest_writes_nothing(origin: tuple[str, str], tmp_path: 
 
 def test_a_manifest_other_than_promised_is_refused(origin: tuple[str, str], tmp_path: Path) -> None:
     def lie(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
-        return httpx.Response(200, content=response.content.replace(b"rod_hang", b"rod_hang", 1) + b"\n")
+        return httpx.Response(
+            200, content=response.content.replace(b"rod_hang", b"rod_hang", 1) + b"\n"
+        )
 
-    with Client(origin[0], transport=Meddler("/manifest", lie)) as client, pytest.raises(DamagedError):
+    with (
+        Client(origin[0], transport=Meddler("/manifest", lie)) as client,
+        pytest.raises(DamagedError),
+    ):
         pull(client, origin[1], 1, tmp_path)
 
 
 def test_a_coordinator_that_is_away_is_waited_for() -> None:
     answers: Iterator[httpx.Response | Exception] = iter(
-        [httpx.Response(503), httpx.ConnectError("refused"), httpx.ReadError("gone"), httpx.Response(200, json=[])]
+        [
+            httpx.Response(503),
+            httpx.ConnectError("refused"),
+            httpx.ReadError("gone"),
+            httpx.Response(200, json=[]),
+        ]
     )
     slept: list[float] = []
 
@@ -227,7 +265,10 @@ def test_a_coordinator_that_is_away_is_waited_for() -> None:
         assert client.workers() == []
     assert len(slept) == 3
     always = httpx.MockTransport(lambda _request: httpx.Response(503))
-    with Client(transport=always, patience=0) as client, pytest.raises(UnexpectedError, match="503"):
+    with (
+        Client(transport=always, patience=0) as client,
+        pytest.raises(UnexpectedError, match="503"),
+    ):
         client.workers()
 
 
@@ -237,14 +278,20 @@ def test_a_coordinator_that_is_not_there_is_not_waited_for() -> None:
 
     slept: list[float] = []
     transport = httpx.MockTransport(refuse)
-    with Client(transport=transport, sleep=slept.append) as client, pytest.raises(UnreachableError, match="refused"):
+    with (
+        Client(transport=transport, sleep=slept.append) as client,
+        pytest.raises(UnreachableError, match="refused"),
+    ):
         client.workers()
     assert slept == []
 
 
 def test_a_problem_is_an_exception_with_all_it_says(origin: tuple[str, str]) -> None:
     with Client(origin[0]) as client, pytest.raises(ProblemError) as caught:
-        client.submit({"kind": "rod_hang", "axes": {"gamma": -1.0, "phi0": 0.0, "phi1": 0.0}}, idempotency_key="bad")
+        client.submit(
+            {"kind": "rod_hang", "axes": {"gamma": -1.0, "phi0": 0.0, "phi1": 0.0}},
+            idempotency_key="bad",
+        )
     (field,) = caught.value.problem.errors
     assert (field.pointer, field.value) == ("/axes/gamma", "-1.0")
 
@@ -258,7 +305,9 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
 
 
 @pytest.mark.physics
-def test_no_flipped_bit_of_the_sealed_files_is_silent(origin: tuple[str, str], tmp_path: Path) -> None:
+def test_no_flipped_bit_of_the_sealed_files_is_silent(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
     with Client(origin[0]) as client:
         pull(client, origin[1], 1, tmp_path)
     rng = random.Random(7)
@@ -267,13 +316,18 @@ def test_no_flipped_bit_of_the_sealed_files_is_silent(origin: tuple[str, str], t
         whole = path.read_bytes()
         for _ in range(700):
             path.write_bytes(flipped(whole, rng))
-            assert [fault.path for fault in verify(tmp_path)] in (["manifest.sha256"], ["manifest.json"])
+            assert [fault.path for fault in verify(tmp_path)] in (
+                ["manifest.sha256"],
+                ["manifest.json"],
+            )
         path.write_bytes(whole)
     assert verify(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["manifest", "zarr.json", "manifest.sha256"])
-def test_no_flipped_bit_arrives_in_silence(origin: tuple[str, str], tmp_path: Path, name: str) -> None:
+def test_no_flipped_bit_arrives_in_silence(
+    origin: tuple[str, str], tmp_path: Path, name: str
+) -> None:
     rng = random.Random(8)
 
     def flip(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
@@ -305,25 +359,36 @@ def test_swapped_shards_are_found(origin: tuple[str, str], tmp_path: Path) -> No
         one.write_bytes(contents[0]), other.write_bytes(contents[1])
 
 
-def test_keys_that_the_manifest_does_not_list_are_found(origin: tuple[str, str], tmp_path: Path) -> None:
-    """A manifest and its seal made anew, consistent in themselves, over the arrays of another dataset."""
+def test_keys_that_the_manifest_does_not_list_are_found(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
+    """A manifest and its seal made anew, consistent in themselves, over the arrays of another
+    dataset.
+    """
     with Client(origin[0]) as client:
         pull(client, origin[1], 1, tmp_path)
     manifest = Manifest.model_validate_json((tmp_path / "manifest.json").read_bytes())
     keys = (manifest.sample_keys[1], manifest.sample_keys[0], *manifest.sample_keys[2:])
     content = manifest.model_copy(update={"sample_keys": keys}).model_dump_json().encode()
     group = with_manifest_digest((tmp_path / "zarr.json").read_bytes(), sha256(content))
-    for name, data in zip(SEALED, (content, group, seal_text(sha256(content), sha256(group))), strict=True):
+    for name, data in zip(
+        SEALED, (content, group, seal_text(sha256(content), sha256(group))), strict=True
+    ):
         (tmp_path / name).write_bytes(data)
     (fault,) = verify(tmp_path)
     assert (fault.path, fault.fault) == ("sample_key/c/0/0", "sample_key")
     assert "slots 0 to 3" in fault.detail
 
 
-def test_files_of_something_else_are_not_mixed_with_a_dataset(origin: tuple[str, str], tmp_path: Path) -> None:
+def test_files_of_something_else_are_not_mixed_with_a_dataset(
+    origin: tuple[str, str], tmp_path: Path
+) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes/thesis.txt").write_text("mine")
-    with Client(origin[0]) as client, pytest.raises(ForeignFilesError, match=r"1 file is .*notes/thesis\.txt"):
+    with (
+        Client(origin[0]) as client,
+        pytest.raises(ForeignFilesError, match=r"1 file is .*notes/thesis\.txt"),
+    ):
         pull(client, origin[1], 1, tmp_path)
     assert [path.name for path in tmp_path.rglob("*")] == ["notes", "thesis.txt"]
 

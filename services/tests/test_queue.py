@@ -6,16 +6,34 @@ import pytest
 from sqlalchemy import event, select
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
-from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishSection, PublishTask, RenderTask
+from stickslip_schemas.documents.tasks import (
+    AnyTask,
+    PackTask,
+    PublishSection,
+    PublishTask,
+    RenderTask,
+)
 from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.versions import find_dataset
 from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import jobs, tasks
-from stickslip_services.errors import ConflictError, KindNotAvailableError, NotFoundError, UnknownWorkerError
+from stickslip_services.errors import (
+    ConflictError,
+    KindNotAvailableError,
+    NotFoundError,
+    UnknownWorkerError,
+)
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, release_ended_jobs, resume_job, start, sweep
+from stickslip_services.queue.control import (
+    cancel_job,
+    pause_job,
+    release_ended_jobs,
+    resume_job,
+    start,
+    sweep,
+)
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
@@ -61,7 +79,12 @@ def test_a_job_runs_from_grid_to_dataset(context: Context, worker: PretendWorker
     worker.finish(*first)
     assert worker.work() == 4 + 4 + 2 + 1 - 1
     job = show_job(context, job_id)
-    assert (job.state, job.rejected_count, job.progress.done, job.progress.total) == (JobState.succeeded, 0, 11, 11)
+    assert (job.state, job.rejected_count, job.progress.done, job.progress.total) == (
+        JobState.succeeded,
+        0,
+        11,
+        11,
+    )
     assert job.progress.stages[Stage.render].cpu_seconds == 8.0
     assert job.dataset is not None
     dataset = show_dataset(context, job.dataset.dataset)
@@ -73,7 +96,10 @@ def test_a_job_runs_from_grid_to_dataset(context: Context, worker: PretendWorker
 def test_tasks_are_composed_of_what_they_build_on(context: Context, worker: PretendWorker) -> None:
     submit(context)
     (simulate, *others) = worker.lease(simulate=100)
-    worker.report((simulate, rejection("no equilibrium")), *((task, worker.result(task.task)) for task in others))
+    worker.report(
+        (simulate, rejection("no equilibrium")),
+        *((task, worker.result(task.task)) for task in others),
+    )
     renders = worker.lease(render=100)
     assert len(renders) == 3
     assert all(isinstance(lease.task, RenderTask) and lease.task.preview for lease in renders)
@@ -82,9 +108,19 @@ def test_tasks_are_composed_of_what_they_build_on(context: Context, worker: Pret
     assert isinstance(first.task, PackTask)
     rejected, good = first.task.slots
     assert rejected.rejection is not None
-    assert (rejected.slot, rejected.valid, rejected.rejection.message) == (0, False, "no equilibrium")
+    assert (rejected.slot, rejected.valid, rejected.rejection.message) == (
+        0,
+        False,
+        "no equilibrium",
+    )
     assert rejected.rejection.labels == {"gamma": 1.0, "phi0": 0.0, "phi1": 1.0}
-    assert good.labels == {"gamma": 1.0, "phi0": 0.0, "phi1": 3.0, "energy": 0.5, "color": [1.0, 0.5, 0.0]}
+    assert good.labels == {
+        "gamma": 1.0,
+        "phi0": 0.0,
+        "phi1": 3.0,
+        "energy": 0.5,
+        "color": [1.0, 0.5, 0.0],
+    }
     assert good.record is not None
     assert set(good.chunks) == {"views"}
     worker.finish(first, second)
@@ -102,7 +138,9 @@ def test_tasks_are_composed_of_what_they_build_on(context: Context, worker: Pret
     check(context)
 
 
-def test_nothing_is_rendered_where_no_views_are_wanted(context: Context, worker: PretendWorker) -> None:
+def test_nothing_is_rendered_where_no_views_are_wanted(
+    context: Context, worker: PretendWorker
+) -> None:
     job_id = submit(context, views=None)
     assert worker.work() == 4 + 2 + 1
     assert show_job(context, job_id).state is JobState.succeeded
@@ -110,14 +148,18 @@ def test_nothing_is_rendered_where_no_views_are_wanted(context: Context, worker:
 
 
 def test_a_rejected_simulation_rejects_its_renders(context: Context, worker: PretendWorker) -> None:
-    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+    worker.judge = lambda task: (
+        rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+    )
     job_id = submit(context)
     worker.work()
     job = show_job(context, job_id)
     assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 2)
     assert "2 of 4 samples were rejected" in job.message
     with context.database.read() as connection:
-        page = list_samples(connection, find_job(connection, job_id).seq, PageRequest(10, None), TaskState.rejected)
+        page = list_samples(
+            connection, find_job(connection, job_id).seq, PageRequest(10, None), TaskState.rejected
+        )
     assert [(item.slot, item.reason, item.message) for item in page.items] == [
         (0, Reason.solver_diverged, "it diverged"),
         (1, Reason.solver_diverged, "it diverged"),
@@ -166,7 +208,10 @@ def test_other_builds_make_another_version(context: Context, worker: PretendWork
     submit(context)
     worker.work()
     other = PretendWorker(
-        DirectApi(context), context.store, name="new", builds=BUILDS.model_copy(update={"render": "e" * 64})
+        DirectApi(context),
+        context.store,
+        name="new",
+        builds=BUILDS.model_copy(update={"render": "e" * 64}),
     ).register()
     job_id = submit(context)
     other.work()
@@ -178,7 +223,9 @@ def test_other_builds_make_another_version(context: Context, worker: PretendWork
     check(context)
 
 
-def test_a_stale_token_is_refused(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_stale_token_is_refused(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context)
     (late,) = worker.lease(simulate=1)
     clock.advance(31)
@@ -202,7 +249,9 @@ def test_another_worker_cannot_report(context: Context, worker: PretendWorker) -
     check(context)
 
 
-def test_a_heartbeat_keeps_a_lease(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_heartbeat_keeps_a_lease(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     submit(context)
     (mine,) = worker.lease(simulate=1)
     for _ in range(5):
@@ -212,21 +261,29 @@ def test_a_heartbeat_keeps_a_lease(context: Context, worker: PretendWorker, cloc
     assert worker.finish(mine) == ["accepted"]
 
 
-def test_an_expired_lease_is_no_failed_try(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_an_expired_lease_is_no_failed_try(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     job_id = submit(context)
     started, idle = worker.lease(simulate=2)
     worker.start(started)
     clock.advance(31)
     sweep(context)
-    assert counts(context, job_id, Stage.simulate) == {TaskState.pending: 4}  # at once, without a wait
+    assert counts(context, job_id, Stage.simulate) == {
+        TaskState.pending: 4
+    }  # at once, without a wait
     leases = {lease.task_id: lease for lease in worker.lease(simulate=10)}
     assert (leases[started.task_id].attempt, leases[idle.task_id].attempt) == (2, 1)
     with context.database.read() as connection:
-        assert connection.execute(select(tasks.c.tries, tasks.c.losses).order_by(tasks.c.seq)).first() == (0, 1)
+        assert connection.execute(
+            select(tasks.c.tries, tasks.c.losses).order_by(tasks.c.seq)
+        ).first() == (0, 1)
     check(context)
 
 
-def test_three_failed_tries_fail_the_job(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_three_failed_tries_fail_the_job(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     job_id = submit(context)
     poison, running, other, _ = worker.lease(simulate=4)
     worker.start(running)
@@ -245,12 +302,16 @@ def test_three_failed_tries_fail_the_job(context: Context, worker: PretendWorker
     assert f"/v1/tasks/{poison.task_id}" in job.message
     assert "stickslip_workers replay" in job.message
     assert worker.lease() == ()  # nothing further is started
-    assert worker.beat(running, other) == (other.task_id,)  # what runs may finish, and the rest is dropped
+    assert worker.beat(running, other) == (
+        other.task_id,
+    )  # what runs may finish, and the rest is dropped
     assert worker.finish(running) == ["accepted"]
     check(context)
 
 
-def test_submitting_a_failed_job_again_tries_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_submitting_a_failed_job_again_tries_again(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     worker.judge = lambda task: failure() if task.stage == "render" else None
     first = submit(context)
     for _ in range(4):
@@ -268,14 +329,18 @@ def test_submitting_a_failed_job_again_tries_again(context: Context, worker: Pre
     check(context)
 
 
-def test_a_failure_with_a_deterministic_reason_is_a_failure(context: Context, worker: PretendWorker) -> None:
+def test_a_failure_with_a_deterministic_reason_is_a_failure(
+    context: Context, worker: PretendWorker
+) -> None:
     job_id = submit(context)
     (task,) = worker.lease(simulate=1)
     worker.report((task, failure(Reason.solver_diverged)))
     assert counts(context, job_id, Stage.simulate)[TaskState.soft_failed] == 1
 
 
-def test_a_released_task_waits_again_without_a_count(context: Context, worker: PretendWorker) -> None:
+def test_a_released_task_waits_again_without_a_count(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context)
     (task,) = worker.lease(simulate=1)
     assert worker.report((task, None)) == ["accepted"]
@@ -314,7 +379,9 @@ def test_jobs_share_tasks_and_one_can_be_cancelled(context: Context, worker: Pre
     first = worker.lease(simulate=1)
     assert show_job(context, small).state is show_job(context, big).state is JobState.running
     check(context)
-    assert cancel_job(context, small).state is JobState.cancelled  # what is leased, the other job needs
+    assert (
+        cancel_job(context, small).state is JobState.cancelled
+    )  # what is leased, the other job needs
     check(context)
     assert worker.beat(*first, started=True) == ()
     worker.finish(*first)
@@ -322,7 +389,9 @@ def test_jobs_share_tasks_and_one_can_be_cancelled(context: Context, worker: Pre
     assert show_job(context, big).state is JobState.succeeded
     assert show_job(context, small).state is JobState.cancelled
     check(context)
-    assert show_job(context, submit(context, gamma=(1.0,))).state is JobState.queued  # its own last task only
+    assert (
+        show_job(context, submit(context, gamma=(1.0,))).state is JobState.queued
+    )  # its own last task only
 
 
 def test_cancelling_drops_what_runs(context: Context, worker: PretendWorker) -> None:
@@ -340,7 +409,9 @@ def test_cancelling_drops_what_runs(context: Context, worker: PretendWorker) -> 
     check(context)
 
 
-def test_a_result_that_comes_before_the_drop_is_kept(context: Context, worker: PretendWorker) -> None:
+def test_a_result_that_comes_before_the_drop_is_kept(
+    context: Context, worker: PretendWorker
+) -> None:
     job_id = submit(context)
     (task,) = worker.lease(simulate=1)
     cancel_job(context, job_id)
@@ -375,10 +446,19 @@ def test_a_job_that_has_ended_cannot_be_cancelled(context: Context, worker: Pret
 def test_a_job_waits_for_the_first_worker(context: Context) -> None:
     job_id = submit(context)
     job = show_job(context, job_id)
-    assert (job.state, job.reason, job.progress.total) == (JobState.queued, Reason.waiting_for_worker, 0)
+    assert (job.state, job.reason, job.progress.total) == (
+        JobState.queued,
+        Reason.waiting_for_worker,
+        0,
+    )
     worker = PretendWorker(DirectApi(context), context.store).register()
     job = show_job(context, job_id)
-    assert (job.state, job.reason, job.message, job.progress.total) == (JobState.queued, None, "", 11)
+    assert (job.state, job.reason, job.message, job.progress.total) == (
+        JobState.queued,
+        None,
+        "",
+        11,
+    )
     worker.work()
     assert show_job(context, job_id).state is JobState.succeeded
     check(context)
@@ -395,7 +475,12 @@ def test_a_waiting_job_can_be_cancelled(context: Context) -> None:
 CLOTH: dict[str, Any] = {
     "kind": "cloth_drag",
     "allow_uncertified": True,
-    "axes": {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "plaid"], "viewpoint": "left"},
+    "axes": {
+        "material": "gray-interlock",
+        "mu": 0.3,
+        "texture": ["dots", "plaid"],
+        "viewpoint": "left",
+    },
 }
 
 
@@ -415,7 +500,9 @@ def test_a_waiting_job_of_such_a_kind_fails(context: Context) -> None:
 
 
 def test_one_simulation_serves_all_looks_and_those_that_come_later(context: Context) -> None:
-    worker = PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
+    worker = PretendWorker(
+        DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")
+    ).register()
 
     def work(**axes: Any) -> dict[str, dict[str, int]]:
         job = submit_job(context, parsed(CLOTH | {"axes": CLOTH["axes"] | axes}), None)
@@ -435,7 +522,9 @@ def test_one_simulation_serves_all_looks_and_those_that_come_later(context: Cont
 
 
 def test_many_renders_share_one_simulation(context: Context) -> None:
-    worker = PretendWorker(DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")).register()
+    worker = PretendWorker(
+        DirectApi(context), context.store, kinds=("rod_hang", "cloth_drag")
+    ).register()
     job = submit_job(context, parsed(CLOTH), None)
     (simulation,) = worker.lease(simulate=10)
     worker.report((simulation, rejection()))
@@ -446,7 +535,9 @@ def test_many_renders_share_one_simulation(context: Context) -> None:
     check(context)
 
 
-def test_a_stranded_job_says_so(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_a_stranded_job_says_so(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     job_id = submit(context)
     clock.advance(31)
     sweep(context)
@@ -465,7 +556,9 @@ def test_a_stranded_job_says_so(context: Context, worker: PretendWorker, clock: 
 def test_tasks_go_only_to_their_builds(context: Context, worker: PretendWorker) -> None:
     submit(context)
     other = BUILDS.model_copy(update={"render": "f" * 64})
-    foreign = PretendWorker(DirectApi(context), context.store, name="foreign", builds=other).register()
+    foreign = PretendWorker(
+        DirectApi(context), context.store, name="foreign", builds=other
+    ).register()
     leases = foreign.lease()
     assert {lease.task.stage for lease in leases} == {"simulate"}  # the simulator is the same
     foreign.finish(*leases)
@@ -473,7 +566,9 @@ def test_tasks_go_only_to_their_builds(context: Context, worker: PretendWorker) 
     assert {lease.task.stage for lease in worker.lease()} == {"render"}
 
 
-def test_a_small_job_does_not_wait_behind_a_big_one(context: Context, worker: PretendWorker) -> None:
+def test_a_small_job_does_not_wait_behind_a_big_one(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context, gamma={"type": "linspace", "start": 0, "stop": 50, "num": 50})
     small = submit(context, gamma=(77.0,))
     held = worker.lease(simulate=4)
@@ -546,7 +641,9 @@ def test_a_task_can_be_read_for_a_replay(context: Context, worker: PretendWorker
         show_task(context, render.task_id.replace("render", "simulate"))
 
 
-def test_versions_of_two_builds_at_once_do_not_share_a_number(context: Context, worker: PretendWorker) -> None:
+def test_versions_of_two_builds_at_once_do_not_share_a_number(
+    context: Context, worker: PretendWorker
+) -> None:
     submit(context)
     builds = Builds(**{stage: str(n) * 64 for n, stage in enumerate(Builds.model_fields)})
     other = PretendWorker(DirectApi(context), context.store, name="other", builds=builds).register()
@@ -577,13 +674,17 @@ def test_the_time_left_is_measured(context: Context, worker: PretendWorker) -> N
     assert show_job(context, job_id).progress.eta is None
     earlier = show_job(context, submit(context, gamma=(8.0,))).progress.eta
     assert earlier is not None  # from the job before
-    assert earlier.seconds == pytest.approx(4.0)  # 6 tasks on 2 slots, but each stage waits for the one before
+    assert earlier.seconds == pytest.approx(
+        4.0
+    )  # 6 tasks on 2 slots, but each stage waits for the one before
 
 
 class TestPausing:
     """Pausing: nothing more is leased, what runs finishes, and resuming goes on."""
 
-    def test_running_tasks_finish_and_nothing_more_is_leased(self, context: Context, worker: PretendWorker) -> None:
+    def test_running_tasks_finish_and_nothing_more_is_leased(
+        self, context: Context, worker: PretendWorker
+    ) -> None:
         job = submit(context)
         running, waiting = worker.lease(simulate=2)
         worker.start(running)
@@ -623,7 +724,9 @@ class TestPausing:
         assert show_job(after, job).state is JobState.succeeded
         after.close()
 
-    def test_others_run_what_a_paused_job_shares(self, context: Context, worker: PretendWorker) -> None:
+    def test_others_run_what_a_paused_job_shares(
+        self, context: Context, worker: PretendWorker
+    ) -> None:
         first = submit(context)
         pause_job(context, first)
         second = submit(context, gamma=(1.0, 2.0), name="second")  # the same tasks
@@ -639,7 +742,9 @@ class TestPausing:
         worker.register()
         worker.work()
         assert show_job(context, second).state is JobState.succeeded
-        assert show_job(context, first).state is JobState.succeeded  # its dataset was made for another
+        assert (
+            show_job(context, first).state is JobState.succeeded
+        )  # its dataset was made for another
         check(context)
 
     def test_a_job_that_waits_for_the_first_worker(self, context: Context) -> None:
@@ -662,7 +767,9 @@ class TestPausing:
             with pytest.raises(ConflictError, match="can be resumed"):
                 resume_job(context, job)
 
-    def test_a_lost_worker_does_not_undo_it(self, context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+    def test_a_lost_worker_does_not_undo_it(
+        self, context: Context, worker: PretendWorker, clock: ManualClock
+    ) -> None:
         job = submit(context)
         worker.start(*worker.lease(simulate=1))
         pause_job(context, job)
@@ -704,7 +811,9 @@ def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings
     asked: list[tuple[str, Any]] = []
     with context.database.read() as connection:
         if connection.dialect.name == "sqlite":
-            event.listen(connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3])))
+            event.listen(
+                connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3]))
+            )
             assert not has_exclusive_lease(connection, 1, LIVE)
             statement, values = asked[0]
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()

@@ -1,4 +1,6 @@
-"""The queue against a small model of it, in any order of events, with an audit of the ledger after each."""
+"""The queue against a small model of it, in any order of events, with an audit of the ledger after
+each.
+"""
 
 import tempfile
 from collections.abc import Iterator
@@ -9,14 +11,29 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from hypothesis.stateful import (
+    Bundle,
+    RuleBasedStateMachine,
+    consumes,
+    initialize,
+    invariant,
+    multiple,
+    rule,
+)
 from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.worker_api import Lease
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job, start, sweep
+from stickslip_services.queue.control import (
+    cancel_job,
+    pause_job,
+    prioritise_job,
+    resume_job,
+    start,
+    sweep,
+)
 from stickslip_services.queue.submit import Planner, submit_job
 from stickslip_services.queue.transaction import RUNNABLE, live_jobs
 from stickslip_services.settings import Settings
@@ -32,7 +49,9 @@ SPECS = (
     rods(gamma=(1.0, 2.0)),  # shares tasks with the first
     rods(gamma=(2.0,), views=None),  # and with the second
     rods(gamma=(2.0,), phi1=(1.0,)),  # all of it is rejected
-    rods(gamma=(1.0, 3.0, 4.0)),  # too many samples to be planned at once; shares tasks with the first two
+    rods(
+        gamma=(1.0, 3.0, 4.0)
+    ),  # too many samples to be planned at once; shares tasks with the first two
 )
 PLAN_SAMPLES = 4
 
@@ -78,7 +97,8 @@ class QueueMachine(RuleBasedStateMachine):
         self.ended: dict[str, JobState] = {}
         self.register("a")
 
-    # --- what happens --------------------------------------------------------------------------------------------
+    # --- what happens
+    # --------------------------------------------------------------------------------------------
 
     @rule(target=jobs, which=st.integers(0, len(SPECS) - 1))
     def submit(self, which: int) -> str:
@@ -101,13 +121,20 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(name=st.sampled_from(("a", "b")))
     def register(self, name: str) -> None:
         old = self.workers.get(name)
-        worker = PretendWorker(DirectApi(self.context), self.context.store, name=name, judge=_judge).register()
+        worker = PretendWorker(
+            DirectApi(self.context), self.context.store, name=name, judge=_judge
+        ).register()
         if old is not None:
             self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
         self.workers[name] = worker
         self.seen[worker.id] = self.clock()
 
-    @rule(target=leases, name=st.sampled_from(("a", "b")), count=st.integers(1, 3), pause=st.sampled_from((0.0, 31.0)))
+    @rule(
+        target=leases,
+        name=st.sampled_from(("a", "b")),
+        count=st.integers(1, 3),
+        pause=st.sampled_from((0.0, 31.0)),
+    )
     def lease(self, name: str, count: int, pause: float) -> Any:
         self.clock.advance(pause)
         worker = self.workers.get(name)
@@ -121,7 +148,11 @@ class QueueMachine(RuleBasedStateMachine):
             assert self._is_asked_for(lease.task_id), "leased for a paused job"
             assert lease.token == self.tokens.get(lease.task_id, 0) + 1
             self.tokens[lease.task_id] = lease.token
-            self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
+            self.holders[lease.task_id] = (
+                worker.id,
+                lease.token,
+                self.clock() + self.settings.lease_seconds,
+            )
         return multiple(*((worker, lease) for lease in granted))
 
     @rule(held=leases, started=st.booleans())
@@ -141,7 +172,11 @@ class QueueMachine(RuleBasedStateMachine):
                 del self.holders[lease.task_id]
         else:
             assert self._holds(worker, lease)
-            self.holders[lease.task_id] = (worker.id, lease.token, self.clock() + self.settings.lease_seconds)
+            self.holders[lease.task_id] = (
+                worker.id,
+                lease.token,
+                self.clock() + self.settings.lease_seconds,
+            )
 
     @rule(target=reported, held=consumes(leases), how=st.sampled_from(HOW))
     def report(self, held: Held, how: str) -> Held:
@@ -223,9 +258,12 @@ class QueueMachine(RuleBasedStateMachine):
         for worker in self.workers.values():
             worker.api = DirectApi(self.context)
         expiry = self.clock() + self.settings.lease_seconds
-        self.holders = {task: (worker, token, expiry) for task, (worker, token, _) in self.holders.items()}
+        self.holders = {
+            task: (worker, token, expiry) for task, (worker, token, _) in self.holders.items()
+        }
 
-    # --- what must hold ------------------------------------------------------------------------------------------
+    # --- what must hold
+    # ------------------------------------------------------------------------------------------
 
     @invariant()
     def ledger_is_right(self) -> None:
@@ -247,11 +285,14 @@ class QueueMachine(RuleBasedStateMachine):
     def teardown(self) -> None:
         if not hasattr(self, "context"):
             return
-        # However it went: once no job is paused, a worker that does its work brings every job to its end.
+        # However it went: once no job is paused, a worker that does its work brings every job to
+        # its end.
         for job in list_jobs(self.context):
             if job.state in (JobState.pausing, JobState.paused):
                 resume_job(self.context, job.id)
-        worker = PretendWorker(DirectApi(self.context), self.context.store, name="last", judge=_judge).register()
+        worker = PretendWorker(
+            DirectApi(self.context), self.context.store, name="last", judge=_judge
+        ).register()
         for _ in range(10):
             self.clock.advance(60)
             self.planner.run()
@@ -265,7 +306,9 @@ class QueueMachine(RuleBasedStateMachine):
     def _is_asked_for(self, task: str) -> bool:
         """Return whether a job that may run needs the task."""
         with self.context.database.read() as connection:
-            seq = connection.scalar(select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2])))
+            seq = connection.scalar(
+                select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2]))
+            )
             return seq is not None and bool(live_jobs(connection, [seq], RUNNABLE))
 
     def _holds(self, worker: PretendWorker, lease: Lease) -> bool:
@@ -277,7 +320,9 @@ class QueueMachine(RuleBasedStateMachine):
         """Forget leases that have had their duration, of workers that have been silent for as long."""
         now, seconds = self.clock(), self.settings.lease_seconds
         self.holders = {
-            task: held for task, held in self.holders.items() if held[2] > now or self.seen[held[0]] > now - seconds
+            task: held
+            for task, held in self.holders.items()
+            if held[2] > now or self.seen[held[0]] > now - seconds
         }
 
 

@@ -7,7 +7,13 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
-from stickslip_schemas.documents.tasks import PackOutput, RecordRef, RenderOutput, SimulateOutput, TaskResult
+from stickslip_schemas.documents.tasks import (
+    PackOutput,
+    RecordRef,
+    RenderOutput,
+    SimulateOutput,
+    TaskResult,
+)
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
@@ -61,12 +67,16 @@ def finish(context: Context, worker: PretendWorker, clock: ManualClock, job: str
     shown = show_job(context, job)
     assert shown.state is JobState.succeeded, shown.message
     assert shown.dataset is not None
-    assert verify(directory(worker).dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
+    assert (
+        verify(directory(worker).dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
+    )
     check(context)
 
 
 @pytest.mark.slow
-def test_100_rotten_artifacts_are_mended(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_100_rotten_artifacts_are_mended(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     rng = random.Random(3)
     gammas = [1.0, 2.0, 3.0]
     finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
@@ -79,11 +89,17 @@ def test_100_rotten_artifacts_are_mended(context: Context, worker: PretendWorker
             finish(context, worker, clock, submit(context, gamma=gammas, samples_per_shard=4))
 
 
-def test_only_what_is_damaged_is_made_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
+def test_only_what_is_damaged_is_made_again(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
     finish(context, worker, clock, submit(context))
     with context.database.read() as connection:
-        output = connection.scalar(select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1))
-    directory(worker).path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(b"x")
+        output = connection.scalar(
+            select(tasks.c.output).where(tasks.c.stage == "pack").order_by(tasks.c.seq).limit(1)
+        )
+    directory(worker).path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(
+        b"x"
+    )
     worker.ran.clear()
     job = submit(context)
     assert "1 of its files were damaged or lost" in show_job(context, job).message
@@ -91,8 +107,12 @@ def test_only_what_is_damaged_is_made_again(context: Context, worker: PretendWor
     assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
 
 
-def test_a_rotten_trajectory_is_simulated_again(context: Context, worker: PretendWorker, clock: ManualClock) -> None:
-    """It is two stages away from the pack task that needs it, and needed by a render that comes later."""
+def test_a_rotten_trajectory_is_simulated_again(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    """It is two stages away from the pack task that needs it, and needed by a render that comes
+    later.
+    """
     job = submit(context)
     worker.finish(*worker.lease(simulate=10))
     (render, *others) = worker.lease(render=10)
@@ -152,7 +172,10 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
         connection.execute(update(dataset_versions).values(bytes=CHECKED_AT_ONCE + 1))
     job = submit(context)
     shown = show_job(context, job)
-    assert (shown.state, shown.message) == (JobState.queued, "the dataset exists already: its files are being checked")
+    assert (shown.state, shown.message) == (
+        JobState.queued,
+        "the dataset exists already: its files are being checked",
+    )
     sweep(context)
     assert show_job(context, job).state is JobState.queued
     check_made_datasets(context)
@@ -176,7 +199,9 @@ def test_a_result_that_is_not_in_the_store_is_refused(
         output = output.model_copy(update={"record": RecordRef(digest="0" * 64, row=0)})
     elif isinstance(output, RenderOutput):
         chunk = output.chunks["views"]
-        output = output.model_copy(update={"chunks": {"views": chunk.model_copy(update={"length": 10**6})}})
+        output = output.model_copy(
+            update={"chunks": {"views": chunk.model_copy(update={"length": 10**6})}}
+        )
     else:
         directory(worker).path(output.labels).unlink()  # type: ignore[union-attr]
     lie = TaskResult(outcome="succeeded", output=output)

@@ -1,4 +1,7 @@
-"""A lost database is built again from the datasets; one that is damaged or newer is refused in one sentence."""
+"""A lost database is built again from the datasets.
+
+One that is damaged or newer is refused in one sentence.
+"""
 
 from pathlib import Path
 
@@ -31,7 +34,9 @@ def made(settings: Settings) -> dict[str, object]:
     context = Context.open(settings)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
-    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    worker.judge = lambda task: (
+        rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    )
     for spec in (rods(name="first"), rods(gamma=(9.0, 1.0))):
         submit_job(context, parsed(spec), None)
         worker.work()
@@ -61,12 +66,16 @@ def test_a_database_is_migrated_before_a_coordinator_starts(
 ) -> None:
     assert main(["--migrate", "--data", str(tmp_path / "new")]) == 0
     assert check(Settings(data=tmp_path / "new"), Role.coordinator)
-    assert main(["--migrate", "--data", str(settings.data)]) == 2  # or the next coordinator would not miss anything
+    assert (
+        main(["--migrate", "--data", str(settings.data)]) == 2
+    )  # or the next coordinator would not miss anything
     assert "is gone: run `stickslip reindex --data" in capsys.readouterr().err
     assert not settings.database_path.exists()
 
 
-def test_datasets_are_found_again(settings: Settings, made: dict[str, object], tmp_path: Path) -> None:
+def test_datasets_are_found_again(
+    settings: Settings, made: dict[str, object], tmp_path: Path
+) -> None:
     result = run(settings)
     assert result.exit_code == 0, result.output
     assert "2 versions found again, 0 known before, 0 left out" in result.stderr
@@ -74,7 +83,9 @@ def test_datasets_are_found_again(settings: Settings, made: dict[str, object], t
     assert "0 versions found again, 2 known before, 0 left out" in again.stderr
     with served(settings.data) as server:
         for dataset in made:
-            pulled = CliRunner().invoke(app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url])
+            pulled = CliRunner().invoke(
+                app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url]
+            )
             assert pulled.exit_code == 0, pulled.output
             assert CliRunner().invoke(app, ["verify", str(tmp_path / dataset)]).exit_code == 0
     context = Context.open(settings)
@@ -84,16 +95,23 @@ def test_datasets_are_found_again(settings: Settings, made: dict[str, object], t
     for dataset, before in made.items():
         (old,), (new,) = before.versions, found[dataset].versions  # type: ignore[attr-defined]
         same = ("version", "manifest", "group", "sample_count", "valid_count", "bytes")
-        assert [getattr(new, name) for name in same[:-1]] == [getattr(old, name) for name in same[:-1]]
+        assert [getattr(new, name) for name in same[:-1]] == [
+            getattr(old, name) for name in same[:-1]
+        ]
         assert found[dataset].name == before.name  # type: ignore[attr-defined]
-    assert {job.state for job in list_jobs(context)} == {JobState.succeeded, JobState.succeeded_with_rejects}
+    assert {job.state for job in list_jobs(context)} == {
+        JobState.succeeded,
+        JobState.succeeded_with_rejects,
+    }
     assert all(job.message.startswith("found again in the store") for job in list_jobs(context))
     with context.database.read() as connection:
         assert violations(connection) == []
     context.close()
 
 
-def test_a_spec_that_is_submitted_again_finds_its_dataset(settings: Settings, made: dict[str, object]) -> None:
+def test_a_spec_that_is_submitted_again_finds_its_dataset(
+    settings: Settings, made: dict[str, object]
+) -> None:
     run(settings)
     context = Context.open(settings)
     start(context)
@@ -110,7 +128,9 @@ def test_a_spec_that_is_submitted_again_finds_its_dataset(settings: Settings, ma
     context.close()
 
 
-def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: dict[str, object]) -> None:
+def test_a_dataset_that_rots_afterwards_is_made_again(
+    settings: Settings, made: dict[str, object]
+) -> None:
     run(settings)
     store = DirectoryStore(settings.store_place)
     (path,) = store.dataset_path(next(iter(made)), 1).glob("views/c/0/0")
@@ -119,7 +139,9 @@ def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: 
     context = Context.open(settings)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
-    worker.judge = lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    worker.judge = lambda task: (
+        rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
+    )
     spec = rods(gamma=(9.0, 1.0)) if path.parts[-6] == next(iter(made)) else rods(name="first")
     job = submit_job(context, parsed(spec), None)
     assert worker.work() > 0
@@ -129,11 +151,15 @@ def test_a_dataset_that_rots_afterwards_is_made_again(settings: Settings, made: 
 
 
 @pytest.mark.parametrize("damage", ["manifest", "file", "moved"])
-def test_a_version_that_is_not_whole_is_left_out(settings: Settings, made: dict[str, object], damage: str) -> None:
+def test_a_version_that_is_not_whole_is_left_out(
+    settings: Settings, made: dict[str, object], damage: str
+) -> None:
     store = DirectoryStore(settings.store_place)
     place = store.dataset_path(next(iter(made)), 1)
     if damage == "manifest":
-        (place / MANIFEST_NAME).unlink()  # it is a link: the artifact must not be written through it
+        (
+            place / MANIFEST_NAME
+        ).unlink()  # it is a link: the artifact must not be written through it
         (place / MANIFEST_NAME).write_text("{}")
     elif damage == "file":
         store.path(sha256((place / "views/c/0/0").read_bytes())).unlink()
@@ -146,7 +172,9 @@ def test_a_version_that_is_not_whole_is_left_out(settings: Settings, made: dict[
     assert f"left out: {place.parent.name}:v" in result.stderr.replace("\n", "")
 
 
-def test_an_artifact_that_is_gone_is_put_back_from_the_version(settings: Settings, made: dict[str, object]) -> None:
+def test_an_artifact_that_is_gone_is_put_back_from_the_version(
+    settings: Settings, made: dict[str, object]
+) -> None:
     store = DirectoryStore(settings.store_place)
     path = store.dataset_path(next(iter(made)), 1) / "views/c/0/0"
     digest = sha256(path.read_bytes())
@@ -155,13 +183,17 @@ def test_an_artifact_that_is_gone_is_put_back_from_the_version(settings: Setting
     assert store.holds(digest)
 
 
-def test_it_does_not_write_beside_a_running_coordinator(settings: Settings, made: dict[str, object]) -> None:
+def test_it_does_not_write_beside_a_running_coordinator(
+    settings: Settings, made: dict[str, object]
+) -> None:
     with locked(settings.data):
         result = run(settings)
     assert result.exit_code == 1
     assert "is in use by another `stickslip up`" in result.stderr
     with opened(settings, Role.upkeep) as database:
-        assert [found.is_new for found in reindex(database, DirectoryStore(settings.store_place))] == [True, True]
+        assert [
+            found.is_new for found in reindex(database, DirectoryStore(settings.store_place))
+        ] == [True, True]
 
 
 def one_sentence(settings: Settings, capsys: pytest.CaptureFixture[str]) -> str:
@@ -174,7 +206,9 @@ def one_sentence(settings: Settings, capsys: pytest.CaptureFixture[str]) -> str:
     return str(raised.value)
 
 
-def test_a_newer_database_is_refused(settings: Settings, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_newer_database_is_refused(
+    settings: Settings, capsys: pytest.CaptureFixture[str]
+) -> None:
     with opened(settings, Role.upkeep) as database, database.write() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9042'"))
     sentence = one_sentence(settings, capsys)
@@ -183,7 +217,9 @@ def test_a_newer_database_is_refused(settings: Settings, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("how", ["overwritten", "truncated", "not one", "another's"])
-def test_a_damaged_database_is_refused(settings: Settings, how: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_database_is_refused(
+    settings: Settings, how: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = settings.database_path
     with opened(settings, Role.upkeep):
         pass

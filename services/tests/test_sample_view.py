@@ -1,4 +1,6 @@
-"""The page of a sample of a scene: what its view in space shows, and curves with the names of its things."""
+"""The page of a sample of a scene: what its view in space shows, and curves with the names of its
+things.
+"""
 
 from io import BytesIO
 from types import SimpleNamespace
@@ -19,7 +21,9 @@ def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:
     axes = {"texture": "checker", "viewpoint": "front"}
     parsed = job_spec_adapter.validate_python({"allow_uncertified": True, "axes": axes, **spec})
     arrays = {array.name: array for array in layout(parsed)}
-    known = {name: np.zeros(array.shape, dtype=array.dtype) for name, array in arrays.items()} | (values or {})
+    known = {name: np.zeros(array.shape, dtype=array.dtype) for name, array in arrays.items()} | (
+        values or {}
+    )
     return SimpleNamespace(
         arrays=arrays,
         manifest=SimpleNamespace(spec=parsed),
@@ -63,39 +67,70 @@ def test_a_view_in_space_has_what_the_scene_has() -> None:
     ]
     assert [body["type"] for body in shown["bodies"]] == ["plane"]
     assert len(shown["holders"]) == 2  # and no rim
-    assert len(shown["instants"]) == len(shown["sheets"][0]["points"]) == len(shown["bodies"][0]["poses"]) == 300
+    assert (
+        len(shown["instants"])
+        == len(shown["sheets"][0]["points"])
+        == len(shown["bodies"][0]["poses"])
+        == 300
+    )
 
     edge: dict[str, Any] = {"scene": "over-the-edge", "set": {"sheets.strip.mesh.cells": [40, 4]}}
     shown = motion(sample({"rounding": np.float64(0.02)}, kind="cloth_scene", **edge), 0)
     table, floor = sorted(shown["bodies"], key=lambda body: str(body["type"]))
-    assert (table["type"], table["rounding"], floor["type"]) == ("box", 0.02, "plane")  # the sample's own
+    assert (table["type"], table["rounding"], floor["type"]) == (
+        "box",
+        0.02,
+        "plane",
+    )  # the sample's own
 
     drag = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
     track = np.zeros((300, 25, 3), np.float32)
     track[:, :, 2] = 0.12345
     rest = np.stack(np.meshgrid(range(5), range(5)), axis=-1).reshape(25, 2).astype(np.float32)
-    shown = motion(sample({"positions": track, "rest": rest}, kind="cloth_drag", mesh=5, axes=drag), 0)
+    shown = motion(
+        sample({"positions": track, "rest": rest}, kind="cloth_drag", mesh=5, axes=drag), 0
+    )
     assert [body["type"] for body in shown["bodies"]] == ["plane"]
     assert "contact" not in shown["sheets"][0]
     assert shown["sheets"][0]["points"][7][2] == pytest.approx(0.12345 / shown["unit"], abs=0.5)
-    assert [holder["poses"][0][11] for holder in shown["holders"]] == pytest.approx([0.12345, 0.12345])
+    assert [holder["poses"][0][11] for holder in shown["holders"]] == pytest.approx(
+        [0.12345, 0.12345]
+    )
 
 
 def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
     count = 5 * 200 * 3
     axes = {
-        "material": ["gray-interlock", "camel-ponte-roma", "royal-target", "navy-sparkle-sweat", "white-swim-solid"],
+        "material": [
+            "gray-interlock",
+            "camel-ponte-roma",
+            "royal-target",
+            "navy-sparkle-sweat",
+            "white-swim-solid",
+        ],
         "mu": {"type": "linspace", "start": 0.0, "stop": 1.0, "num": 200},
         "texture": ["dots", "plaid", "floral"],
         "viewpoint": "left",
     }
     data = sample(kind="cloth_drag", axes=axes)
     points = list(data.manifest.spec.grid())
-    columns = {name: np.array([point[name] for point in points]) for name in ("mu", "material", "texture")}
+    columns = {
+        name: np.array([point[name] for point in points]) for name in ("mu", "material", "texture")
+    }
     for name in ("material", "texture"):
-        columns[name] = np.array([data.arrays[name].categories.index(value) for value in columns[name]])
-    columns |= {"split": np.arange(count) % 3, "valid": np.arange(count) > 0, "psnr_cloth": np.linspace(20, 40, count)}
-    data.label, data.rejection, data.manifest.sample_count = columns.__getitem__, lambda _slot: None, count
+        columns[name] = np.array(
+            [data.arrays[name].categories.index(value) for value in columns[name]]
+        )
+    columns |= {
+        "split": np.arange(count) % 3,
+        "valid": np.arange(count) > 0,
+        "psnr_cloth": np.linspace(20, 40, count),
+    }
+    data.label, data.rejection, data.manifest.sample_count = (
+        columns.__getitem__,
+        lambda _slot: None,
+        count,
+    )
 
     def chosen(**query: str) -> int:
         return int(thumbs(data, query, 0)["chosen"])
@@ -127,18 +162,27 @@ def test_a_body_of_triangles_follows_its_bones() -> None:
     still = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)
     raised = still.copy()
     raised[2, 3] = 2.0
-    skin = {"rest": np.zeros((2, 3)), "weights": np.array([[1.0, 0.0], [0.5, 0.5]]), "times": np.array([0.0, 1.0])}
+    skin = {
+        "rest": np.zeros((2, 3)),
+        "weights": np.array([[1.0, 0.0], [0.5, 0.5]]),
+        "times": np.array([0.0, 1.0]),
+    }
     bones = np.array([[still, still], [still, raised]])
     heights = deformed({**skin, "bones": bones}, 3.0, np.array([0.0, 0.5, 9.0]))[:, :, 2]
     assert heights.tolist() == [[0.0, 0.0], [0.0, 1.5], [0.0, 3.0]]
-    assert deformed({"positions": np.ones((1, 4, 3)), "times": np.zeros(1)}, 1.0, np.arange(3.0)).shape == (3, 4, 3)
+    assert deformed(
+        {"positions": np.ones((1, 4, 3)), "times": np.zeros(1)}, 1.0, np.arange(3.0)
+    ).shape == (3, 4, 3)
 
 
 def test_a_film_shows_the_frames_of_the_clip() -> None:
     av = pytest.importorskip("av", reason="pip install 'stickslip[films]'")
     frames = [np.full((224, 224, 3), level, np.uint8) for level in (20, 120, 220)]
     with av.open(BytesIO(mp4(frames))) as film:
-        assert (film.streams.video[0].average_rate, film.streams.video[0].codec_context.name) == (10, "h264")
+        assert (film.streams.video[0].average_rate, film.streams.video[0].codec_context.name) == (
+            10,
+            "h264",
+        )
         levels = [frame.to_ndarray(format="rgb24").mean() for frame in film.decode(video=0)]
     assert levels == pytest.approx([20, 120, 220], abs=3)
 
@@ -150,7 +194,15 @@ def test_ground_truth_is_shown_in_colours() -> None:
         [[127, 255, 127], [63, 127, 127]]
     ]
     depth = np.array([[[1.0, np.inf]], [[3.0, 2.0]]], dtype=np.float32)
-    assert coloured(array("depth", "", "float32", y_x), depth, 0).tolist() == [[[0, 0, 0], [0, 0, 0]]]
-    assert coloured(array("depth", "", "float32", y_x), depth, 1).tolist() == [[[255] * 3, [127] * 3]]
-    codes = array("segmentation", "", "uint8", y_x, attributes={"categories": ["background", "cloth"]})
-    assert len(np.unique(coloured(codes, np.array([[[0, 1]]] * 2, dtype=np.uint8), 0), axis=1)[0]) == 2
+    assert coloured(array("depth", "", "float32", y_x), depth, 0).tolist() == [
+        [[0, 0, 0], [0, 0, 0]]
+    ]
+    assert coloured(array("depth", "", "float32", y_x), depth, 1).tolist() == [
+        [[255] * 3, [127] * 3]
+    ]
+    codes = array(
+        "segmentation", "", "uint8", y_x, attributes={"categories": ["background", "cloth"]}
+    )
+    assert (
+        len(np.unique(coloured(codes, np.array([[[0, 1]]] * 2, dtype=np.uint8), 0), axis=1)[0]) == 2
+    )

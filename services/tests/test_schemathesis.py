@@ -21,7 +21,9 @@ from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = 3
-"""Generated for each operation, beside those that cover the document; a nightly run may ask for more."""
+"""Generated for each operation, beside those that cover the document; a nightly run may ask for
+more.
+"""
 
 
 @pytest.mark.slow
@@ -74,7 +76,9 @@ def make_datasets(context: Context) -> None:
         DirectApi(context),
         context.store,
         whole=True,
-        judge=lambda task: rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None,
+        judge=lambda task: (
+            rejection() if task.stage == "simulate" and task.simulation.gamma == 1.0 else None
+        ),
     ).register()
     submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
     worker.work()

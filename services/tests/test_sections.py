@@ -1,4 +1,6 @@
-"""Versions whose manifest has sections: served, pulled, checked, compared, found again and collected like others."""
+"""Versions whose manifest has sections: served, pulled, checked, compared, found again and
+collected like others.
+"""
 
 import json
 import random
@@ -49,13 +51,16 @@ def origin(made: FastAPI) -> Iterator[tuple[str, str, PretendWorker]]:
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
         worker.judge = lambda task: (
             rejection()
-            if task.stage == "simulate" and (task.simulation.gamma, task.simulation.phi1) == (3.0, 3.0)
+            if task.stage == "simulate"
+            and (task.simulation.gamma, task.simulation.phi1) == (3.0, 3.0)
             else None
         )
         job = client.submit(rods(gamma=GAMMAS))
         worker.work()
         shown = client.job(job.id)
-        assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 1), shown.message
+        assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 1), (
+            shown.message
+        )
         assert shown.dataset is not None
         yield url, shown.dataset.dataset, worker
 
@@ -106,10 +111,14 @@ def test_files_and_pages_of_sections_are_served(origin: tuple[str, str, PretendW
         assert client.get(f"/datasets/{dataset}/v1/samples/7").status_code == 200
 
 
-def test_a_part_needs_only_the_sections_of_its_samples(origin: tuple[str, str, PretendWorker], tmp_path: Path) -> None:
+def test_a_part_needs_only_the_sections_of_its_samples(
+    origin: tuple[str, str, PretendWorker], tmp_path: Path
+) -> None:
     url, dataset, _ = origin
     target = tmp_path / "part"
-    chosen = Selection(arrays=("views",), where=("gamma<3", "gamma>=1"))  # the pretended gamma of slot n is n
+    chosen = Selection(
+        arrays=("views",), where=("gamma<3", "gamma>=1")
+    )  # the pretended gamma of slot n is n
     with Client(url) as client:
         pull(client, dataset, 1, target, selection=chosen)
         assert {path for path in files(target) if path.startswith("manifest/")} == set(SECTIONS[:2])
@@ -163,7 +172,11 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
 
 
 def test_nothing_of_it_is_unused_and_it_is_found_again(
-    origin: tuple[str, str, PretendWorker], made: FastAPI, settings: Settings, tmp_path: Path, clock: ManualClock
+    origin: tuple[str, str, PretendWorker],
+    made: FastAPI,
+    settings: Settings,
+    tmp_path: Path,
+    clock: ManualClock,
 ) -> None:
     _, dataset, _ = origin
     context: Context = made.state.context
@@ -171,12 +184,16 @@ def test_nothing_of_it_is_unused_and_it_is_found_again(
     shown = context.store.read(known.versions[0].manifest)
     needed = {
         file.sha256
-        for file in Contents(Manifest.model_validate_json(shown), lambda file: context.store.read(file.sha256)).files()
+        for file in Contents(
+            Manifest.model_validate_json(shown), lambda file: context.store.read(file.sha256)
+        ).files()
     }
     free = {file.name for file in unused(context.database, context.store, older_than=-1)}
     assert not needed & free
     fresh = Context.open(
-        settings.model_copy(update={"data": tmp_path / "fresh", "store": str(settings.data / "store")})
+        settings.model_copy(
+            update={"data": tmp_path / "fresh", "store": str(settings.data / "store")}
+        )
     )
     start(fresh)
     first = next(iter(needed - {known.versions[0].manifest}))
@@ -192,7 +209,9 @@ def test_nothing_of_it_is_unused_and_it_is_found_again(
     fresh.close()
 
 
-def test_a_version_with_a_damaged_section_is_not_believed(context: Context, worker: PretendWorker) -> None:
+def test_a_version_with_a_damaged_section_is_not_believed(
+    context: Context, worker: PretendWorker
+) -> None:
     submit_job(context, parsed(rods(gamma=GAMMAS)), None)
     while not (publish := worker.lease(publish=1)):
         worker.finish(*worker.lease(simulate=9, render=9, pack=9))
@@ -201,6 +220,8 @@ def test_a_version_with_a_damaged_section_is_not_believed(context: Context, work
     context.store.path(document.sections[1].sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
     assert worker.report((publish[0], result)) == ["accepted"]  # as a failure
     with context.database.read() as connection:
-        ((reason, message),) = connection.exec_driver_sql("SELECT reason, message FROM tasks WHERE state='soft_failed'")
+        ((reason, message),) = connection.exec_driver_sql(
+            "SELECT reason, message FROM tasks WHERE state='soft_failed'"
+        )
     assert reason == Reason.storage_error
     assert "the result does not hold" in message

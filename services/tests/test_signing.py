@@ -13,7 +13,13 @@ from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest
 from stickslip_services.app import main, make_app
 from stickslip_services.cli import app as commands
 from stickslip_services.client import Client, pull, signer_of, verify
-from stickslip_services.client.http import ChangedError, ClientError, DamagedError, UnknownSignerError, UnsignedError
+from stickslip_services.client.http import (
+    ChangedError,
+    ClientError,
+    DamagedError,
+    UnknownSignerError,
+    UnsignedError,
+)
 from stickslip_services.client.verifying import sign
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import has_runnable_job
@@ -40,10 +46,23 @@ class Signers:
 def signers(tmp_path_factory: pytest.TempPathFactory) -> Signers:
     place = tmp_path_factory.mktemp("keys")
     for name in ("lab", "stranger"):
-        command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", name, "-f", str(place / name)]
+        command = [
+            "ssh-keygen",
+            "-q",
+            "-t",
+            "ed25519",
+            "-N",
+            "",
+            "-C",
+            name,
+            "-f",
+            str(place / name),
+        ]
         subprocess.run(command, check=True)
     made = Signers(place / "lab", place / "stranger", place / "allowed")
-    made.allowed.write_text(f'lab@example.org namespaces="stickslip" {(place / "lab.pub").read_text()}')
+    made.allowed.write_text(
+        f'lab@example.org namespaces="stickslip" {(place / "lab.pub").read_text()}'
+    )
     return made
 
 
@@ -61,7 +80,9 @@ class Origin:
 
 @pytest.fixture
 def origin(tmp_path: Path, signers: Signers) -> Iterator[Origin]:
-    app = make_app(Settings(data=tmp_path / "data", durable=False, database=None, signing_key=signers.lab))
+    app = make_app(
+        Settings(data=tmp_path / "data", durable=False, database=None, signing_key=signers.lab)
+    )
     context: Context = app.state.context
     with serving(app) as url, Client(url) as client:
         worker = PretendWorker(DirectApi(context), context.store).register()
@@ -77,18 +98,34 @@ def run(*words: object) -> tuple[int, str]:
     return ended.exit_code, ended.output
 
 
-def test_what_a_coordinator_signs_is_pulled_and_verified(origin: Origin, signers: Signers, tmp_path: Path) -> None:
+def test_what_a_coordinator_signs_is_pulled_and_verified(
+    origin: Origin, signers: Signers, tmp_path: Path
+) -> None:
     target = tmp_path / "d"
     options = ("--allowed-signers", signers.allowed)
     assert run("pull", origin.dataset, target, *options, "--url", origin.url)[0] == 0
     status, said = run("verify", target, *options)
     assert (status, "signed by lab@example.org" in said) == (0, True), said
     with Client(origin.url) as client:
-        served = client.request("GET", f"/v1/datasets/{origin.dataset}/versions/1/files/manifest.sha256.sig").content
+        served = client.request(
+            "GET", f"/v1/datasets/{origin.dataset}/versions/1/files/manifest.sha256.sig"
+        ).content
     assert served == (target / "manifest.sha256.sig").read_bytes()
-    command = ["ssh-keygen", "-Y", "verify", "-n", "stickslip", "-I", "lab@example.org", "-f", str(signers.allowed)]
+    command = [
+        "ssh-keygen",
+        "-Y",
+        "verify",
+        "-n",
+        "stickslip",
+        "-I",
+        "lab@example.org",
+        "-f",
+        str(signers.allowed),
+    ]
     with (target / "manifest.sha256").open("rb") as seal:  # no program of ours is needed
-        subprocess.run([*command, "-s", str(target / "manifest.sha256.sig")], stdin=seal, check=True)
+        subprocess.run(
+            [*command, "-s", str(target / "manifest.sha256.sig")], stdin=seal, check=True
+        )
 
 
 def test_unsigned_unknown_and_changed_are_three_errors_and_nothing_is_written(
@@ -104,8 +141,13 @@ def test_unsigned_unknown_and_changed_are_three_errors_and_nothing_is_written(
 
     signature.unlink()
     refused(UnsignedError, "is not signed")
-    assert run("sign", origin.shown(""), "--key", signers.stranger)[0] == 0  # served from the next request on
-    refused(UnknownSignerError, "signed by somebody whom .*allowed does not allow, with ED25519 key SHA256:")
+    assert (
+        run("sign", origin.shown(""), "--key", signers.stranger)[0] == 0
+    )  # served from the next request on
+    refused(
+        UnknownSignerError,
+        "signed by somebody whom .*allowed does not allow, with ED25519 key SHA256:",
+    )
     signature.write_bytes(good.replace(b"\n", b"\nAAAA", 1))
     refused(ChangedError, "was changed")
     signature.write_bytes(good)
@@ -113,7 +155,9 @@ def test_unsigned_unknown_and_changed_are_three_errors_and_nothing_is_written(
         pull(client, origin.dataset, 1, target, allowed_signers=signers.allowed)
 
 
-def test_a_dataset_that_is_changed_and_sealed_again_is_found(origin: Origin, signers: Signers, tmp_path: Path) -> None:
+def test_a_dataset_that_is_changed_and_sealed_again_is_found(
+    origin: Origin, signers: Signers, tmp_path: Path
+) -> None:
     target = tmp_path / "d"
     with Client(origin.url) as client:
         pull(client, origin.dataset, 1, target)
@@ -133,7 +177,9 @@ def test_a_dataset_that_is_changed_and_sealed_again_is_found(origin: Origin, sig
     assert (status, "is not signed, because it is damaged" in said) == (1, True), said
 
 
-def test_a_signed_version_is_not_passed_off_as_another(origin: Origin, signers: Signers, tmp_path: Path) -> None:
+def test_a_signed_version_is_not_passed_off_as_another(
+    origin: Origin, signers: Signers, tmp_path: Path
+) -> None:
     """A server with an older signed version answers with it where the newer one is asked for."""
     with Client(origin.url) as client:
         answer = client.request
@@ -146,7 +192,9 @@ def test_a_signed_version_is_not_passed_off_as_another(origin: Origin, signers: 
             pull(client, origin.dataset, 2, tmp_path / "d", allowed_signers=signers.allowed)
 
 
-@pytest.mark.parametrize("damage", ["none", "lost", "flipped", "of another version", "by another key"])
+@pytest.mark.parametrize(
+    "damage", ["none", "lost", "flipped", "of another version", "by another key"]
+)
 def test_a_scrub_signs_again_what_has_no_good_signature(
     origin: Origin, signers: Signers, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
@@ -155,7 +203,9 @@ def test_a_scrub_signs_again_what_has_no_good_signature(
     if damage == "lost":
         signature.unlink()
     elif damage == "flipped":
-        signature.write_bytes(good[:200] + bytes([good[200] ^ 1]) + good[201:])  # in place: the artifact rots with it
+        signature.write_bytes(
+            good[:200] + bytes([good[200] ^ 1]) + good[201:]
+        )  # in place: the artifact rots with it
     elif damage == "of another version":
         signature.write_bytes(sign(b"another seal", signers.lab))
     elif damage == "by another key":
@@ -166,7 +216,10 @@ def test_a_scrub_signs_again_what_has_no_good_signature(
         assert run(*command)[0] == 0  # without a key nobody knows that it should be signed
     monkeypatch.setenv("STICKSLIP_SIGNING_KEY", str(signers.lab))
     status, said = run(*command)
-    assert (status, f"{origin.dataset}:v1  manifest.sha256.sig" in said) == (is_broken, is_broken), said
+    assert (status, f"{origin.dataset}:v1  manifest.sha256.sig" in said) == (
+        is_broken,
+        is_broken,
+    ), said
     assert run(*command)[0] == 0
     assert (signature.read_bytes() == good) == (damage != "by another key")
     with origin.context.database.read() as connection:
@@ -178,5 +231,17 @@ def test_a_coordinator_does_not_start_with_a_key_that_cannot_sign(
 ) -> None:
     (tmp_path / "key").write_text("no key")
     (tmp_path / "key").chmod(0o600)
-    assert main(["--data", str(tmp_path / "data"), "--port", "0", "--signing-key", str(tmp_path / "key")]) == 2
+    assert (
+        main(
+            [
+                "--data",
+                str(tmp_path / "data"),
+                "--port",
+                "0",
+                "--signing-key",
+                str(tmp_path / "key"),
+            ]
+        )
+        == 2
+    )
     assert "cannot sign" in capsys.readouterr().err

@@ -23,7 +23,9 @@ from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, sho
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
 
-pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+pytest.importorskip(
+    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+)
 
 import obstore.store
 from stickslip_testing.s3 import Proxy, no_fault
@@ -31,9 +33,14 @@ from stickslip_testing.s3 import Proxy, no_fault
 REFUSAL = r"store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/lab/store'"
 
 
-@pytest.mark.parametrize("command", [["up"], ["gc"], ["rm", "ds-0123456789abcdef:v1"], ["reindex"], ["coordinator"]])
+@pytest.mark.parametrize(
+    "command", [["up"], ["gc"], ["rm", "ds-0123456789abcdef:v1"], ["reindex"], ["coordinator"]]
+)
 def test_a_place_that_is_no_store_is_refused(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     verb, *rest = command
@@ -59,7 +66,9 @@ def test_nobody_else_reads_the_database(tmp_path: Path) -> None:
     assert [place.stat().st_mode & 0o777 for place in (data, database)] == [0o700, 0o600]
 
 
-def test_the_environment_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_is_checked_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("STICKSLIP_STORE", "s3:/lab/store")
     with pytest.raises(SettingsError, match=REFUSAL):
         Settings.chosen(data=tmp_path)
@@ -77,7 +86,11 @@ def stickslip(*words: str) -> Result:
 def objects(bucket: str) -> dict[str, float]:
     """Return the names of all objects of a bucket, and when they were written."""
     root = obstore.store.S3Store(bucket.removeprefix("s3://").partition("/")[0])
-    return {item["path"]: item["last_modified"].timestamp() for page in obstore.list(root) for item in page}
+    return {
+        item["path"]: item["last_modified"].timestamp()
+        for page in obstore.list(root)
+        for item in page
+    }
 
 
 def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
@@ -89,7 +102,9 @@ def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
 def test_a_bucket_is_a_store_like_any_other(
     in_bucket: Settings, bucket: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Make two datasets, read one, remove one, collect, lose the database, and find the other one again."""
+    """Make two datasets, read one, remove one, collect, lose the database, and find the other one
+    again.
+    """
     context = Context.open(in_bucket)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
@@ -138,7 +153,9 @@ def test_a_bucket_is_a_store_like_any_other(
     context.close()
 
 
-def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Settings, bucket: str) -> None:
+def test_what_a_version_shows_is_kept_though_no_database_knows_it(
+    in_bucket: Settings, bucket: str
+) -> None:
     """A database from an old backup knows less than the bucket."""
     context = Context.open(in_bucket)
     start(context)
@@ -154,14 +171,18 @@ def test_what_a_version_shows_is_kept_though_no_database_knows_it(in_bucket: Set
     fresh.close()
     before = {name for name in objects(bucket) if "/datasets/" in name}
     assert (
-        stickslip("gc", "--delete", "--older-than", "0", "--data", str(in_bucket.data), "--store", bucket).exit_code
+        stickslip(
+            "gc", "--delete", "--older-than", "0", "--data", str(in_bucket.data), "--store", bucket
+        ).exit_code
         == 0
     )
     assert {name for name in objects(bucket) if "/datasets/" in name} == before
     assert stickslip("reindex", "--data", str(in_bucket.data), "--store", bucket).exit_code == 0
 
 
-def test_jobs_wait_while_the_bucket_is_away(in_bucket: Settings, s3: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_wait_while_the_bucket_is_away(
+    in_bucket: Settings, s3: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("stickslip_schemas.store.bucket.PROBE_PATIENCE", 0.5)
     clock = ManualClock()
     context = Context.open(in_bucket, clock)
@@ -189,7 +210,11 @@ def test_jobs_wait_while_the_bucket_is_away(in_bucket: Settings, s3: Proxy, monk
 
 
 def test_a_new_coordinator_wants_an_answer_of_its_bucket(
-    bucket: str, s3: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    bucket: str,
+    s3: Proxy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     """It must not start an empty queue beside datasets that it cannot see."""
     monkeypatch.setattr("stickslip_schemas.store.bucket.PATIENCE", 0.5)

@@ -1,4 +1,7 @@
-"""A store that is full, read-only or not to be written pauses jobs within seconds; then they go on by themselves."""
+"""A store that is full, read-only or not to be written pauses jobs within seconds.
+
+Then they go on by themselves.
+"""
 
 import errno
 import os
@@ -30,7 +33,9 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 48 MiB."""
     place = tmp_path / "disk"
     place.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", place], capture_output=True, check=False)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", place], capture_output=True, check=False
+    )
     if done.returncode != 0:
         pytest.skip(f"mounting needs root: {done.stderr.decode()}")
     yield place
@@ -59,7 +64,10 @@ def job_of(server: RunningServer, job: str) -> dict[str, object]:
 def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
     disk: Path, monkeypatch: pytest.MonkeyPatch, left: int
 ) -> None:
-    """Database and store share the disk. With nothing left at all, not even the database can be written."""
+    """Database and store share the disk.
+
+    With nothing left at all, not even the database can be written.
+    """
     monkeypatch.setenv("STICKSLIP_MIN_FREE_BYTES", str(8 * MIB))
     server = start_server(disk / "data")
     try:
@@ -85,7 +93,9 @@ def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
 
 
 def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
-    settings = Settings(data=tmp_path / "data", store=str(disk / "store"), durable=False, min_free_bytes=0)
+    settings = Settings(
+        data=tmp_path / "data", store=str(disk / "store"), durable=False, min_free_bytes=0
+    )
     context = Context.open(settings, ManualClock())
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
@@ -126,7 +136,9 @@ def test_a_store_that_is_a_file_pauses_the_job(context: Context, worker: Pretend
     assert show_job(context, job).message == ""
 
 
-def test_a_job_from_before_the_first_worker_is_planned_once_the_store_is_free(context: Context) -> None:
+def test_a_job_from_before_the_first_worker_is_planned_once_the_store_is_free(
+    context: Context,
+) -> None:
     root = Path(context.settings.store_place)
     if root.exists():
         root.rmdir()

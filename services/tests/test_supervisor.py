@@ -28,14 +28,27 @@ pytestmark = pytest.mark.real
 
 
 class Up:
-    def __init__(self, directory: Path, *, stub: str | None = None, data: str = "data", port: str = "0") -> None:
+    def __init__(
+        self, directory: Path, *, stub: str | None = None, data: str = "data", port: str = "0"
+    ) -> None:
         self.data = directory / data
         self.log = directory / "dispatchers.log"
         program = directory / "stub.py"
         program.write_text(STUB.format(log=str(self.log)) if stub is None else stub)
-        command = [sys.executable, "-m", "stickslip_services.cli", "up", "--data", str(self.data), "--port", port]
+        command = [
+            sys.executable,
+            "-m",
+            "stickslip_services.cli",
+            "up",
+            "--data",
+            str(self.data),
+            "--port",
+            port,
+        ]
         command += ["--slots", "3", "--workers", f"{sys.executable} {program}"]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
 
     @property
     def url(self) -> str:
@@ -51,7 +64,11 @@ class Up:
         return self.started("dispatch")
 
     def started(self, command: str) -> list[int]:
-        lines = [line.split() for line in self.log.read_text().splitlines()] if self.log.exists() else []
+        lines = (
+            [line.split() for line in self.log.read_text().splitlines()]
+            if self.log.exists()
+            else []
+        )
         return [int(words[0]) for words in lines if words[1] == command]
 
     def coordinator(self) -> int:
@@ -74,7 +91,10 @@ class Up:
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Up]:
     """One for the tests that follow each other: the last kills it."""
     running = Up(tmp_path_factory.mktemp("up"))
-    wait_until(lambda: bool(running.dispatchers() and running.started("head")) and running.answers(), seconds=250)
+    wait_until(
+        lambda: bool(running.dispatchers() and running.started("head")) and running.answers(),
+        seconds=250,
+    )
     yield running
     running.stop()
 
@@ -91,9 +111,15 @@ def test_up_starts_all_once(up: Up) -> None:
     assert port != "0"
     words = sorted(line.partition(" ")[2] for line in up.log.read_text().splitlines())
     expected = f"dispatch --once --ray-data {up.data} --url {up.url} --store {up.data / 'store'} --name local"
-    assert words == [f"{expected} --key-file {up.data / 'worker-key'}", f"head --ray-data {up.data} --cpus 3"]
+    assert words == [
+        f"{expected} --key-file {up.data / 'worker-key'}",
+        f"head --ray-data {up.data} --cpus 3",
+    ]
     assert (up.data / "logs" / "coordinator.log").exists()
-    for data, at, message in (("data", "0", "in use by another"), ("other", port, "cannot listen on")):
+    for data, at, message in (
+        ("data", "0", "in use by another"),
+        ("other", port, "cannot listen on"),
+    ):
         second = Up(up.data.parent, data=data, port=at)
         assert message in second.process.communicate(timeout=150)[0]
         assert second.process.returncode == 1
@@ -104,7 +130,10 @@ def test_children_that_are_killed_come_back(up: Up) -> None:
     os.kill(first, signal.SIGKILL)
     os.kill(up.dispatchers()[-1], signal.SIGKILL)
     wait_until(
-        lambda: up.coordinator() not in (0, first) and up.answers() and len(up.dispatchers()) > before, seconds=250
+        lambda: (
+            up.coordinator() not in (0, first) and up.answers() and len(up.dispatchers()) > before
+        ),
+        seconds=250,
     )
     assert up.url == url
 
@@ -142,7 +171,9 @@ def test_only_the_coordinator_is_told_the_database(
     up = Up(tmp_path)
     try:
         wait_until(lambda: bool(up.dispatchers()) and up.answers(), seconds=250)
-        coordinator, dispatcher = (Path(f"/proc/{pid}") for pid in (up.coordinator(), *up.dispatchers()))
+        coordinator, dispatcher = (
+            Path(f"/proc/{pid}") for pid in (up.coordinator(), *up.dispatchers())
+        )
         assert b"STICKSLIP_DATABASE" in (coordinator / "environ").read_bytes()
         assert b"postgresql" not in (coordinator / "cmdline").read_bytes()
         assert b"STICKSLIP_DATABASE" not in (dispatcher / "environ").read_bytes()

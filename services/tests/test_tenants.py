@@ -1,7 +1,7 @@
 """Tenants: what belongs to another project is not there, whatever the operation.
 
-Every operation of the OpenAPI document, and every page, is tried with the key of another project. One that is added
-and not tried fails the test.
+Every operation of the OpenAPI document, and every page, is tried with the key of another project.
+One that is added and not tried fails the test.
 """
 
 import time
@@ -95,7 +95,9 @@ OWNED = {
 
 @dataclass
 class Tenants:
-    """A coordinator with a job, a dataset and an upload of the project alpha, and keys of two projects."""
+    """A coordinator with a job, a dataset and an upload of the project alpha, and keys of two
+    projects.
+    """
 
     app: FastAPI
     alpha: httpx.Client
@@ -121,7 +123,9 @@ def picture(shade: int) -> bytes:
 
 @pytest.fixture(scope="module")
 def tenants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tenants]:
-    app = make_app(Settings(data=tmp_path_factory.mktemp("tenants"), durable=False, require_keys=True))
+    app = make_app(
+        Settings(data=tmp_path_factory.mktemp("tenants"), durable=False, require_keys=True)
+    )
     context: Context = app.state.context
     with serving(app) as url:
         with context.database.write() as connection:
@@ -130,14 +134,23 @@ def tenants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tenants]:
                 for name in ("alpha", "beta")
             }
         clients = {
-            name: httpx.Client(base_url=url, headers={"Authorization": f"Bearer {secret}"}, timeout=20, trust_env=False)
+            name: httpx.Client(
+                base_url=url,
+                headers={"Authorization": f"Bearer {secret}"},
+                timeout=20,
+                trust_env=False,
+            )
             for name, secret in secrets.items()
         }
         alpha = clients["alpha"]
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
-        made = alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers={"Idempotency-Key": "one"}).json()
+        made = alpha.post(
+            "/v1/jobs", json=rods(name="alpha-s"), headers={"Idempotency-Key": "one"}
+        ).json()
         worker.work()
-        upload = alpha.post("/v1/textures", content=picture(7), headers={"Content-Type": "image/png"}).json()
+        upload = alpha.post(
+            "/v1/textures", content=picture(7), headers={"Content-Type": "image/png"}
+        ).json()
         job = alpha.get(f"/v1/jobs/{made['id']}").json()
         assert job["state"] == "succeeded", job
         with context.database.read() as connection:
@@ -164,23 +177,39 @@ def tenants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tenants]:
 def operations(app: FastAPI) -> set[tuple[str, str]]:
     """Return all operations (method, template), those outside the OpenAPI document included."""
     nested = [getattr(route, "original_router", None) for route in app.state.routes]
-    all_routes = [*app.state.routes, *(route for router in nested if router for route in router.routes)]
+    all_routes = [
+        *app.state.routes,
+        *(route for router in nested if router for route in router.routes),
+    ]
     routes = {
-        (method, route.path) for route in all_routes if isinstance(route, Route) for method in route.methods or ()
+        (method, route.path)
+        for route in all_routes
+        if isinstance(route, Route)
+        for method in route.methods or ()
     }
-    document = {(method.upper(), path) for path, methods in app.openapi()["paths"].items() for method in methods}
+    document = {
+        (method.upper(), path)
+        for path, methods in app.openapi()["paths"].items()
+        for method in methods
+    }
     assert document <= {(method, path.replace("{path:path}", "{path}")) for method, path in routes}
     return routes
 
 
 def test_every_operation_is_tried(tenants: Tenants) -> None:
     there = {(method, path) for method, path in operations(tenants.app) if method != "HEAD"}
-    tried = {(method, path) for method, path in SHARED | HOUSE.keys() | ENDLESS | OWNED if method != "HEAD"}
+    tried = {
+        (method, path)
+        for method, path in SHARED | HOUSE.keys() | ENDLESS | OWNED
+        if method != "HEAD"
+    }
     assert there == tried, f"not tried: {there - tried}; not there: {tried - there}"
 
 
 @pytest.mark.parametrize(("method", "path"), sorted(OWNED))
-def test_what_belongs_to_another_project_is_not_found(tenants: Tenants, method: str, path: str) -> None:
+def test_what_belongs_to_another_project_is_not_found(
+    tenants: Tenants, method: str, path: str
+) -> None:
     refused = tenants.call(tenants.beta, method, path)
     if (method, path) not in operations(tenants.app):
         assert refused.status_code == 405
@@ -188,7 +217,10 @@ def test_what_belongs_to_another_project_is_not_found(tenants: Tenants, method: 
     assert refused.status_code == 404, refused.text
     own = tenants.call(tenants.alpha, method, path)
     assert own.status_code != 404 or "array" in path, own.text  # rods have no pictures of that name
-    assert refused.text.replace(refused.headers["x-request-id"], "") not in own.text or method == "HEAD"
+    assert (
+        refused.text.replace(refused.headers["x-request-id"], "") not in own.text
+        or method == "HEAD"
+    )
 
 
 @pytest.mark.parametrize(("method", "path"), sorted(SHARED))
@@ -213,14 +245,25 @@ def test_a_key_of_idempotency_is_of_its_project(tenants: Tenants) -> None:
     made = tenants.beta.post("/v1/jobs", json=rods(gamma=(5.0,)), headers=headers)
     assert made.status_code == 202
     assert made.json()["id"] != tenants.parameters["job_id"]
-    assert tenants.alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers=headers).status_code == 200
+    assert (
+        tenants.alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers=headers).status_code
+        == 200
+    )
 
 
 def test_an_upload_is_of_its_project(tenants: Tenants) -> None:
-    axes = {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "mine"], "viewpoint": "calibrated"}
+    axes = {
+        "material": "gray-interlock",
+        "mu": 0.3,
+        "texture": ["dots", "mine"],
+        "viewpoint": "calibrated",
+    }
     spec = {"kind": "cloth_drag", "axes": axes, "textures": {"mine": tenants.upload}}
     refused = tenants.beta.post("/v1/jobs:validate", json=spec)
-    assert (refused.status_code, "must name a file that was uploaded" in refused.text) == (422, True), refused.text
+    assert (refused.status_code, "must name a file that was uploaded" in refused.text) == (
+        422,
+        True,
+    ), refused.text
     assert tenants.alpha.post("/v1/jobs:validate", json=spec).status_code == 200
 
 

@@ -43,7 +43,10 @@ def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
 
 @pytest.fixture
 def made(settings: Settings) -> list[str]:
-    """Two datasets that share two of their four simulations each; return their ids. The coordinator has ended."""
+    """Two datasets that share two of their four simulations each; return their ids.
+
+    The coordinator has ended.
+    """
     context = Context.open(settings)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
@@ -65,7 +68,10 @@ def run(settings: Settings, *arguments: object) -> Result:
 
 
 def artifacts(settings: Settings) -> dict[str, int]:
-    return {path.name: path.stat().st_size for path in (Path(settings.store_place) / "artifacts").glob("*/*")}
+    return {
+        path.name: path.stat().st_size
+        for path in (Path(settings.store_place) / "artifacts").glob("*/*")
+    }
 
 
 def age(settings: Settings, seconds: float) -> None:
@@ -153,7 +159,9 @@ def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
     assert not scratch.exists()
 
 
-def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(settings: Settings, made: list[str]) -> None:
+def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(
+    settings: Settings, made: list[str]
+) -> None:
     """As after a database was restored from an old backup."""
     directory = Path(settings.store_place) / "datasets" / made[0] / "v1"
     away = settings.data / "away"
@@ -196,7 +204,10 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("rm", "ds-0000000000000000:v1"), "there is no version 1 of a dataset 'ds-0000000000000000'"),
+        (
+            ("rm", "ds-0000000000000000:v1"),
+            "there is no version 1 of a dataset 'ds-0000000000000000'",
+        ),
         (("rm", "ds-0000000000000000"), "must be DATASET:vN, as in ds-0123456789abcdef:v1"),
         (("rm", "../../etc:v1"), "must be DATASET:vN, as in ds-0123456789abcdef:v1"),
     ],
@@ -232,10 +243,14 @@ def mend(context: Context) -> None:
     assert {job.state for job in list_jobs(context)} == {JobState.succeeded}
 
 
-def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(settings: Settings, made: list[str]) -> None:
+def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(
+    settings: Settings, made: list[str]
+) -> None:
     """The versions share files by their bytes, as hard links do."""
     rng = random.Random(5)
-    shown = sorted(path for path in (Path(settings.store_place) / "datasets").rglob("*") if path.is_file())
+    shown = sorted(
+        path for path in (Path(settings.store_place) / "datasets").rglob("*") if path.is_file()
+    )
     before = {path: path.read_bytes() for path in shown}
     for round_ in range(5):
         rotten = {path for path in rng.sample(shown, 4) if path.stat().st_size}
@@ -248,7 +263,9 @@ def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(settings: Sett
         damaged = {path for path in shown if path.read_bytes() != before[path]}
         told = {tuple(line.split("  ")) for line in found.stdout.splitlines()}
         for path in damaged:
-            dataset, version, *names = path.relative_to(Path(settings.store_place) / "datasets").parts
+            dataset, version, *names = path.relative_to(
+                Path(settings.store_place) / "datasets"
+            ).parts
             listed = {name for one, name in told if one == f"{dataset}:{version}"}
             assert listed & {"/".join(names), MANIFEST_NAME}
         clock = ManualClock()
@@ -284,4 +301,8 @@ def test_a_coordinator_scrubs_when_it_is_idle(settings: Settings, made: list[str
 def scrubbed(context: Context) -> list[str]:
     with context.database.read() as connection:
         read = dataset_versions.c.scrubbed_at > context.clock() - DAY
-        return list(connection.scalars(select(dataset_versions.c.dataset).where(read, dataset_versions.c.version == 1)))
+        return list(
+            connection.scalars(
+                select(dataset_versions.c.dataset).where(read, dataset_versions.c.version == 1)
+            )
+        )

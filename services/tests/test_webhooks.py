@@ -51,7 +51,9 @@ class Receiver:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"])).decode()
-                receiver.received.append(({name.lower(): value for name, value in self.headers.items()}, body))
+                receiver.received.append(
+                    ({name.lower(): value for name, value in self.headers.items()}, body)
+                )
                 self.send_response(receiver.status)
                 self.end_headers()
 
@@ -82,7 +84,9 @@ def receiver() -> Iterator[Receiver]:
 
 @pytest.fixture
 def messenger(context: Context, monkeypatch: pytest.MonkeyPatch) -> WebhookDelivery:
-    monkeypatch.setattr(webhooks, "WAIT_SECONDS", 20.0)  # a busy machine must not leave a delivery for later
+    monkeypatch.setattr(
+        webhooks, "WAIT_SECONDS", 20.0
+    )  # a busy machine must not leave a delivery for later
     return WebhookDelivery(context.database, context.clock, sealer(context.settings))
 
 
@@ -116,7 +120,9 @@ def test_what_happens_is_told_in_order_and_signed(
     assert len(set(ids)) == len(ids)
     for headers, body in receiver.received:
         at = datetime.fromtimestamp(int(headers["webhook-timestamp"]), UTC)
-        assert headers["webhook-signature"] == Verifier(secret).sign(headers["webhook-id"], at, body)
+        assert headers["webhook-signature"] == Verifier(secret).sign(
+            headers["webhook-id"], at, body
+        )
         assert headers["webhook-id"].startswith(f"msg_{name}_")
         document = json.loads(body)
         assert document["data"]["name"] == "of-a-test"
@@ -126,7 +132,11 @@ def test_what_happens_is_told_in_order_and_signed(
 
 
 def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
-    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
 ) -> None:
     made(context, receiver.url)
     receiver.status = 500
@@ -155,7 +165,11 @@ def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
 
 
 def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherwise(
-    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
 ) -> None:
     name, _ = made(context, receiver.url)
     receiver.status = 503
@@ -176,7 +190,11 @@ def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherw
 
 
 def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one_dies(
-    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
 ) -> None:
     made(context, receiver.url)
     run_job(context, worker, 1.0)
@@ -223,11 +241,17 @@ def test_a_delivery_that_ends_in_its_middle_is_tried_again_without_the_wait_of_i
 
 
 def test_a_copy_of_the_database_has_no_secret(
-    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
 ) -> None:
     name, secret = made(context, receiver.url)
     with context.database.read() as connection:
-        sealed = connection.scalar(select(tables.webhooks.c.secret).where(tables.webhooks.c.id == name))
+        sealed = connection.scalar(
+            select(tables.webhooks.c.secret).where(tables.webhooks.c.id == name)
+        )
     assert sealed is not None
     assert secret.removeprefix("whsec_") not in sealed
     assert sealer(context.settings).decrypt(sealed).decode() == secret
@@ -243,11 +267,17 @@ def test_a_copy_of_the_database_has_no_secret(
 
 def fault_of(context: Context, name: str) -> str:
     with context.database.read() as connection:
-        return next(str(one.fault) for one in list_webhooks(connection, context.clock()) if one.id == name)
+        return next(
+            str(one.fault) for one in list_webhooks(connection, context.clock()) if one.id == name
+        )
 
 
 def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
-    context: Context, worker: PretendWorker, clock: ManualClock, messenger: WebhookDelivery, receiver: Receiver
+    context: Context,
+    worker: PretendWorker,
+    clock: ManualClock,
+    messenger: WebhookDelivery,
+    receiver: Receiver,
 ) -> None:
     receiver.close()
     made(context, receiver.url)
@@ -275,7 +305,9 @@ def test_a_receiver_that_trickles_holds_up_no_other(
         run_job(context, worker, 1.0)
         began = time.monotonic()
         messenger.run()
-        wait_until(lambda: [one for one in receiver.told if one[1] != "queued"] == ONE_JOB, seconds=3)
+        wait_until(
+            lambda: [one for one in receiver.told if one[1] != "queued"] == ONE_JOB, seconds=3
+        )
         assert time.monotonic() - began < 3.8
 
         wait_until(lambda: "did not answer within 4 s" in fault_of(context, slow_hook), seconds=20)
@@ -289,7 +321,9 @@ def trickle(server: socket.socket) -> None:
             time.sleep(0.2)
 
 
-@pytest.mark.parametrize("url", ["http://example.org/hook", "ftp://127.0.0.1/", "https://", "hook", "http://[", ""])
+@pytest.mark.parametrize(
+    "url", ["http://example.org/hook", "ftp://127.0.0.1/", "https://", "hook", "http://[", ""]
+)
 def test_urls_that_anybody_could_read_are_refused(context: Context, url: str) -> None:
     with pytest.raises(SettingsError, match="url must be https"):
         made(context, url)

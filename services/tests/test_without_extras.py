@@ -25,7 +25,9 @@ BLOCKED = f"import sys\nsys.modules.update(dict.fromkeys({(*SERVER_ONLY, *sorted
 
 
 def run_without_extras(code: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", BLOCKED + code], capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.real
@@ -56,8 +58,16 @@ def test_the_command_line_needs_no_extra() -> None:
         ("fabric-cloth.yaml", 1, "numpy is not installed: pip install 'stickslip[arrays]'"),
     ],
 )
-def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(example: str, status: int, said: str) -> None:
-    words = ["stickslip", "validate", str(ROOT / "examples" / example), "--url", "http://127.0.0.1:9"]
+def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(
+    example: str, status: int, said: str
+) -> None:
+    words = [
+        "stickslip",
+        "validate",
+        str(ROOT / "examples" / example),
+        "--url",
+        "http://127.0.0.1:9",
+    ]
     done = run_without_extras(f"from stickslip_services.cli import app\nsys.argv = {words}\napp()")
     assert (done.returncode, said in done.stdout + done.stderr) == (status, True), done.stderr
 

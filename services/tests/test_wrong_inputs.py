@@ -1,4 +1,6 @@
-"""Wrong inputs, in files, request bodies and flags: each is refused, and the message names field, rule and value."""
+"""Wrong inputs, in files, request bodies and flags: each is refused, and the message names field,
+rule and value.
+"""
 
 import json
 from collections.abc import Iterator
@@ -34,7 +36,8 @@ def drawn(**change: Any) -> dict[str, Any]:
     return {"type": "random", "low": 1, "high": 2, "num": 3} | change
 
 
-# Where a document is changed, to what, a part of the rule, and the field that is named where it is another place.
+# Where a document is changed, to what, a part of the rule, and the field that is named where it is
+# another place.
 WRONG_RODS: list[tuple[Any, ...]] = [
     ("kind", "rod", "one of cloth_drag, cloth_scene, rod_hang"),
     ("kind", MISSING, "one of cloth_drag, cloth_scene, rod_hang"),
@@ -149,7 +152,13 @@ def changed(base: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("base", "path", "value", "rule", "field"), DOCUMENTS)
 def test_a_wrong_document_is_refused_as_a_file_and_as_a_body(
-    base: dict[str, Any], path: str, value: Any, rule: str, field: str | None, api: httpx.Client, tmp_path: Path
+    base: dict[str, Any],
+    path: str,
+    value: Any,
+    rule: str,
+    field: str | None,
+    api: httpx.Client,
+    tmp_path: Path,
 ) -> None:
     document = changed(base, path, value)
     named = path if field is None else field
@@ -172,7 +181,11 @@ NUMBER = "not a valid integer range"
 FLAGS: list[tuple[str, int, str]] = [
     ("submitt", 2, "No such command 'submitt'. Did you mean 'submit'?"),
     ("--verson", 2, "No such option '--verson'. Did you mean '--version'?"),
-    ("--install-completion tcsh", 2, "'--install-completion': 'tcsh' is not one of 'bash', 'zsh', 'fish'"),
+    (
+        "--install-completion tcsh",
+        2,
+        "'--install-completion': 'tcsh' is not one of 'bash', 'zsh', 'fish'",
+    ),
     ("validate", 2, "Missing argument 'FILE'"),
     ("validate OK --jsn", 2, "No such option '--jsn'. Did you mean '--json'?"),
     ("validate OK x", 2, "unexpected extra argument (x)"),
@@ -181,7 +194,11 @@ FLAGS: list[tuple[str, int, str]] = [
     ("validate NONE", 1, "there is no file"),
     ("validate LIST", 1, "must hold a mapping (key: value), and it holds [1]"),
     ("validate NAN", 1, "axes.phi0 must be a finite number, and it is nan"),
-    ("validate DATE", 1, "name must be a number, a word, a list or a mapping, and it is datetime.date"),
+    (
+        "validate DATE",
+        1,
+        "name must be a number, a word, a list or a mapping, and it is datetime.date",
+    ),
     ("validate TWICE", 1, "the key 'kind' is there twice"),
     ("validate BROKEN", 1, "is not YAML"),
     ("validate BYTES", 1, "cannot be read"),
@@ -205,18 +222,38 @@ FLAGS: list[tuple[str, int, str]] = [
     ("pull", 2, "Missing argument 'DATASET[:vN]'"),
     (f"pull {DATASET}", 2, "Missing argument 'DEST'"),
     (f"pull {DATASET}:vx OUT", 1, f"must be DATASET:vN, as in {DATASET}:v1, and is '{DATASET}:vx'"),
-    (f"pull {DATASET}:v1 OUT --split all", 1, "split: Input should be 'train', 'validation' or 'test', and is 'all'"),
+    (
+        f"pull {DATASET}:v1 OUT --split all",
+        1,
+        "split: Input should be 'train', 'validation' or 'test', and is 'all'",
+    ),
     (f"pull {DATASET} OUT --where", 2, "'--where' requires an argument"),
     ("sign OUT", 2, "Missing option '--key'"),
     ("verify", 2, "Missing argument 'DIR'"),
-    ("verify OUT", 1, "manifest.json  missing  not there: no dataset, or a pull that was not finished"),
+    (
+        "verify OUT",
+        1,
+        "manifest.json  missing  not there: no dataset, or a pull that was not finished",
+    ),
     (f"rm {DATASET}", 1, f"must be DATASET:vN, as in {DATASET}:v1, and is '{DATASET}'"),
     (f"rm {DATASET}:v0", 1, f"must be DATASET:vN, as in {DATASET}:v1, and is '{DATASET}:v0'"),
     (f"rm {DATASET}:v1 DATA", 1, "does not exist or is empty: name the --data of a coordinator"),
     ("gc --older-than -1", 2, "'--older-than': must be a number of hours, 0 or more, and is '-1'"),
-    ("gc --older-than nan", 2, "'--older-than': must be a number of hours, 0 or more, and is 'nan'"),
-    ("gc --older-than inf", 2, "'--older-than': must be a number of hours, 0 or more, and is 'inf'"),
-    ("gc --older-than week", 2, "'--older-than': must be a number of hours, 0 or more, and is 'week'"),
+    (
+        "gc --older-than nan",
+        2,
+        "'--older-than': must be a number of hours, 0 or more, and is 'nan'",
+    ),
+    (
+        "gc --older-than inf",
+        2,
+        "'--older-than': must be a number of hours, 0 or more, and is 'inf'",
+    ),
+    (
+        "gc --older-than week",
+        2,
+        "'--older-than': must be a number of hours, 0 or more, and is 'week'",
+    ),
     ("scrub --rate 0", 2, "'--rate': must be a number of MB/s, 0.1 or more, and is '0'"),
     ("scrub --rate nan", 2, "'--rate': must be a number of MB/s, 0.1 or more, and is 'nan'"),
     (
@@ -224,10 +261,22 @@ FLAGS: list[tuple[str, int, str]] = [
         1,
         "store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3://'",
     ),
-    ("reindex DATA --store ftp://x", 1, "store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 'ftp"),
+    (
+        "reindex DATA --store ftp://x",
+        1,
+        "store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 'ftp",
+    ),
     ("keys create me", 2, "Missing option '--scope'"),
-    ("keys create me --scope all", 2, "'--scope': 'all' is not one of 'read', 'submit', 'work', 'admin'"),
-    (f"keys create {'x' * 101} --scope read DATA", 1, "name must have 1 to 100 characters, and has 101"),
+    (
+        "keys create me --scope all",
+        2,
+        "'--scope': 'all' is not one of 'read', 'submit', 'work', 'admin'",
+    ),
+    (
+        f"keys create {'x' * 101} --scope read DATA",
+        1,
+        "name must have 1 to 100 characters, and has 101",
+    ),
     (
         "keys create me --scope read --project A DATA",
         1,
@@ -236,10 +285,26 @@ FLAGS: list[tuple[str, int, str]] = [
     ("keys revoke key-0 DATA", 1, "there is no key 'key-0'"),
     ("projects quota lab --jobs -1", 2, "'--jobs': -1 is not in the range x>=0"),
     ("projects quota lab --samples many", 2, f"'--samples': 'many' is {NUMBER}"),
-    ("projects quota A DATA", 1, "project must be lower-case letters, digits and '-', 63 at most; got 'A'"),
-    ("webhooks create example.org DATA", 1, "url must be https://HOST/PATH, or http:// on this machine; got 'example"),
-    ("webhooks create ftp://x DATA", 1, "url must be https://HOST/PATH, or http:// on this machine; got 'ftp://x'"),
-    ("webhooks create http://example.org DATA", 1, "url must be https://HOST/PATH, or http:// on this machine"),
+    (
+        "projects quota A DATA",
+        1,
+        "project must be lower-case letters, digits and '-', 63 at most; got 'A'",
+    ),
+    (
+        "webhooks create example.org DATA",
+        1,
+        "url must be https://HOST/PATH, or http:// on this machine; got 'example",
+    ),
+    (
+        "webhooks create ftp://x DATA",
+        1,
+        "url must be https://HOST/PATH, or http:// on this machine; got 'ftp://x'",
+    ),
+    (
+        "webhooks create http://example.org DATA",
+        1,
+        "url must be https://HOST/PATH, or http:// on this machine",
+    ),
     ("webhooks delete wh-0 DATA", 1, "there is no webhook 'wh-0'"),
     ("audit-log --limit 0", 2, "'--limit': 0 is not in the range x>=1"),
     ("certify", 2, "Missing option '--preset'"),
@@ -252,9 +317,17 @@ FLAGS: list[tuple[str, int, str]] = [
     ("up --port web", 2, f"'--port': 'web' is {NUMBER}"),
     ("up --slots 0", 2, "'--slots': 0 is not in the range x>=1"),
     ("up --host 0.0.0.0 DATA", 1, "host must be a loopback address unless"),
-    ("up --allow-host a/b DATA", 1, "allowed_hosts must be names or addresses without a port; one is 'a/b'"),
+    (
+        "up --allow-host a/b DATA",
+        1,
+        "allowed_hosts must be names or addresses without a port; one is 'a/b'",
+    ),
     ("up --tls-key NONE DATA", 1, "tls_certificate and tls_key must be given together"),
-    ("up --store s3:/x DATA", 1, "store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/x'"),
+    (
+        "up --store s3:/x DATA",
+        1,
+        "store must be a directory, file:///DIRECTORY or s3://BUCKET/PREFIX; got 's3:/x'",
+    ),
     (
         "up --database mysql://x/y DATA",
         1,
@@ -277,12 +350,20 @@ def test_there_are_150_wrong_inputs() -> None:
     assert len(DOCUMENTS) + len({words for words, _, _ in FLAGS}) >= 150
 
 
-@pytest.mark.parametrize(("words", "status", "said"), FLAGS, ids=[words[:40] for words, _, _ in FLAGS])
-def test_a_wrong_flag_or_file_is_refused(words: str, status: int, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "status", "said"), FLAGS, ids=[words[:40] for words, _, _ in FLAGS]
+)
+def test_a_wrong_flag_or_file_is_refused(
+    words: str, status: int, said: str, tmp_path: Path
+) -> None:
     for name, text in FILES.items():
         (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
     known = {name: [str(tmp_path / f"{name}.yaml")] for name in (*FILES, "NONE")}
-    known |= {"DATA": ["--data", str(tmp_path / "data")], "OUT": [str(tmp_path / "out")], "HERE": [str(tmp_path)]}
+    known |= {
+        "DATA": ["--data", str(tmp_path / "data")],
+        "OUT": [str(tmp_path / "out")],
+        "HERE": [str(tmp_path)],
+    }
     given = [part for word in words.split() for part in known.get(word, [word])]
     done = CliRunner().invoke(app, given, env={"COLUMNS": "250", "STICKSLIP_URL": OFFLINE[1]})
     assert done.exit_code == status, done.output

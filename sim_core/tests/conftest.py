@@ -11,7 +11,10 @@ Floats = NDArray[np.float64]
 
 @pytest.fixture(scope="session")
 def thesis_rods() -> Floats:
-    """400 rods over the thesis's ranges and 200 in the corner with several minima; rows (gamma, phi0, phi1)."""
+    """400 rods over the thesis's ranges and 200 in the corner with several minima.
+
+    Rows (gamma, phi0, phi1).
+    """
     rng = np.random.default_rng(20260101)
     ranges = rng.uniform([100, 0.2, 6], [1300, 12, 20], (400, 3))
     corner = rng.uniform([100, 0.2, 9.1], [1300, 2.8, 20], (200, 3))

@@ -56,7 +56,12 @@ def test_hash_follows_what_matters(tmp_path: Path) -> None:
     assert here == elsewhere
     assert configure(tmp_path / "here", tmp_path / "build-here", "-DSIM_CORE_ISA=x86-64-v3") != here
     assert (
-        configure(tmp_path / "here", tmp_path / "build-here", "-DSIM_CORE_ISA=", "-DCMAKE_CXX_FLAGS=-fno-inline")
+        configure(
+            tmp_path / "here",
+            tmp_path / "build-here",
+            "-DSIM_CORE_ISA=",
+            "-DCMAKE_CXX_FLAGS=-fno-inline",
+        )
         != here
     )
     source = tmp_path / "elsewhere" / "src" / "rods" / "newton.hpp"

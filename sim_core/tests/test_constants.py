@@ -1,7 +1,9 @@
-"""Constants of the cloth solver, halved and doubled: results move within a bound, and the cost within a factor.
+"""Constants of the cloth solver, halved and doubled: results move within a bound, and the cost
+within a factor.
 
-Where contact makes a cloth choose, as which way a fold falls, any change of rounding may choose otherwise: the bounds
-of such scenes are the size of that, and of the others a share of the thickness.
+Where contact makes a cloth choose, as which way a fold falls, any change of rounding may choose
+otherwise: the bounds of such scenes are the size of that, and of the others a share of the
+thickness.
 """
 
 import pytest
@@ -91,13 +93,21 @@ def test_counts_are_those_of_the_solver() -> None:
 )
 def test_constants_that_break_a_rule_are_refused(changed: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Cloth(meshes.grid(0.1, 0.1, 2, 2), fabric("gray-interlock"), SolverSettings("own", 0.02, constants=changed))
+        Cloth(
+            meshes.grid(0.1, 0.1, 2, 2),
+            fabric("gray-interlock"),
+            SolverSettings("own", 0.02, constants=changed),
+        )
 
 
 def test_numbers_of_a_preset_are_those_of_its_solver() -> None:
     numbers = SolverSettings("own", 0.02, constants={"contact.proximal": 20.0}).numbers()
     assert numbers == {
-        **{name: value for name, value in vars(SolverSettings("own", 0.02)).items() if name != "constants"},
+        **{
+            name: value
+            for name, value in vars(SolverSettings("own", 0.02)).items()
+            if name != "constants"
+        },
         **cloth_constants(),
         "contact.proximal": 20.0,
     }
@@ -122,5 +132,6 @@ def test_halved_and_doubled(name: str, factor: float) -> None:
     assert found.moved < (0.25 if (name, factor) in OTHERWISE else MOVED[scene])
     limit = DEARER.get((name, factor), COST)
     assert max(found.newton, found.krylov) < limit
-    # Half the share that pairs with surfaces keep is half the distance; nodes that miss a surface are left to these.
+    # Half the share that pairs with surfaces keep is half the distance; nodes that miss a surface
+    # are left to these.
     assert found.least_distance >= 0.4 * default(scene).least_distance

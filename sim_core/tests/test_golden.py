@@ -3,8 +3,9 @@
     python sim_core/tests/test_golden.py           # compare with golden.json
     python sim_core/tests/test_golden.py --record  # after a change meant to change results: say why
 
-Cloth runs with the kernel level named, so that the level `baseline` gives the same bits on any x86-64 processor. So do
-rods of varying curvature with BLAS of the oldest kernels: they are interpolated by matrix products.
+Cloth runs with the kernel level named, so that the level `baseline` gives the same bits on any
+x86-64 processor. So do rods of varying curvature with BLAS of the oldest kernels: they are
+interpolated by matrix products.
 """
 
 import argparse
@@ -47,7 +48,9 @@ KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
 
 def digest(*arrays: NDArray[np.generic]) -> str:
     """Return the SHA-256 of the arrays' bytes."""
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    ).hexdigest()
 
 
 def fallen(material: str, mesh: meshes.Mesh, *, box_below: bool) -> str:
@@ -64,7 +67,12 @@ def fallen(material: str, mesh: meshes.Mesh, *, box_below: bool) -> str:
             if box_below
             else sphere(0.6, 0.03, rotation=turn)
         )
-        cloth.step(0.02, held=ends + 0.0005 * step * np.array([1.0, 0.0, -1.0]), bodies=[plane(0.3), body], damping=0.5)
+        cloth.step(
+            0.02,
+            held=ends + 0.0005 * step * np.array([1.0, 0.0, -1.0]),
+            bodies=[plane(0.3), body],
+            damping=0.5,
+        )
     return digest(cloth.positions, cloth.velocities, cloth.reactions, cloth.contacts, cloth.sliding)
 
 
@@ -72,7 +80,12 @@ def clamped() -> str:
     """Let a clamped strip with Poisson's ratio sag under its weight."""
     mesh = meshes.unstructured(0.02, 0.1, 0.005, 1)
     at_clamp = mesh.rest[:, 1] < -0.043
-    cloth = Cloth(mesh, isotropic(0.2, 500.0, 1e-5, 0.3), preset_named("certified"), held=np.flatnonzero(at_clamp))
+    cloth = Cloth(
+        mesh,
+        isotropic(0.2, 500.0, 1e-5, 0.3),
+        preset_named("certified"),
+        held=np.flatnonzero(at_clamp),
+    )
     flat = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
     cloth.set_state(flat)
     for _ in range(40):
@@ -127,7 +140,9 @@ CLOTH: dict[str, Callable[[], str]] = {
     "plane and sphere, unstructured": lambda: fallen(
         "gray-interlock", meshes.unstructured(0.1, 0.1, 0.01, 3), box_below=False
     ),
-    "plane and box, grid": lambda: fallen("camel-ponte-roma", meshes.grid(0.1, 0.1, 11, 11), box_below=True),
+    "plane and box, grid": lambda: fallen(
+        "camel-ponte-roma", meshes.grid(0.1, 0.1, 11, 11), box_below=True
+    ),
     "clamped strip": clamped,
     "drop and drag, 11, first turn": lambda: dragged("gray-interlock", 0.5, 11, 100, "certified"),
     "drop and drag, 21, touchdown": lambda: dragged("11oz-black-denim", 1.2, 21, 30, "certified"),
@@ -158,7 +173,9 @@ def recorded() -> dict[str, Any]:
     """What is recorded, if this machine can be expected to give the same bits."""
     found: dict[str, Any] = json.loads(RECORDED.read_text(encoding="utf-8"))
     if platform.machine() not in ("x86_64", "AMD64") or build_info().compiler != found["compiler"]:
-        pytest.skip(f"recorded with {found['compiler']} on x86-64: others may give other last digits")
+        pytest.skip(
+            f"recorded with {found['compiler']} on x86-64: others may give other last digits"
+        )
     return found
 
 

@@ -52,6 +52,8 @@ def test_import_needs_numpy_only() -> None:
         "import sys, numpy; before = set(sys.modules); import stickslip_sim_core; "
         "print(sorted({m.split('.')[0] for m in set(sys.modules) - before} - set(sys.stdlib_module_names)))"
     )
-    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
     names = set(eval(loaded))
     assert not names & {"scipy", "torch", "ray", "fastapi", "pydantic", "stickslip_schemas"}, names

@@ -26,7 +26,9 @@ POINTS = 150
 class MadeDataset:
     """A dataset directory, and what was written into it."""
 
-    def __init__(self, root: Path, arrays: dict[str, np.ndarray], spec: RodHangSpec | ClothDragSpec) -> None:
+    def __init__(
+        self, root: Path, arrays: dict[str, np.ndarray], spec: RodHangSpec | ClothDragSpec
+    ) -> None:
         self.root = root
         self.arrays = arrays
         self.spec = spec
@@ -63,16 +65,26 @@ class MadeDataset:
 def seal(root: Path) -> None:
     """Write the manifest's digest into the group's metadata, and those of both beside them."""
     group = json.loads((root / "zarr.json").read_bytes())
-    group.setdefault("attributes", {})["manifest_sha256"] = sha256((root / MANIFEST_NAME).read_bytes())
+    group.setdefault("attributes", {})["manifest_sha256"] = sha256(
+        (root / MANIFEST_NAME).read_bytes()
+    )
     (root / "zarr.json").write_text(json.dumps(group))
-    lines = [f"{sha256((root / name).read_bytes())}  {name}\n" for name in (MANIFEST_NAME, "zarr.json")]
+    lines = [
+        f"{sha256((root / name).read_bytes())}  {name}\n" for name in (MANIFEST_NAME, "zarr.json")
+    ]
     (root / "manifest.sha256").write_text("".join(lines))
 
 
 def write_dataset(
-    root: Path, spec: RodHangSpec | ClothDragSpec, content: dict[str, np.ndarray], rejected: tuple[int, ...] = ()
+    root: Path,
+    spec: RodHangSpec | ClothDragSpec,
+    content: dict[str, np.ndarray],
+    rejected: tuple[int, ...] = (),
 ) -> MadeDataset:
-    """Write a dataset version with zarr-python; `content` has the arrays that are not in every dataset."""
+    """Write a dataset version with zarr-python.
+
+    `content` has the arrays that are not in every dataset.
+    """
     builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     planned = list(samples(spec, builds))
     valid = np.ones(len(planned), dtype=bool)
@@ -81,10 +93,14 @@ def write_dataset(
         **content,
         "split": np.array([sample.split for sample in planned], dtype=np.uint8),
         "valid": valid,
-        "sample_key": np.array([list(bytes.fromhex(sample.key)) for sample in planned], dtype=np.uint8),
+        "sample_key": np.array(
+            [list(bytes.fromhex(sample.key)) for sample in planned], dtype=np.uint8
+        ),
     }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # consolidated metadata are no part of the Zarr v3 specification yet
+        warnings.simplefilter(
+            "ignore"
+        )  # consolidated metadata are no part of the Zarr v3 specification yet
         group = zarr.create_group(str(root), zarr_format=3, attributes={"format": FORMAT})
         for array in layout(spec):
             values = arrays[array.name].copy()
@@ -93,9 +109,15 @@ def write_dataset(
             _write_array(group, array, values, spec.samples_per_file(array))
             arrays[array.name] = values
         zarr.consolidate_metadata(group.store)
-    files = sorted(path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json")
+    files = sorted(
+        path for path in root.rglob("*") if path.is_file() and path != root / "zarr.json"
+    )
     entries = tuple(
-        FileEntry(path=str(path.relative_to(root)), sha256=sha256(path.read_bytes()), size=path.stat().st_size)
+        FileEntry(
+            path=str(path.relative_to(root)),
+            sha256=sha256(path.read_bytes()),
+            size=path.stat().st_size,
+        )
         for path in files
     )
     manifest = Manifest(
@@ -108,7 +130,9 @@ def write_dataset(
         cameras=(),
         sample_count=len(planned),
         valid_count=int(valid.sum()),
-        split_counts={name: int((valid & (arrays["split"] == code)).sum()) for code, name in enumerate(SPLITS)},
+        split_counts={
+            name: int((valid & (arrays["split"] == code)).sum()) for code, name in enumerate(SPLITS)
+        },
         rejection_counts={Reason.out_of_frame: len(rejected)} if len(rejected) else {},
         rejections=tuple(
             Rejection(
@@ -128,9 +152,15 @@ def write_dataset(
     return MadeDataset(root, arrays, spec)
 
 
-def _write_array(group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_file: int) -> None:
+def _write_array(
+    group: zarr.Group, array: ArrayLayout, values: np.ndarray, samples_per_file: int
+) -> None:
     shard = (samples_per_file, *array.shape)
-    compressor = BloscCodec(typesize=4, cname="zstd", clevel=5, shuffle="shuffle") if array.is_trajectory else None
+    compressor = (
+        BloscCodec(typesize=4, cname="zstd", clevel=5, shuffle="shuffle")
+        if array.is_trajectory
+        else None
+    )
     if array.is_clip:
         compressor = BloscCodec(typesize=1, cname="lz4hc", clevel=9, shuffle="noshuffle")
     out = group.create_array(
@@ -193,10 +223,12 @@ def rod_spec(**changes: Any) -> RodHangSpec:
 
 
 def curves(gamma: np.ndarray, phi0: np.ndarray, phi1: np.ndarray) -> dict[str, np.ndarray]:
-    """Return curves that are like hanging rods, and are not: strains of a made-up form, and their exact centrelines.
+    """Return curves that are like hanging rods, and are not: strains of a made-up form, and their
+    exact centrelines.
 
-    kappa(s) = (phi0 (1 - a (1 - s)), b sin(phi0 s) (1 - s), phi1 (1 - a (1 - s))), with a and b that grow with gamma.
-    The frame follows R' = R [kappa]_x in small rotations, the centreline x' = d1.
+    kappa(s) = (phi0 (1 - a (1 - s)), b sin(phi0 s) (1 - s), phi1 (1 - a (1 - s))), with a and b
+    that grow with gamma. The frame follows R' = R [kappa]_x in small rotations, the centreline x' =
+    d1.
     """
     fine = 8
     count = fine * (POINTS - 1)
@@ -237,7 +269,9 @@ def write_rods(root: Path, spec: RodHangSpec, rejected: tuple[int, ...] = ()) ->
     """Write a dataset of made-up rods, with noise for pictures where the spec asks for views."""
     builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
     labels = [sample.labels for sample in samples(spec, builds)]
-    parameters = {name: np.array([label[name] for label in labels]) for name in ("gamma", "phi0", "phi1")}
+    parameters = {
+        name: np.array([label[name] for label in labels]) for name in ("gamma", "phi0", "phi1")
+    }
     content = {**parameters, **curves(**parameters), "energy": np.linspace(-1.0, 1.0, len(labels))}
     content["multistable"] = np.arange(len(labels)) % 3 == 0
     content["self_contact_distance"] = np.where(content["multistable"], 0.02, np.inf)
@@ -260,7 +294,9 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
         for name in ("material", "texture", "viewpoint")
     }
     content["mu"] = np.array([label["mu"] for label in labels])
-    content["video"] = generator.integers(1, 6, (len(labels), spec.frames, 224, 224, 3), dtype=np.uint8)
+    content["video"] = generator.integers(
+        1, 6, (len(labels), spec.frames, 224, 224, 3), dtype=np.uint8
+    )
     for array in layout(spec):
         if array.name in content or array.name in ("valid", "split", "sample_key"):
             continue
@@ -273,7 +309,10 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
 
 @pytest.fixture(scope="session")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> MadeDataset:
-    """12 clips in a full and a half-full shard; 3 and 9 are rejected. Do not write into it: copy it."""
+    """12 clips in a full and a half-full shard; 3 and 9 are rejected.
+
+    Do not write into it: copy it.
+    """
     return write_clips(tmp_path_factory.mktemp("clips") / "v1", cloth_spec(), rejected=(3, 9))
 
 

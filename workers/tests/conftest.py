@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_schemas.base import Reason
-from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, RecordRef
+from stickslip_schemas.documents.tasks import (
+    ChunkRef,
+    PackOutput,
+    PackSlot,
+    PackTask,
+    PublishTask,
+    RecordRef,
+)
 from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.format.manifest import FileEntry, Rejection, layout
 from stickslip_schemas.kinds.rod_hang import RodHangSpec
@@ -51,7 +58,9 @@ class Made:
         """The task that ends it; packs first where that has not been done."""
         if not self.packed:
             self.packed = [pack(task, self.store) for task in self.pack_tasks]
-        return publish_task(self.spec, BUILDS, self.sample_keys, self.rejections, self.packed, self.store)
+        return publish_task(
+            self.spec, BUILDS, self.sample_keys, self.rejections, self.packed, self.store
+        )
 
     @property
     def files(self) -> list[FileEntry]:
@@ -73,7 +82,9 @@ def store(tmp_path: Path) -> DirectoryStore:
 def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
     """Make up a dataset: `make_dataset(count=7, per_shard=4, rejected=(2,), views=True)`."""
 
-    def make(*, count: int = 7, per_shard: int = 4, rejected: tuple[int, ...] = (2,), views: bool = True) -> Made:
+    def make(
+        *, count: int = 7, per_shard: int = 4, rejected: tuple[int, ...] = (2,), views: bool = True
+    ) -> Made:
         rng = np.random.default_rng(count)
         spec = RodHangSpec.model_validate(
             {
@@ -84,7 +95,10 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
             }
         )
         members = list(samples(spec, BUILDS))
-        arrays = {array.name: np.full((count, *array.shape), array.fill, dtype=array.dtype) for array in layout(spec)}
+        arrays = {
+            array.name: np.full((count, *array.shape), array.fill, dtype=array.dtype)
+            for array in layout(spec)
+        }
         curves = {
             name: rng.standard_normal((count, *arrays[name].shape[1:])).astype(np.float32)
             for name in ("centerline", "curvature", "frame")
@@ -104,7 +118,9 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
                 arrays[name][i] = sample.labels[name]
             common = {"slot": i, "sample_key": sample.key, "labels": sample.labels}
             if i in rejected:
-                rejections.append(Rejection(**common, reason=Reason.out_of_frame, message="made up"))
+                rejections.append(
+                    Rejection(**common, reason=Reason.out_of_frame, message="made up")
+                )
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             labels = {**sample.labels, "energy": float(rng.standard_normal())}
@@ -116,7 +132,9 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
             if views:
                 labels["color"] = [float(value) for value in rng.random(3)]
                 arrays["color"][i] = labels["color"]
-                picture = np.repeat(rng.integers(0, 255, (4, 224, 28, 3), dtype=np.uint8), 8, axis=2)
+                picture = np.repeat(
+                    rng.integers(0, 255, (4, 224, 28, 3), dtype=np.uint8), 8, axis=2
+                )
                 arrays["views"][i] = picture
                 chunk = encode_chunk(picture)
                 # Somewhere in a larger artifact, as a renderer may leave it.
@@ -136,7 +154,9 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
             PackTask(spec=spec, shard=shard, slots=tuple(slots[first : first + per_shard]))
             for shard, first in enumerate(range(0, count, per_shard))
         ]
-        return Made(spec, store, tasks, arrays, tuple(rejections), tuple(sample.key for sample in members))
+        return Made(
+            spec, store, tasks, arrays, tuple(rejections), tuple(sample.key for sample in members)
+        )
 
     return make
 

@@ -1,4 +1,6 @@
-"""A coordinator for tests of the dispatcher: speaks the worker API, and does on demand what a real one seldom does."""
+"""A coordinator for tests of the dispatcher: speaks the worker API, and does on demand what a real
+one seldom does.
+"""
 
 import json
 import threading
@@ -24,7 +26,10 @@ from stickslip_schemas.documents.worker_api import (
 
 
 class CoordinatorDouble:
-    """Tasks are given out once, in order; `results`, `released` and `started` say what became of them."""
+    """Tasks are given out once, in order.
+
+    `results`, `released` and `started` say what became of them.
+    """
 
     lease_seconds = 0.6
 
@@ -50,7 +55,8 @@ class CoordinatorDouble:
         self._server: ThreadingHTTPServer | None = None
         self.port = 0
 
-    # --- as a test sees it -----------------------------------------------------------------------------------
+    # --- as a test sees it
+    # -----------------------------------------------------------------------------------
 
     def start(self) -> str:
         double = self
@@ -64,7 +70,9 @@ class CoordinatorDouble:
                     status, answer = double._answer(self.path, body)
                     double.changed.notify_all()
                 data = (
-                    answer.model_dump_json().encode() if isinstance(answer, BaseModel) else json.dumps(answer).encode()
+                    answer.model_dump_json().encode()
+                    if isinstance(answer, BaseModel)
+                    else json.dumps(answer).encode()
                 )
                 self.send_response(status)
                 self.send_header("Content-Length", str(len(data)))
@@ -99,14 +107,21 @@ class CoordinatorDouble:
     def until(self, condition: Callable[[], bool], timeout: float = 180) -> None:
         """Wait for a condition, which is looked at after every request."""
         with self.changed:
-            assert self.changed.wait_for(condition, timeout), (self.results, self.leased, self.released)
+            assert self.changed.wait_for(condition, timeout), (
+                self.results,
+                self.leased,
+                self.released,
+            )
 
-    # --- as a dispatcher sees it -----------------------------------------------------------------------------
+    # --- as a dispatcher sees it
+    # -----------------------------------------------------------------------------
 
     def _answer(self, path: str, body: bytes) -> tuple[int, BaseModel | dict[str, str]]:
         if path == "/v1/workers":
             self.registrations.append(WorkerRegistration.model_validate_json(body))
-            return 201, WorkerSession(worker_id=f"worker-{len(self.registrations)}", lease_seconds=self.lease_seconds)
+            return 201, WorkerSession(
+                worker_id=f"worker-{len(self.registrations)}", lease_seconds=self.lease_seconds
+            )
         if not self.registrations:
             return 404, {"code": "unknown_worker"}
         if path == "/v1/worker/lease":
@@ -128,7 +143,11 @@ class CoordinatorDouble:
                 self._token += 1
                 self.leased[name] = self._token
                 limit = self.limits.get(name)
-                granted.append(Lease(task_id=name, token=self._token, attempt=1, limit_seconds=limit, task=task))
+                granted.append(
+                    Lease(
+                        task_id=name, token=self._token, attempt=1, limit_seconds=limit, task=task
+                    )
+                )
             else:
                 left.append((name, task))
         self.waiting = left
@@ -138,9 +157,13 @@ class CoordinatorDouble:
     def _beat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
         self.beats += 1
         self.condition = heartbeat.condition
-        self.frames |= {lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None}
+        self.frames |= {
+            lease.task_id: lease.frames for lease in heartbeat.leases if lease.frames is not None
+        }
         self.started |= {lease.task_id for lease in heartbeat.leases if lease.started}
-        return HeartbeatAnswer(drop=tuple(lease.task_id for lease in heartbeat.leases if lease.task_id in self.drop))
+        return HeartbeatAnswer(
+            drop=tuple(lease.task_id for lease in heartbeat.leases if lease.task_id in self.drop)
+        )
 
     def _report(self, batch: ReportBatch) -> ReportAnswer:
         verdicts = []
@@ -153,7 +176,11 @@ class CoordinatorDouble:
             del self.leased[report.task_id]
             if report.result is None:
                 self.released.append(report.task_id)
-                self.waiting += [item for item in self.given if item[0] == report.task_id and item[0] in self.long]
+                self.waiting += [
+                    item
+                    for item in self.given
+                    if item[0] == report.task_id and item[0] in self.long
+                ]
             else:
                 self.results[report.task_id] = report.result
             verdicts.append(ReportVerdict(task_id=report.task_id, verdict="accepted"))

@@ -1,4 +1,6 @@
-"""A renderer for tests of the dispatcher: quick, and what it does to a task is the number of its colour seed."""
+"""A renderer for tests of the dispatcher: quick, and what it does to a task is the number of its
+colour seed.
+"""
 
 import errno
 import os
@@ -37,7 +39,11 @@ class RenderActor:
                 time.sleep(0.01)
         chunk = encode_chunk(bytes(4 * 224 * 224 * 3))
         output = RenderOutput(
-            chunks={"views": ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))},
+            chunks={
+                "views": ChunkRef(digest=self._store.publish(chunk), offset=0, length=len(chunk))
+            },
             labels={"color": [0.1, 0.2, 0.3]},
         )
-        return TaskResult(outcome="succeeded", output=output, cpu_seconds=0.1).model_dump(mode="json")
+        return TaskResult(outcome="succeeded", output=output, cpu_seconds=0.1).model_dump(
+            mode="json"
+        )

@@ -21,7 +21,9 @@ def publish_task(
     """Return the task that publishes what was packed, as the coordinator composes it."""
     size, sections = section_samples(spec), []
     for first in range(0, len(keys), size):
-        shards = packed[first // spec.samples_per_shard : -(-(first + size) // spec.samples_per_shard)]
+        shards = packed[
+            first // spec.samples_per_shard : -(-(first + size) // spec.samples_per_shard)
+        ]
         section = PublishSection(
             first=first,
             sample_keys=tuple(keys[first : first + size]),
@@ -30,11 +32,15 @@ def publish_task(
             labels=tuple(output.labels for output in shards),
         )
         sections.append(store.publish(section.model_dump_json().encode()))
-    return PublishTask(spec=spec, dataset=spec.dataset_id, version=1, builds=builds, sections=tuple(sections))
+    return PublishTask(
+        spec=spec, dataset=spec.dataset_id, version=1, builds=builds, sections=tuple(sections)
+    )
 
 
 def changed(task: PublishTask, store: Store, **changes: Any) -> PublishTask:
     """Return the task with other things in its first section."""
-    section = PublishSection.model_validate_json(store.read(task.sections[0])).model_copy(update=changes)
+    section = PublishSection.model_validate_json(store.read(task.sections[0])).model_copy(
+        update=changes
+    )
     digest = store.publish(section.model_dump_json().encode())
     return task.model_copy(update={"sections": (digest, *task.sections[1:])})

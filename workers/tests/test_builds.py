@@ -19,7 +19,14 @@ STAGES = ("simulate", "pack")
 
 SIMULATIONS = {
     "rod_hang": {"gamma": 50.0, "phi0": 1.0, "phi1": 6.0, "poisson": 0.5},
-    "cloth_drag": {"material": "gray-interlock", "fabric": None, "mu": 0.5, "preset": "fast", "mesh": 5, "frames": 2}
+    "cloth_drag": {
+        "material": "gray-interlock",
+        "fabric": None,
+        "mu": 0.5,
+        "preset": "fast",
+        "mesh": 5,
+        "frames": 2,
+    }
     | {"seed": 1, "self_friction": None},
     "cloth_scene": {
         "seed": 1,
@@ -70,7 +77,9 @@ print("\\n".join(m.__file__ for n, m in list(sys.modules.items()) if n.startswit
 
 
 def _python(script: str, *arguments: str) -> str:
-    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True
+    )
     return done.stdout
 
 
@@ -93,8 +102,13 @@ def _only_passes_on(path: Path) -> bool:
 
 
 def _decides_on_nothing(path: Path) -> bool:
-    """Documents only check what a key has as a whole, and say which files it names; a store finds bytes by digest."""
-    return path.parts[-3:-1] in (("stickslip_schemas", room) for room in ("kinds", "scene", "store"))
+    """Documents only check what a key has as a whole, and say which files it names.
+
+    A store finds bytes by digest.
+    """
+    return path.parts[-3:-1] in (
+        ("stickslip_schemas", room) for room in ("kinds", "scene", "store")
+    )
 
 
 @pytest.mark.physics
@@ -104,7 +118,11 @@ def test_every_function_that_runs_is_in_the_build(name: str, tmp_path: Path) -> 
     task = {"stage": "simulate", "simulation": {"kind": name, **SIMULATIONS[name]}}
     answer = json.loads(_python(_RUN, json.dumps([task]), str(tmp_path)))
     assert answer["results"][0]["outcome"] == "succeeded", answer["results"]
-    ours = {Path(file).resolve() for file in answer["ran"] if "/stickslip_" in file and file.endswith(".py")}
+    ours = {
+        Path(file).resolve()
+        for file in answer["ran"]
+        if "/stickslip_" in file and file.endswith(".py")
+    }
     assert len(ours) >= 5
     left = {path for path in ours if not _decides_on_nothing(path)}
     assert left <= _files("simulate", name), left - _files("simulate", name)
@@ -112,9 +130,16 @@ def test_every_function_that_runs_is_in_the_build(name: str, tmp_path: Path) -> 
 
 @pytest.mark.physics
 def test_every_module_that_is_imported_is_in_some_build() -> None:
-    """A file that only passes names on, or that is compiled, is in none; the build of the core covers the latter."""
+    """A file that only passes names on, or that is compiled, is in none.
+
+    The build of the core covers the latter.
+    """
     covered = {path for name in KINDS for stage in STAGES for path in _files(stage, name)}
-    registry = {path.resolve() for path in sources(["stickslip_schemas.kinds"]).values() if path.name == "__init__.py"}
+    registry = {
+        path.resolve()
+        for path in sources(["stickslip_schemas.kinds"]).values()
+        if path.name == "__init__.py"
+    }
     loose = [
         path
         for path in map(Path, _python(_IMPORT).split())
@@ -122,9 +147,12 @@ def test_every_module_that_is_imported_is_in_some_build() -> None:
         and path.resolve() not in covered | registry
         and not (_only_passes_on(path) or _decides_on_nothing(path))
     ]
-    # Loaded with the package of the core, for people; no stage calls them, which the test above would notice.
+    # Loaded with the package of the core, for people; no stage calls them, which the test above
+    # would notice.
     unused = ("rods/fit.py", "rods/inverse.py", "protocols/", "reference/")
-    assert [str(path) for path in loose if not any(part in path.as_posix() for part in unused)] == []
+    assert [
+        str(path) for path in loose if not any(part in path.as_posix() for part in unused)
+    ] == []
 
 
 def test_a_kinds_own_files_are_in_its_builds_and_in_no_others() -> None:
@@ -155,7 +183,8 @@ def test_a_new_fabric_makes_no_rod_again_and_a_new_texture_no_simulation(
         name
         for name in KINDS
         if any(
-            path.name == file and (file == "fabrics.toml" or of_schemas in path.parts) for path in _files(stage, name)
+            path.name == file and (file == "fabrics.toml" or of_schemas in path.parts)
+            for path in _files(stage, name)
         )
     }
     assert held == kinds
@@ -163,11 +192,15 @@ def test_a_new_fabric_makes_no_rod_again_and_a_new_texture_no_simulation(
 
 def test_every_build_is_another() -> None:
     made = [builds.kind_builds(name) for name in KINDS]
-    assert len({one["simulate"] for one in made}) == len({one["pack"] for one in made}) == len(KINDS)
+    assert (
+        len({one["simulate"] for one in made}) == len({one["pack"] for one in made}) == len(KINDS)
+    )
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_certificate_is_of_the_solver_that_the_kind_uses(name: str) -> None:
     presets = [preset for preset, made in CERTIFICATION.items() if made.solver == kind(name).solver]
     assert presets
-    assert builds.kind_builds(name)["sim_core"] == builds.solver_build(CERTIFICATION[presets[0]].solver)
+    assert builds.kind_builds(name)["sim_core"] == builds.solver_build(
+        CERTIFICATION[presets[0]].solver
+    )

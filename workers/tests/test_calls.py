@@ -23,15 +23,22 @@ class Remote:
         return self
 
 
-def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    nodes: list[dict[str, Any]] = [{"NodeID": name, "Alive": True, "Resources": {}} for name in "ab"]
+def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    nodes: list[dict[str, Any]] = [
+        {"NodeID": name, "Alive": True, "Resources": {}} for name in "ab"
+    ]
     cancelled: list[object] = []
     monkeypatch.setattr(ray, "nodes", lambda: nodes)
     monkeypatch.setattr(ray, "cancel", lambda reference, force: cancelled.append(reference))
     monkeypatch.setattr(ray, "wait", lambda *_, **__: ([], []))
-    calls = RayCalls(Settings(urls=(), store="nowhere", name="test"), {"builds": {}}, {"builds": {}})
+    calls = RayCalls(
+        Settings(urls=(), store="nowhere", name="test"), {"builds": {}}, {"builds": {}}
+    )
     here, lost, waiting = (
-        Call(Stage.simulate, [], reference=name, node=node) for name, node in zip("hlw", ("a", "b", ""), strict=True)
+        Call(Stage.simulate, [], reference=name, node=node)
+        for name, node in zip("hlw", ("a", "b", ""), strict=True)
     )
     here.started_at = lost.started_at = time.monotonic()
     calls._in_progress = {one.reference: one for one in (here, lost, waiting)}
@@ -43,7 +50,8 @@ def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(monkeyp
     assert list(calls) == [here]
     assert list(calls.check_nodes()) == []
 
-    # They differ from earlier ones, for Ray would let them wait behind its requests to the lost node.
+    # They differ from earlier ones, for Ray would let them wait behind its requests to the lost
+    # node.
     remote = Remote()
     calls._stages = replace(calls._stages, remote=remote)
     calls.submit(Call(Stage.simulate, []))

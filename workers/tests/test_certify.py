@@ -23,12 +23,18 @@ def presets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two presets that are quick to certify: one that passes, one whose second protocol breaks off."""
     made = {
         "good": Certification(
-            ("rod-lateral-buckling", "rod-cantilever"), ROD_SOLVER, lambda: {"dt": 0.01, "solver": "<b>"}, LITTLE
+            ("rod-lateral-buckling", "rod-cantilever"),
+            ROD_SOLVER,
+            lambda: {"dt": 0.01, "solver": "<b>"},
+            LITTLE,
         ),
         "coarse": Certification(
             ("rod-cantilever", "rod-lateral-buckling"),
             ROD_SOLVER,
-            quick={"rod-cantilever": {"gamma": (1e4,), "elements": 16}, "rod-lateral-buckling": {"elements": 7}},
+            quick={
+                "rod-cantilever": {"gamma": (1e4,), "elements": 16},
+                "rod-lateral-buckling": {"elements": 7},
+            },
         ),
     }
     monkeypatch.setattr(protocols, "CERTIFICATION", made)
@@ -48,24 +54,37 @@ class TestCertify:
         assert out.strip() == certificate.digest
         assert "1/2 rod-lateral-buckling" in err
         assert "passed, largest error" in err
-        assert (certificate.passed, certificate.extent, certificate.certifies) == (True, "quick", False)
+        assert (certificate.passed, certificate.extent, certificate.certifies) == (
+            True,
+            "quick",
+            False,
+        )
         assert certificate.sim_core == solver_build(ROD_SOLVER)
         assert certificate.numbers == {"dt": 0.01, "solver": "<b>"}
-        assert [report.build_hash for report in certificate.protocols] == [build_info().build_hash] * 2
+        assert [report.build_hash for report in certificate.protocols] == [
+            build_info().build_hash
+        ] * 2
         assert certificate.protocols[1].settings == {"elements": 512}
         assert {"cpu_seconds/rod-cantilever", "processor"} <= set(certificate.environment)
 
     def test_twice_is_the_same(self, tmp_path: Path) -> None:
-        first, second = (certify("good", tmp_path / name, quick=True, say=lambda _: None) for name in "ab")
+        first, second = (
+            certify("good", tmp_path / name, quick=True, say=lambda _: None) for name in "ab"
+        )
         assert first.digest == second.digest
 
-    def test_a_preset_that_does_not_pass(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    def test_a_preset_that_does_not_pass(
+        self, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    ) -> None:
         assert main(["certify", "--preset", "coarse", "--out", str(tmp_path), "--quick"]) == 1
         cantilever, buckling = read(tmp_path).protocols
         assert not cantilever.passed
         assert cantilever.error is not None
         assert cantilever.error > cantilever.tolerance
-        assert buckling.message == "ValueError: elements: must be a multiple of 4 and at least 16, got 7"
+        assert (
+            buckling.message
+            == "ValueError: elements: must be a multiple of 4 and at least 16, got 7"
+        )
         assert buckling.curves == ()
         assert "broke off" in capfd.readouterr().err
 
@@ -91,7 +110,9 @@ class TestCertify:
 
         def spoil(name: str, preset: str | None = None, **settings: Any) -> Any:
             result = run(name, preset, **settings)
-            return replace(result, settings={"mesh": object()}) if name == "rod-cantilever" else result
+            return (
+                replace(result, settings={"mesh": object()}) if name == "rod-cantilever" else result
+            )
 
         monkeypatch.setattr(protocols, "run", spoil)
         certificate = certify("good", tmp_path, quick=True, say=lambda _: None)

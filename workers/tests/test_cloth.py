@@ -14,7 +14,14 @@ import zarr
 from PIL import Image
 from publishing import publish_task
 from stickslip_schemas.base import Reason
-from stickslip_schemas.documents.tasks import ChunkRef, PackOutput, PackSlot, PackTask, PublishTask, SimulateTask
+from stickslip_schemas.documents.tasks import (
+    ChunkRef,
+    PackOutput,
+    PackSlot,
+    PackTask,
+    PublishTask,
+    SimulateTask,
+)
 from stickslip_schemas.format.codecs import encode_clip, encode_sample
 from stickslip_schemas.format.manifest import Manifest, Pictures, Psnr, Rejection, layout
 from stickslip_schemas.kinds.cloth.arrays import CHECKS
@@ -80,7 +87,10 @@ class Core:
             rest=scene.mesh.rest,
             triangles=scene.mesh.triangles,
             times=t,
-            record={"contact_force": np.outer(t, (mu, 0.0, 1.0)), "holder_force": np.outer(t, (-mu, 0.0, -1.0))},
+            record={
+                "contact_force": np.outer(t, (mu, 0.0, 1.0)),
+                "holder_force": np.outer(t, (-mu, 0.0, -1.0)),
+            },
             labels={
                 "kernel": "baseline",
                 "steps": 1200,
@@ -154,10 +164,15 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
         "holder_force": ((300, 3), np.float32),
     }
     assert record["positions"][-1, :, 0] == pytest.approx(0.25)
-    assert record["self_intersections"][[1, 50]].tolist() == [1000, 32767]  # more than fits is still many
+    assert record["self_intersections"][[1, 50]].tolist() == [
+        1000,
+        32767,
+    ]  # more than fits is still many
 
 
-def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(core: Core, store: DirectoryStore) -> None:
+def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(
+    core: Core, store: DirectoryStore
+) -> None:
     core.changes = {"code": "stretch", "reason": "stretch: must be at most 1.25, got 2.5"}
     (result,) = run_tasks([_task()], store)
     assert (result.outcome, result.reason) == ("rejected", Reason.stretch)
@@ -197,7 +212,8 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
         spec = ClothDragSpec.model_validate(document | changes)
         members = list(samples(spec, BUILDS))
         arrays = {
-            array.name: np.full((len(members), *array.shape), array.fill, dtype=array.dtype) for array in layout(spec)
+            array.name: np.full((len(members), *array.shape), array.fill, dtype=array.dtype)
+            for array in layout(spec)
         }
         rng = np.random.default_rng(0)
         slots, rejections = [], []
@@ -209,13 +225,17 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
             arrays["material"][i], arrays["viewpoint"][i] = 2, 2
             arrays["texture"][i] = {"dots": 1, "plaid": 3}[sample.labels["texture"]]
             if i in rejected:
-                rejections.append(Rejection(**common, reason=Reason.out_of_frame, message="made up"))
+                rejections.append(
+                    Rejection(**common, reason=Reason.out_of_frame, message="made up")
+                )
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
             shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": ()}
             shown |= {f"psnr_{region}": () for region in REGIONS} | {"psnr_deviation": 3}
-            seen = {name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()}
+            seen = {
+                name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()
+            }
             seen |= {"light_seed": i, "lighting": "drawn", "substrate": "ceramic"}
             labels = sample.labels | result.output.labels | seen
             arrays["valid"][i] = True
@@ -245,7 +265,9 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
         ]
 
         def task_of(packed: list[PackOutput]) -> PublishTask:
-            return publish_task(spec, BUILDS, [sample.key for sample in members], rejections, packed, store)
+            return publish_task(
+                spec, BUILDS, [sample.key for sample in members], rejections, packed, store
+            )
 
         return Clips(spec, tasks, arrays, task_of)
 
@@ -257,13 +279,19 @@ def test_files_are_those_of_zarr_python(
     make_clips: Callable[..., Clips], store: DirectoryStore, tmp_path: Path, store_positions: bool
 ) -> None:
     made = make_clips(rejected=(2,), store_positions=store_positions)
-    packed = {file.path: store.read(file.sha256) for task in made.pack_tasks for file in pack(task, store).files}
+    packed = {
+        file.path: store.read(file.sha256)
+        for task in made.pack_tasks
+        for file in pack(task, store).files
+    }
     group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
     for array in layout(made.spec):
         if array.is_label:  # written by the task that publishes
             continue
         with zarr.config.set({"array.write_empty_chunks": not array.per_sample}):
-            create_array(group, array, sample_count=6, samples_per_file=4)[:] = made.arrays[array.name]  # type: ignore[index]
+            create_array(group, array, sample_count=6, samples_per_file=4)[:] = made.arrays[
+                array.name
+            ]  # type: ignore[index]
     written = {
         path.relative_to(tmp_path / "zarr").as_posix(): path.read_bytes()
         for path in (tmp_path / "zarr").rglob("*")
@@ -274,14 +302,19 @@ def test_files_are_those_of_zarr_python(
     assert [path for path in packed if packed[path] != written[path]] == []
 
 
-def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], store: DirectoryStore) -> None:
+def test_three_readers_give_back_what_went_in(
+    make_clips: Callable[..., Clips], store: DirectoryStore
+) -> None:
     made = make_clips(rejected=(3,))
     publish(made.publish_task([pack(task, store) for task in made.pack_tasks]), store)
     directory = store.dataset_path(made.spec.dataset_id, 1)
     group = zarr.open_group(directory, mode="r")
     with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
         for name, expected in made.arrays.items():
-            spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{directory / name}/"}}
+            spec = {
+                "driver": "zarr3",
+                "kvstore": {"driver": "file", "path": f"{directory / name}/"},
+            }
             third = tensorstore.open(spec, read=True).result().read().result()
             for got in (group[name][...], dataset[name].values, third):
                 assert got.dtype == expected.dtype, name
@@ -296,7 +329,9 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
                 clips=5,
                 median=round(float(np.median(values)), 2),
                 worst=round(float(np.quantile(values, 0.01)), 2),
-                deviation=round(float(np.median(made.arrays["psnr_deviation"][made.arrays["valid"], number])), 2),
+                deviation=round(
+                    float(np.median(made.arrays["psnr_deviation"][made.arrays["valid"], number])), 2
+                ),
             )
             for number, region in enumerate(REGIONS)
             if (values := made.arrays[f"psnr_{region}"][made.arrays["valid"]]).size
@@ -308,7 +343,11 @@ def test_three_readers_give_back_what_went_in(make_clips: Callable[..., Clips], 
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")
-    assert [camera.name for camera in manifest.cameras] == group["viewpoint"].attrs["categories"] == list(VIEWPOINTS)
+    assert (
+        [camera.name for camera in manifest.cameras]
+        == group["viewpoint"].attrs["categories"]
+        == list(VIEWPOINTS)
+    )
 
 
 def test_a_trajectory_is_encoded_once_for_all_its_renders(
@@ -326,10 +365,15 @@ def test_a_trajectory_is_encoded_once_for_all_its_renders(
     assert len(encoded) == 3
 
 
-def test_a_mesh_of_another_size_is_refused(make_clips: Callable[..., Clips], store: DirectoryStore) -> None:
+def test_a_mesh_of_another_size_is_refused(
+    make_clips: Callable[..., Clips], store: DirectoryStore
+) -> None:
     (task, *_) = make_clips().pack_tasks
     other = ClothDragSpec.model_validate(task.spec.model_dump() | {"mesh": 7})
-    with pytest.raises(ValueError, match=r"must be float32 of shape \(n, \*\(300, 49, 3\)\) with n > 0; got float32"):
+    with pytest.raises(
+        ValueError,
+        match=r"must be float32 of shape \(n, \*\(300, 49, 3\)\) with n > 0; got float32",
+    ):
         pack(task.model_copy(update={"spec": other}), store)
 
 

@@ -23,7 +23,10 @@ from stickslip_workers.lease_client import CoordinatorError
 from stickslip_workers.ray_calls import StartError
 from stickslip_workers.settings import Settings
 
-pytestmark = [pytest.mark.real, pytest.mark.filterwarnings("ignore::ResourceWarning")]  # Ray leaves its log files open
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]  # Ray leaves its log files open
 
 
 class Running:
@@ -44,7 +47,9 @@ class Running:
     def stop(self) -> None:
         self.dispatcher.stop()
         self.join()
-        for one in self.dispatcher._calls or ():  # another driver would end, and with it what it runs
+        for one in (
+            self.dispatcher._calls or ()
+        ):  # another driver would end, and with it what it runs
             ray.cancel(one.reference, force=True)
 
     def join(self) -> None:
@@ -97,14 +102,23 @@ def _render(what: int) -> RenderTask:
 
 def _simulate(count: int) -> dict[str, SimulateTask]:
     return {
-        f"rod-{i}": SimulateTask(simulation=RodHangSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5))
+        f"rod-{i}": SimulateTask(
+            simulation=RodHangSimulation(gamma=1.0 + i, phi0=2.0, phi1=5.0, poisson=0.5)
+        )
         for i in range(count)
     }
 
 
 def _cloth() -> SimulateTask:
     cloth = ClothDragSimulation(
-        material="gray-interlock", fabric=None, mu=0.3, preset="fast", mesh=21, frames=300, seed=1, self_friction=None
+        material="gray-interlock",
+        fabric=None,
+        mu=0.3,
+        preset="fast",
+        mesh=21,
+        frames=300,
+        seed=1,
+        self_friction=None,
     )
     return SimulateTask(simulation=cloth)
 
@@ -124,16 +138,24 @@ def test_runs_what_it_is_given_and_says_who_it_is(
 ) -> None:
     made = make_dataset(count=5, per_shard=4)
     start()
-    double.offer(**_simulate(700), picture=_render(fake_renderer.FINE), shard=made.pack_tasks[0], all=made.publish_task)
+    double.offer(
+        **_simulate(700),
+        picture=_render(fake_renderer.FINE),
+        shard=made.pack_tasks[0],
+        all=made.publish_task,
+    )
     double.until(lambda: len(double.results) == 703)
     assert {result.outcome for result in double.results.values()} == {"succeeded"}
-    # The first calls are given little, to learn how long a rod takes; then 512 go together. Each makes one artifact.
+    # The first calls are given little, to learn how long a rod takes; then 512 go together. Each
+    # makes one artifact.
     assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) <= 10
     assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
     starting, registration = double.registrations
     assert (starting.builds, starting.condition.state) == ({}, "starting")
     assert starting.condition.reason.startswith("waiting for Ray: ")
-    assert {name: builds.render for name, builds in registration.builds.items()} == {"rod_hang": fake_renderer.BUILD}
+    assert {name: builds.render for name, builds in registration.builds.items()} == {
+        "rod_hang": fake_renderer.BUILD
+    }
     assert double.condition.state == "ready"
     assert double.condition.slots == 2
     assert registration.versions["fake"] == "1"
@@ -141,7 +163,9 @@ def test_runs_what_it_is_given_and_says_who_it_is(
 
 def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -> None:
     start()
-    double.offer(full=_render(fake_renderer.DISK_FULL), bug=_render(fake_renderer.BUG), fine=_render(0))
+    double.offer(
+        full=_render(fake_renderer.DISK_FULL), bug=_render(fake_renderer.BUG), fine=_render(0)
+    )
     double.until(lambda: len(double.results) == 3)
     assert double.results["full"].reason is Reason.store_unavailable
     assert "No space left on device" in double.results["full"].message
@@ -176,21 +200,32 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     others = {f"fine-{i}": _render(fake_renderer.FINE) for i in range(3)}
     double.offer(**others, crash=_render(HANG), bug=_render(fake_renderer.BUG))
     together = _wait_for_pid(double, store, HANG)
-    assert set(double.results) == {"first"}  # those before it in the call have no answer of their own
+    assert set(double.results) == {
+        "first"
+    }  # those before it in the call have no answer of their own
     (store.root / f"pid-{HANG}").unlink()
     os.kill(together, signal.SIGKILL)
     alone = _wait_for_pid(double, store, HANG)
     assert alone != together
     os.kill(alone, signal.SIGKILL)
     double.until(lambda: len(double.results) == 6)
-    assert {name: result.reason for name, result in double.results.items() if result.outcome == "failed"} == {
+    assert {
+        name: result.reason for name, result in double.results.items() if result.outcome == "failed"
+    } == {
         "crash": Reason.renderer_crash,
         "bug": Reason.internal_error,
     }
 
 
-def test_what_takes_too_long_is_killed(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
-    start(exec_seconds={**Settings(urls=(), store=store.place, name="x").exec_seconds, Stage.render: 0.5})
+def test_what_takes_too_long_is_killed(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
+    start(
+        exec_seconds={
+            **Settings(urls=(), store=store.place, name="x").exec_seconds,
+            Stage.render: 0.5,
+        }
+    )
     double.offer(slow=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
     double.until(lambda: "slow" in double.results)
@@ -220,7 +255,9 @@ def _is_gone(pid: int) -> bool:
         return True
 
 
-def test_short_tasks_go_on_beside_long_ones(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+def test_short_tasks_go_on_beside_long_ones(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     """Two long tasks hold both CPUs; what is short runs at once."""
     start(clog_seconds=1.0)
     double.long |= {f"long-{i}" for i in range(6)}
@@ -244,7 +281,9 @@ def test_a_simulation_tells_how_far_it_is(start: Start, double: CoordinatorDoubl
     assert 0 < done <= frames == 300
 
 
-def test_heartbeats_say_what_has_been_started(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+def test_heartbeats_say_what_has_been_started(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start()
     double.offer(**{f"render-{i}": _render(HANG + i) for i in range(9)})
     double.until(lambda: len(double.started) == 2)
@@ -294,7 +333,9 @@ def test_results_wait_for_a_coordinator_that_is_away(
     assert Path(f"/proc/{pid}").exists()  # no process was lost over it
 
 
-def test_a_forgotten_session_is_opened_again(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+def test_a_forgotten_session_is_opened_again(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     start(max_cpus=1)
     double.offer(lost=_render(HANG))
     pid = _wait_for_pid(double, store, HANG)
@@ -325,7 +366,9 @@ def test_a_superseded_dispatcher_goes(start: Start, double: CoordinatorDouble) -
     assert "409" in str(running.error)
 
 
-def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+def test_stopping_gives_back_what_is_not_done(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     running = start(max_cpus=1)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     _wait_for_pid(double, store, HANG)
@@ -336,7 +379,9 @@ def test_stopping_gives_back_what_is_not_done(start: Start, double: CoordinatorD
     assert double.results == {}
 
 
-def test_stopping_waits_for_what_is_nearly_done(start: Start, double: CoordinatorDouble, store: DirectoryStore) -> None:
+def test_stopping_waits_for_what_is_nearly_done(
+    start: Start, double: CoordinatorDouble, store: DirectoryStore
+) -> None:
     running = start(max_cpus=1, stop_seconds=20)
     double.offer(running=_render(HANG), waiting=_render(HANG + 1))
     double.until(lambda: "running" in double.started and "waiting" in double.leased)

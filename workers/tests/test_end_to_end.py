@@ -21,7 +21,9 @@ pytest.importorskip("stickslip_services")
 pytestmark = [
     pytest.mark.real,
     pytest.mark.slow,  # tests/test_chaos.py ends dispatchers of a whole service, too
-    pytest.mark.skipif(not default_blender_python().exists(), reason="there is no Blender environment"),
+    pytest.mark.skipif(
+        not default_blender_python().exists(), reason="there is no Blender environment"
+    ),
 ]
 
 T = TypeVar("T")
@@ -81,7 +83,11 @@ class Services:
     def submit(self, count: int) -> str:
         spec = {
             "kind": "rod_hang",
-            "axes": {"gamma": {"type": "linspace", "start": 100.0, "stop": 900.0, "num": count}, "phi0": 2, "phi1": 8},
+            "axes": {
+                "gamma": {"type": "linspace", "start": 100.0, "stop": 900.0, "num": count},
+                "phi0": 2,
+                "phi1": 8,
+            },
             "samples_per_shard": 8,
             "quality": "draft",
         }
@@ -124,8 +130,14 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
     job = services.submit(24)
 
     def some_rendered() -> bool | None:
-        stages = services.job(job)["progress"]["stages"]  # empty before the dispatcher says what it makes
-        return True if 1 < stages.get("render", {"counts": {}})["counts"].get("succeeded", 0) < 24 else None
+        stages = services.job(job)["progress"][
+            "stages"
+        ]  # empty before the dispatcher says what it makes
+        return (
+            True
+            if 1 < stages.get("render", {"counts": {}})["counts"].get("succeeded", 0) < 24
+            else None
+        )
 
     _wait_for("some renders", some_rendered)
     assert _processes()
@@ -133,9 +145,13 @@ def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> 
     first.wait()
 
     second = services.dispatch("second")
-    done = _wait_for("the end of the job", lambda: (now := services.job(job))["finished_at"] and now)
+    done = _wait_for(
+        "the end of the job", lambda: (now := services.job(job))["finished_at"] and now
+    )
     assert done["state"] == "succeeded"
-    version = services.store / "datasets" / done["dataset"]["dataset"] / f"v{done['dataset']['version']}"
+    version = (
+        services.store / "datasets" / done["dataset"]["dataset"] / f"v{done['dataset']['version']}"
+    )
     group = zarr.open_group(version, mode="r")
     assert group["valid"][...].all()
     assert (group["views"][...].reshape(24, -1).max(axis=1) > 0).all()

@@ -52,7 +52,9 @@ class SlowCoordinator:
 
 def test_a_heartbeat_in_progress_ends_before_its_connection_is_closed() -> None:
     coordinator = SlowCoordinator()
-    registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
+    registration = WorkerRegistration(
+        name="test", builds={}, versions={}, condition=WorkerCondition(slots=0)
+    )
     session = Session(cast(Any, coordinator), lambda: registration)
     session.start()
     assert coordinator.asked.wait(timeout=60)
@@ -67,7 +69,9 @@ def test_what_the_coordinator_refuses_ends_the_session() -> None:
         def register(self, _: WorkerRegistration) -> WorkerSession:
             raise CoordinatorError("wrong key")
 
-    registration = WorkerRegistration(name="test", builds={}, versions={}, condition=WorkerCondition(slots=0))
+    registration = WorkerRegistration(
+        name="test", builds={}, versions={}, condition=WorkerCondition(slots=0)
+    )
     session = Session(cast(Any, Refusing()), lambda: registration)
     session.start()
     session.join(timeout=60)
@@ -107,7 +111,10 @@ def test_started_is_said_and_a_reported_lease_forgotten() -> None:
 
 
 def test_a_result_goes_with_its_lease() -> None:
-    book, result = LeaseBook(), TaskResult(outcome="failed", reason=Reason.internal_error, message="")
+    book, result = (
+        LeaseBook(),
+        TaskResult(outcome="failed", reason=Reason.internal_error, message=""),
+    )
     book.add([_lease(1)])
     book.settle(_lease(7), result)  # not held
     assert book.reports() == ()

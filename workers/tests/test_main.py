@@ -1,4 +1,7 @@
-"""A dispatcher on somebody else's cluster starts again when it dies; one that asks a cluster notices its end."""
+"""A dispatcher on somebody else's cluster starts again when it dies.
+
+One that asks a cluster notices its end.
+"""
 
 import os
 import signal
@@ -32,7 +35,10 @@ def run(tmp_path: Path, end: str) -> "subprocess.Popen[bytes]":
 
 def test_it_starts_again_until_it_ends_well(tmp_path: Path) -> None:
     # First as if it had failed, then as if something had killed it, then well.
-    process = run(tmp_path, "[lambda: sys.exit(1), lambda: os.kill(os.getpid(), 9), lambda: sys.exit(0)][number]()")
+    process = run(
+        tmp_path,
+        "[lambda: sys.exit(1), lambda: os.kill(os.getpid(), 9), lambda: sys.exit(0)][number]()",
+    )
     assert process.wait(60) == 0
     assert len((tmp_path / "pids").read_text().split()) == 3
 

@@ -18,10 +18,14 @@ from stickslip_workers.stages.run import run_tasks
 
 
 @pytest.mark.parametrize("views", [True, False])
-def test_files_are_those_of_zarr_python(make_dataset: Callable[..., Any], tmp_path: Path, views: bool) -> None:
+def test_files_are_those_of_zarr_python(
+    make_dataset: Callable[..., Any], tmp_path: Path, views: bool
+) -> None:
     made = make_dataset(count=7, per_shard=4, rejected=(2,), views=views)
     packed = {
-        file.path: made.store.read(file.sha256) for task in made.pack_tasks for file in pack(task, made.store).files
+        file.path: made.store.read(file.sha256)
+        for task in made.pack_tasks
+        for file in pack(task, made.store).files
     }
     group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
     for array in layout(made.spec):
@@ -42,7 +46,9 @@ def test_files_are_those_of_zarr_python(make_dataset: Callable[..., Any], tmp_pa
 
 def test_packing_again_gives_the_same_files(make_dataset: Callable[..., Any]) -> None:
     made = make_dataset()
-    assert [pack(task, made.store) for task in made.pack_tasks] == [pack(task, made.store) for task in made.pack_tasks]
+    assert [pack(task, made.store) for task in made.pack_tasks] == [
+        pack(task, made.store) for task in made.pack_tasks
+    ]
 
 
 def test_a_rejected_slot_keeps_its_labels(make_dataset: Callable[..., Any]) -> None:
@@ -72,7 +78,9 @@ def _with_first_slot(task: PackTask, **changes: Any) -> PackTask:
     return task.model_copy(update={"slots": (first.model_copy(update=changes), *others)})
 
 
-def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
+def test_a_corrupt_chunk_is_refused(
+    make_dataset: Callable[..., Any], store: DirectoryStore
+) -> None:
     (task, *_) = make_dataset().pack_tasks
     where = task.slots[0].chunks["views"]
     chunk = bytearray(store.read(where.digest, offset=where.offset, length=where.length))
@@ -83,7 +91,9 @@ def test_a_corrupt_chunk_is_refused(make_dataset: Callable[..., Any], store: Dir
         pack(_with_first_slot(task, chunks={"views": bad}), store)
 
 
-def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
+def test_a_record_that_was_damaged_on_disk_is_refused(
+    make_dataset: Callable[..., Any], store: DirectoryStore
+) -> None:
     (task, *_) = make_dataset().pack_tasks
     path = store.path(task.slots[0].record.digest)
     data = bytearray(path.read_bytes())
@@ -93,7 +103,9 @@ def test_a_record_that_was_damaged_on_disk_is_refused(make_dataset: Callable[...
         pack(task, store)
 
 
-def test_a_missing_artifact_is_refused(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
+def test_a_missing_artifact_is_refused(
+    make_dataset: Callable[..., Any], store: DirectoryStore
+) -> None:
     (task, *_) = make_dataset().pack_tasks
     store.path(task.slots[0].chunks["views"].digest).unlink()
     with pytest.raises(FileNotFoundError):
@@ -108,12 +120,17 @@ def test_what_is_wrong_is_named(make_dataset: Callable[..., Any], store: Directo
     with pytest.raises(ValueError, match="chunks of slot 0 must have 'views'"):
         pack(_with_first_slot(task, chunks={}), store)
     with pytest.raises(ValueError, match="labels of slot 0 must have 'energy'"):
-        pack(_with_first_slot(task, labels={"gamma": 1, "phi0": 1, "phi1": 1, "color": [0] * 3}), store)
+        pack(
+            _with_first_slot(task, labels={"gamma": 1, "phi0": 1, "phi1": 1, "color": [0] * 3}),
+            store,
+        )
     with pytest.raises(ValueError, match="with n > 99; got float32"):
         pack(_with_first_slot(task, record=slot.record.model_copy(update={"row": 99})), store)
 
 
-def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
+def test_a_failed_task_names_all_its_damaged_inputs(
+    make_dataset: Callable[..., Any], store: DirectoryStore
+) -> None:
     task = make_dataset().pack_tasks[1]
     (whole,) = run_tasks([task], store)
     assert whole.outcome == "succeeded"
@@ -125,7 +142,9 @@ def test_a_failed_task_names_all_its_damaged_inputs(make_dataset: Callable[..., 
     assert set(result.damaged_inputs) == set(chunks[:2])
 
 
-def test_publishing_a_rotten_shard_names_it(make_dataset: Callable[..., Any], store: DirectoryStore) -> None:
+def test_publishing_a_rotten_shard_names_it(
+    make_dataset: Callable[..., Any], store: DirectoryStore
+) -> None:
     made = make_dataset()
     task = made.publish_task
     rotten = made.files[3].sha256

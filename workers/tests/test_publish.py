@@ -23,7 +23,9 @@ Make = Callable[..., Any]
 
 def _tree(directory: Path) -> dict[str, bytes]:
     return {
-        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
+        path.relative_to(directory).as_posix(): path.read_bytes()
+        for path in directory.rglob("*")
+        if path.is_file()
     }
 
 
@@ -52,13 +54,18 @@ def test_three_readers_give_back_what_went_in(make_dataset: Make, shape: dict[st
         for name, expected in made.arrays.items():
             _assert_same(group[name][...], expected, name)
             _assert_same(dataset[name].values, expected, name)
-            spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{directory / name}/"}}
+            spec = {
+                "driver": "zarr3",
+                "kvstore": {"driver": "file", "path": f"{directory / name}/"},
+            }
             _assert_same(tensorstore.open(spec, read=True).result().read().result(), expected, name)
     assert dataset["frame"].dims == ("sample", "point", "xyz", "director")
     assert group["split"].attrs["categories"] == ["train", "validation", "test"]
 
 
-def test_a_version_of_many_samples_has_sections(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_version_of_many_samples_has_sections(
+    make_dataset: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same version with and without sections: other lists, and the same files."""
     made = make_dataset(count=7, per_shard=2, rejected=(2, 5))
     whole = _tree(made.publish())
@@ -86,7 +93,9 @@ def test_a_version_of_many_samples_has_sections(make_dataset: Make, monkeypatch:
         assert found is not None
         assert found.sha256 == sha256(tree[path])
     assert contents.file("views/c/4/0/0/0/0") is None
-    assert not {path for path in listed if path.startswith("views/c")} & {file.path for file in manifest.files}
+    assert not {path for path in listed if path.startswith("views/c")} & {
+        file.path for file in manifest.files
+    }
 
 
 def test_labels_have_large_chunks(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +116,9 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     tree = _tree(directory)
     manifest = Manifest.model_validate_json(tree.pop("manifest.json"))
     digest = check_seal(
-        directory.joinpath("manifest.json").read_bytes(), tree.pop("zarr.json"), tree["manifest.sha256"]
+        directory.joinpath("manifest.json").read_bytes(),
+        tree.pop("zarr.json"),
+        tree["manifest.sha256"],
     )
     assert tree.pop("manifest.sha256").startswith(f"{digest}  manifest.json\n".encode())
     assert {file.path: (file.sha256, file.size) for file in manifest.files} == {
@@ -130,7 +141,9 @@ def test_what_is_not_rendered_has_no_picture(make_dataset: Make) -> None:
     assert Manifest.model_validate_json((directory / "manifest.json").read_bytes()).pictures is None
 
 
-def test_publishing_again_and_after_a_crash_gives_the_same(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publishing_again_and_after_a_crash_gives_the_same(
+    make_dataset: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = make_dataset()
     task = made.publish_task
     directory = made.store.dataset_path(task.dataset, 1)
@@ -170,7 +183,9 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
         publish(changed(task, made.store, labels=(made.packed[0].labels,)), made.store)
     with pytest.raises(ValueError, match="rejections must be the slots that are not valid"):
         publish(changed(task, made.store, rejections=()), made.store)
-    with pytest.raises(ValueError, match=r"sections must have the samples 0 to 6, and they end at \[0, 6\]"):
+    with pytest.raises(
+        ValueError, match=r"sections must have the samples 0 to 6, and they end at \[0, 6\]"
+    ):
         publish(changed(task, made.store, sample_keys=made.sample_keys[:6]), made.store)
     with pytest.raises(ValueError, match="dataset must be the id of its spec"):
         publish(task.model_copy(update={"dataset": "../elsewhere"}), made.store)
@@ -183,12 +198,16 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
     assert not made.store.dataset_path(task.dataset, 1).exists()
 
 
-def test_a_version_has_a_card_that_is_true(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_version_has_a_card_that_is_true(
+    make_dataset: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = make_dataset()
     directory = made.publish()
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
     text = (directory / "README.md").read_text()
-    assert sha256(text.encode()) in {file.sha256 for file in manifest.files if file.path == "README.md"}
+    assert sha256(text.encode()) in {
+        file.sha256 for file in manifest.files if file.path == "README.md"
+    }
     for name, array in zarr.open_group(directory, mode="r").arrays():
         assert f"| `{name}` |" in text
         assert str(array.attrs["description"]) in text

@@ -1,11 +1,20 @@
-"""Results: each failure has its reason; renders of one shading are merged, and their result is split."""
+"""Results: each failure has its reason.
+
+Renders of one shading are merged, and their result is split.
+"""
 
 import errno
 
 import pytest
 from ray import exceptions as ray_errors
 from stickslip_schemas.base import Reason
-from stickslip_schemas.documents.tasks import ChunkRef, RecordRef, RenderOutput, RenderTask, TaskResult
+from stickslip_schemas.documents.tasks import (
+    ChunkRef,
+    RecordRef,
+    RenderOutput,
+    RenderTask,
+    TaskResult,
+)
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.kinds.rod_hang import RodHangRender
@@ -45,8 +54,16 @@ def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
         (ray_errors.NodeDiedError("the node is gone"), True, Reason.worker_lost),
         (RuntimeError("node a is gone"), True, Reason.worker_lost),
         (ray_errors.OutOfMemoryError("low on memory"), True, Reason.oom_killed),
-        (ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")), True, Reason.store_unavailable),
-        (ray_errors.RayTaskError("render", "traceback", "not an exception"), True, Reason.internal_error),
+        (
+            ray_errors.RayTaskError("render", "traceback", OSError(errno.ENOSPC, "full")),
+            True,
+            Reason.store_unavailable,
+        ),
+        (
+            ray_errors.RayTaskError("render", "traceback", "not an exception"),
+            True,
+            Reason.internal_error,
+        ),
     ],
 )
 def test_what_ray_raises(error: Exception, renders: bool, reason: Reason) -> None:
@@ -54,10 +71,14 @@ def test_what_ray_raises(error: Exception, renders: bool, reason: Reason) -> Non
 
 
 def done(number: int) -> TaskResult:
-    return TaskResult(outcome="succeeded", output=RenderOutput(chunks={"video": chunk(number)}, labels={}))
+    return TaskResult(
+        outcome="succeeded", output=RenderOutput(chunks={"video": chunk(number)}, labels={})
+    )
 
 
-def clip(texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object) -> RenderTask:
+def clip(
+    texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object
+) -> RenderTask:
     shown = {
         "rig": "drag",
         "rig_digest": "0" * 64,
@@ -77,7 +98,11 @@ def chunk(number: int) -> ChunkRef:
 def test_only_the_texture_may_differ() -> None:
     same = shading_key(clip("dots"))
     assert shading_key(clip("plaid", preview=True)) == same
-    others = [clip("dots", light_seed=2), clip("dots", viewpoint="right"), clip("dots", creases=0.5)]
+    others = [
+        clip("dots", light_seed=2),
+        clip("dots", viewpoint="right"),
+        clip("dots", creases=0.5),
+    ]
     others.append(clip("dots", ground_truth=("depth",)))
     others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
     assert same not in {shading_key(task) for task in others}
@@ -100,18 +125,29 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
     depth = {"depth": chunk(9)}
     made = [
-        RenderOutput(chunks={"video": chunk(number), **depth}, preview="e" * 64, labels={"psnr_cloth": 40.0 + number})
+        RenderOutput(
+            chunks={"video": chunk(number), **depth},
+            preview="e" * 64,
+            labels={"psnr_cloth": 40.0 + number},
+        )
         for number in range(2)
     ]
     poor = TaskResult(outcome="rejected", reason=Reason.poor_pictures, message="psnr_edge")
     all_three = [*(TaskResult(outcome="succeeded", output=one) for one in made), poor]
-    output = RenderOutput(chunks={}, labels={}, clips=dict(zip(asked.textures, all_three, strict=True)))
+    output = RenderOutput(
+        chunks={}, labels={}, clips=dict(zip(asked.textures, all_three, strict=True))
+    )
     results = split_render_result(
         tasks, TaskResult(outcome="succeeded", output=output, cpu_seconds=6.0, wall_seconds=3.0)
     )
-    assert [result.output.chunks for result in results[:2]] == [{"video": chunk(n), **depth} for n in range(2)]
+    assert [result.output.chunks for result in results[:2]] == [
+        {"video": chunk(n), **depth} for n in range(2)
+    ]
     assert [result.output.preview for result in results[:2]] == [None, "e" * 64]
-    assert [result.output.labels for result in results[:2]] == [{"psnr_cloth": 40.0}, {"psnr_cloth": 41.0}]
+    assert [result.output.labels for result in results[:2]] == [
+        {"psnr_cloth": 40.0},
+        {"psnr_cloth": 41.0},
+    ]
     assert (results[2].outcome, results[2].reason) == ("rejected", Reason.poor_pictures)
     assert [(result.cpu_seconds, result.wall_seconds) for result in results] == [(2.0, 1.0)] * 3
 
@@ -119,17 +155,26 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
 def test_textures_of_the_users_own_go_by_their_pictures() -> None:
     """Two jobs may give one name to two pictures, and one picture may have two names."""
     one, other = (f"sha256:{digit * 64}" for digit in "12")
-    tasks = [clip("dots"), clip("logo", image=one), clip("logo", image=other), clip("brand", image=one)]
+    tasks = [
+        clip("dots"),
+        clip("logo", image=one),
+        clip("logo", image=other),
+        clip("brand", image=one),
+    ]
     asked = merge_renders(tasks)
     assert asked.textures == ("dots", one, other)
-    output = RenderOutput(chunks={}, labels={}, clips={name: done(n) for n, name in enumerate(asked.textures)})
+    output = RenderOutput(
+        chunks={}, labels={}, clips={name: done(n) for n, name in enumerate(asked.textures)}
+    )
     results = split_render_result(tasks, TaskResult(outcome="succeeded", output=output))
     assert [result.output.chunks["video"] for result in results] == [chunk(n) for n in (0, 1, 2, 1)]
 
 
 def test_what_is_wrong_with_a_shading_is_wrong_with_all_its_clips() -> None:
     tasks = [clip("dots"), clip("plaid")]
-    out = TaskResult(outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0)
+    out = TaskResult(
+        outcome="rejected", reason=Reason.out_of_frame, message="left", cpu_seconds=2.0
+    )
     assert [(result.reason, result.cpu_seconds) for result in split_render_result(tasks, out)] == [
         (Reason.out_of_frame, 1.0)
     ] * 2

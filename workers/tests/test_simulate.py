@@ -18,7 +18,9 @@ from stickslip_workers.stages.run import run_tasks
 def _rods(count: int) -> list[SimulateTask]:
     gammas = np.linspace(1, 300, count)
     return [
-        SimulateTask(simulation=RodHangSimulation(gamma=float(gamma), phi0=2.0, phi1=8.0, poisson=0.5))
+        SimulateTask(
+            simulation=RodHangSimulation(gamma=float(gamma), phi0=2.0, phi1=8.0, poisson=0.5)
+        )
         for gamma in gammas
     ]
 
@@ -47,13 +49,18 @@ def test_a_batch_is_one_artifact_and_the_same_again(store: DirectoryStore) -> No
 
 
 def test_labels_say_what_a_rod_looks_like(store: DirectoryStore) -> None:
-    both_hands = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5))
-    one_hand = SimulateTask(simulation=RodHangSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5))
+    both_hands = SimulateTask(
+        simulation=RodHangSimulation(gamma=600.0, phi0=0.3, phi1=15.0, poisson=0.5)
+    )
+    one_hand = SimulateTask(
+        simulation=RodHangSimulation(gamma=600.0, phi0=10.0, phi1=15.0, poisson=0.5)
+    )
     coil = SimulateTask(simulation=RodHangSimulation(gamma=0.0, phi0=2.0, phi1=30.0, poisson=0.5))
     labels = [_curves(store, result) for result in run_tasks([both_hands, one_hand, coil], store)]
     assert [bool(rod["multistable"]) for rod in labels] == [True, False, False]
     assert [np.isinf(rod["self_contact_distance"]) for rod in labels] == [True, True, False]
-    # A helix of curvature 30 and torsion 2: its pitch is 2 pi 2 / (4 + 900), the next turn a little nearer.
+    # A helix of curvature 30 and torsion 2: its pitch is 2 pi 2 / (4 + 900), the next turn a little
+    # nearer.
     assert labels[2]["self_contact_distance"] == pytest.approx(4 * np.pi / 904, rel=0.01)
     for rod in labels:
         assert rod["reach"] == pytest.approx(np.hypot(*rod["centerline"][:, :2].T).max(), rel=1e-6)
@@ -71,7 +78,9 @@ def test_a_rod_does_not_depend_on_its_batch(store: DirectoryStore) -> None:
         assert all(np.array_equal(one[name], many[name]) for name in one)
 
 
-def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rod_without_a_stable_shape_is_rejected(
+    store: DirectoryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     solve = rod_hang.solve_rods
 
     def fail_some(*args: Any, **kwargs: Any) -> Any:
@@ -82,14 +91,21 @@ def test_a_rod_without_a_stable_shape_is_rejected(store: DirectoryStore, monkeyp
 
     monkeypatch.setattr(rod_hang, "solve_rods", fail_some)
     results = run_tasks(_rods(4), store)
-    assert [result.outcome for result in results] == ["succeeded", "rejected", "rejected", "succeeded"]
+    assert [result.outcome for result in results] == [
+        "succeeded",
+        "rejected",
+        "rejected",
+        "succeeded",
+    ]
     assert {result.reason for result in results[1:3]} == {Reason.solver_diverged}
     assert results[1].message.startswith("the solver did not converge at gamma = 100.667, phi0 = 2")
     assert results[2].message.startswith("no stable equilibrium was found")
     assert [results[0].output.record.row, results[3].output.record.row] == [0, 1]
 
 
-def test_all_rejected_makes_no_artifact(store: DirectoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_rejected_makes_no_artifact(
+    store: DirectoryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     solve = rod_hang.solve_rods
 
     def fail(*args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,6 @@
-"""The base of all documents: strict numbers, content keys, states and reasons, and units of numbers."""
+"""The base of all documents: strict numbers, content keys, states and reasons, and units of
+numbers.
+"""
 
 import hashlib
 import json
@@ -18,7 +20,9 @@ def _whole(value: Any) -> Any:
 
 
 WHOLE = BeforeValidator(_whole)
-"""For integers with bounds of their own: stands after them, or the bounds are not in the JSON schema."""
+"""For integers with bounds of their own: stands after them, or the bounds are not in the JSON
+schema.
+"""
 Int = Annotated[int, Strict(), WHOLE]
 """A whole number: not the text "1", not true."""
 Float = Annotated[float, Strict()]
@@ -35,11 +39,14 @@ class Document(BaseModel):
 
 KEY_PATTERN = r"^[0-9a-f]{64}$"
 
-Sha256 = Annotated[str, Field(pattern=KEY_PATTERN, description="SHA-256, 64 lower-case hexadecimal digits")]
+Sha256 = Annotated[
+    str, Field(pattern=KEY_PATTERN, description="SHA-256, 64 lower-case hexadecimal digits")
+]
 
 
 def canonical_json(value: Any) -> str:
-    """Return the one JSON text of `value`: sorted keys, no spaces, shortest round-trip floats, -0.0 as 0.0.
+    """Return the one JSON text of `value`: sorted keys, no spaces, shortest round-trip floats, -0.0
+    as 0.0.
 
     NaN and infinities raise ValueError, for they have no JSON form.
     """
@@ -47,17 +54,23 @@ def canonical_json(value: Any) -> str:
 
 
 def content_key(purpose: str, value: Any) -> str:
-    """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share a key."""
+    """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share
+    a key.
+    """
     return sha256(keyed_text(purpose, canonical_json(value)).encode())
 
 
 def keyed_text(purpose: str, canonical: str) -> str:
-    """Return the text whose SHA-256 is the content key of a value with the canonical JSON `canonical`."""
+    """Return the text whose SHA-256 is the content key of a value with the canonical JSON
+    `canonical`.
+    """
     return f"stickslip/{purpose}\n{canonical}"
 
 
 def derived_seed(seed: int, purpose: str, value: Any) -> int:
-    """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position in a grid."""
+    """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position
+    in a grid.
+    """
     return seed_of_key(content_key(f"seed/{purpose}", {"seed": seed, "for": value}))
 
 
@@ -79,7 +92,8 @@ ARTIFACT = "sha256:"
 """How a reference to an artifact begins, where a name might stand as well."""
 
 ArtifactRef = Annotated[
-    str, Field(pattern=r"^sha256:[0-9a-f]{64}$", description="`sha256:` and the SHA-256 of an artifact")
+    str,
+    Field(pattern=r"^sha256:[0-9a-f]{64}$", description="`sha256:` and the SHA-256 of an artifact"),
 ]
 
 
@@ -89,12 +103,18 @@ def referred(name: str) -> Sha256 | None:
 
 
 def placed(document: Any, place: Sequence[str | int], value: Any) -> Any:
-    """Return a copy of a JSON document with another value at a place; positions in lists may be texts."""
+    """Return a copy of a JSON document with another value at a place.
+
+    Positions in lists may be texts.
+    """
     if not place:
         return value
     step, *rest = place
     if isinstance(document, list):
-        return [placed(item, rest, value) if at == int(step) else item for at, item in enumerate(document)]
+        return [
+            placed(item, rest, value) if at == int(step) else item
+            for at, item in enumerate(document)
+        ]
     return {**document, step: placed(document[step], rest, value)}
 
 
@@ -111,7 +131,8 @@ def _normalised(value: Any) -> Any:
 class JobState(StrEnum):
     """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back.
 
-    A job of many samples is `planning` until all its tasks are written down; the first of them run meanwhile.
+    A job of many samples is `planning` until all its tasks are written down; the first of them run
+    meanwhile.
     """
 
     planning = "planning"
@@ -128,7 +149,12 @@ class JobState(StrEnum):
     @property
     def is_open(self) -> bool:
         """True until the job has ended."""
-        ended = (JobState.cancelled, JobState.succeeded, JobState.succeeded_with_rejects, JobState.failed)
+        ended = (
+            JobState.cancelled,
+            JobState.succeeded,
+            JobState.succeeded_with_rejects,
+            JobState.failed,
+        )
         return self not in ended
 
 
@@ -201,16 +227,27 @@ class Reason(StrEnum):
 
     @property
     def ends_a_process(self) -> bool:
-        """True where a task took its process with it; one that does so again and again is quarantined."""
+        """True where a task took its process with it.
+
+        One that does so again and again is quarantined.
+        """
         return self in _ENDING
 
     @property
     def is_deterministic(self) -> bool:
-        """True where a second try gives the same answer, so that the sample is rejected and not retried."""
+        """True where a second try gives the same answer, so that the sample is rejected and not
+        retried.
+        """
         return self not in _INFRASTRUCTURE | _OF_JOBS
 
 
-_ENDING = {Reason.exec_timeout, Reason.worker_lost, Reason.oom_killed, Reason.renderer_crash, Reason.process_crash}
+_ENDING = {
+    Reason.exec_timeout,
+    Reason.worker_lost,
+    Reason.oom_killed,
+    Reason.renderer_crash,
+    Reason.process_crash,
+}
 _INFRASTRUCTURE = {*_ENDING, Reason.storage_error, Reason.store_unavailable, Reason.internal_error}
 _OF_JOBS = {
     Reason.cancelled,
@@ -221,7 +258,14 @@ _OF_JOBS = {
 }
 
 
-_RULES = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_type", "finite_number")
+_RULES = (
+    "greater_than",
+    "greater_than_equal",
+    "less_than",
+    "less_than_equal",
+    "float_type",
+    "finite_number",
+)
 """Types of pydantic's errors that are about a number."""
 
 
@@ -231,7 +275,11 @@ def unit_of(item: ErrorDetails, of: Any) -> str:
     `of` is the type that the document was to be, a model or a union of models.
     """
     location = item["loc"]
-    names = [place for place, part in enumerate(location) if isinstance(part, str) and item["type"] in _RULES]
+    names = [
+        place
+        for place, part in enumerate(location)
+        if isinstance(part, str) and item["type"] in _RULES
+    ]
     for place in reversed(names):
         for model in models_at(of, location[:place]):
             if (field := model.model_fields.get(str(location[place]))) is not None:
@@ -265,7 +313,11 @@ def models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
         if fields:
             models = [found for field in fields for found in _models_in(field.annotation)]
         else:  # the place in a list, or the tag of a union
-            tagged = [m for m in models if any(part in literals(of.annotation) for of in m.model_fields.values())]
+            tagged = [
+                m
+                for m in models
+                if any(part in literals(of.annotation) for of in m.model_fields.values())
+            ]
             models = tagged or models
     return models
 
@@ -279,4 +331,6 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def literals(annotation: Any) -> list[str]:
-    return [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []
+    return (
+        [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []
+    )

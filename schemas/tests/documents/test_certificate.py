@@ -14,7 +14,13 @@ BUILDS = Builds(sim_core="a" * 64, simulate="a" * 64, render="b" * 64, pack="c" 
 
 
 def protocol(**changes: Any) -> dict[str, Any]:
-    curve = {"parameters": {}, "x": [1.0, 2.0], "measured": [1.0, None], "master": [1.0, None], "errors": [0.0, 0.0]}
+    curve = {
+        "parameters": {},
+        "x": [1.0, 2.0],
+        "measured": [1.0, None],
+        "master": [1.0, None],
+        "errors": [0.0, 0.0],
+    }
     return {
         "protocol": "stick-slip",
         "x": "strain",
@@ -73,17 +79,29 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
         document(protocols=[protocol(curves=off_by(0.02), error=0.02)]),
         "within their tolerances",
     ),
-    "passed with an infinite error": (document(protocols=[protocol(curves=off_by(None), error=None)]), "within"),
+    "passed with an infinite error": (
+        document(protocols=[protocol(curves=off_by(None), error=None)]),
+        "within",
+    ),
     "an error that is not that of the curves": (
         document(protocols=[protocol(curves=off_by(0.5))]),
         "largest of the curves' errors",
     ),
-    "passed without a measurement": (document(protocols=[protocol(curves=[], error=None)]), "within"),
+    "passed without a measurement": (
+        document(protocols=[protocol(curves=[], error=None)]),
+        "within",
+    ),
     "passed though it broke off": (document(protocols=[protocol(message="no")]), "within"),
     "a protocol twice": (document(protocols=[protocol(), protocol()]), "there once"),
-    "two builds": (document(protocols=[protocol(), protocol(protocol="cantilever", build_hash="e" * 64)]), "one build"),
+    "two builds": (
+        document(protocols=[protocol(), protocol(protocol="cantilever", build_hash="e" * 64)]),
+        "one build",
+    ),
     "no protocol": (document(protocols=[]), "at least 1 item"),
-    "curves of two lengths": (document(protocols=[protocol(curves=[off_by(0.0)[0] | {"x": []}])]), "one length"),
+    "curves of two lengths": (
+        document(protocols=[protocol(curves=[off_by(0.0)[0] | {"x": []}])]),
+        "one length",
+    ),
     "a digest that is none": (document(sim_core="latest"), "pattern"),
 }
 
@@ -98,7 +116,9 @@ def test_contradictions_are_refused(what: str) -> None:
 def test_allow_uncertified_changes_no_sample() -> None:
     axes = {"material": "gray-interlock", "mu": [0.1, 0.2], "texture": "dots", "viewpoint": "left"}
     strict, lenient = (
-        job_spec_adapter.validate_python({"kind": "cloth_drag", "axes": axes, "allow_uncertified": allowed})
+        job_spec_adapter.validate_python(
+            {"kind": "cloth_drag", "axes": axes, "allow_uncertified": allowed}
+        )
         for allowed in (False, True)
     )
     assert [s.key for s in samples(strict, BUILDS)] == [s.key for s in samples(lenient, BUILDS)]
@@ -107,6 +127,8 @@ def test_allow_uncertified_changes_no_sample() -> None:
 
 
 def test_a_certificate_makes_another_version_of_the_dataset() -> None:
-    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}})
+    spec = job_spec_adapter.validate_python(
+        {"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1, "phi1": 6}}
+    )
     assert publish_key(spec, ["a" * 64], BUILDS, "e" * 64) != publish_key(spec, ["a" * 64], BUILDS)
     assert spec.certified_preset == "rods"

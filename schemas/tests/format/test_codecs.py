@@ -3,18 +3,29 @@
 import numpy as np
 import pytest
 from numcodecs import blosc
-from stickslip_schemas.format.codecs import CorruptChunkError, axes_order, decode_sample, encode_sample
+from stickslip_schemas.format.codecs import (
+    CorruptChunkError,
+    axes_order,
+    decode_sample,
+    encode_sample,
+)
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 SHAPE = (6, 24, 20, 3)
-CLIP = ArrayLayout("video", "uint8", SHAPE, ("frame", "y", "x", "rgb"), "", per_sample=True, is_clip=True)
-TRAJECTORY = ArrayLayout("positions", "float32", SHAPE, ("t", "a", "b", "xyz"), "", is_trajectory=True)
+CLIP = ArrayLayout(
+    "video", "uint8", SHAPE, ("frame", "y", "x", "rgb"), "", per_sample=True, is_clip=True
+)
+TRAJECTORY = ArrayLayout(
+    "positions", "float32", SHAPE, ("t", "a", "b", "xyz"), "", is_trajectory=True
+)
 PLAIN = ArrayLayout("views", "uint8", SHAPE, ("view", "y", "x", "rgb"), "", per_sample=True)
 
 
 def moving() -> np.ndarray:
     """Return a noisy picture in six frames, in which a square moves."""
-    clip = np.repeat(np.random.default_rng(3).integers(0, 250, (1, *SHAPE[1:]), dtype=np.uint8), SHAPE[0], axis=0)
+    clip = np.repeat(
+        np.random.default_rng(3).integers(0, 250, (1, *SHAPE[1:]), dtype=np.uint8), SHAPE[0], axis=0
+    )
     for frame, picture in enumerate(clip):
         picture[4:9, frame : frame + 5] = 200
     return clip

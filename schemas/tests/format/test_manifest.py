@@ -35,7 +35,11 @@ REJECTED = (1, 4)
 def _spec(count: int = 5, per_shard: int = 2) -> JobSpec:
     axis = {"type": "linspace", "start": 1, "stop": 9, "num": count} if count > 1 else 1
     return job_spec_adapter.validate_python(
-        {"kind": "rod_hang", "axes": {"gamma": axis, "phi0": 1, "phi1": 6}, "samples_per_shard": per_shard}
+        {
+            "kind": "rod_hang",
+            "axes": {"gamma": axis, "phi0": 1, "phi1": 6},
+            "samples_per_shard": per_shard,
+        }
     )
 
 
@@ -45,7 +49,11 @@ def _entry(path: str, data: bytes) -> FileEntry:
 
 def _rejection(point: KeyedPoint) -> Rejection:
     return Rejection(
-        slot=point.slot, sample_key=point.key, reason=Reason.out_of_frame, message="left", labels=point.labels
+        slot=point.slot,
+        sample_key=point.key,
+        reason=Reason.out_of_frame,
+        message="left",
+        labels=point.labels,
     )
 
 
@@ -65,7 +73,9 @@ class Version:
             section = ManifestSection(
                 first=first,
                 sample_keys=tuple(point.key for point in members),
-                rejections=tuple(item for item in self.rejections if first <= item.slot < first + 2),
+                rejections=tuple(
+                    item for item in self.rejections if first <= item.slot < first + 2
+                ),
                 files=(self.shards[number],),
             )
             path = section_path(number)
@@ -111,12 +121,16 @@ def test_a_section_is_whole_shards() -> None:
 
 
 @pytest.mark.parametrize("sections", [True, False])
-def test_contents_are_the_same_with_and_without_sections(make: Callable[..., Version], sections: bool) -> None:
+def test_contents_are_the_same_with_and_without_sections(
+    make: Callable[..., Version], sections: bool
+) -> None:
     version = make(sections=sections)
     contents = version.contents()
     assert tuple(contents.sample_keys()) == tuple(point.key for point in version.points)
     assert tuple(contents.rejections()) == version.rejections
-    assert [item.labels for item in contents.rejections()] == [version.points[slot].labels for slot in REJECTED]
+    assert [item.labels for item in contents.rejections()] == [
+        version.points[slot].labels for slot in REJECTED
+    ]
     for shard in version.shards:
         assert contents.file(shard.path) == shard
     assert contents.file("zarr.txt") == _entry("zarr.txt", b"root")
@@ -136,7 +150,9 @@ def test_a_file_is_found_in_the_one_section_that_lists_it(make: Callable[..., Ve
     assert version.reads == ["manifest/2.json"]
 
 
-def test_a_manifest_names_all_its_sections_and_repeats_nothing(make: Callable[..., Version]) -> None:
+def test_a_manifest_names_all_its_sections_and_repeats_nothing(
+    make: Callable[..., Version],
+) -> None:
     version = make(sections=True)
     listed = version.document["sections"]
     for wrong in (listed[:2], listed[::-1], (*listed, listed[0])):

@@ -6,9 +6,13 @@ from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 
 ARRAYS = (
-    ArrayLayout("video", "uint8", (2, 8, 8, 3), ("frame", "y", "x", "rgb"), "clip", per_sample=True),
+    ArrayLayout(
+        "video", "uint8", (2, 8, 8, 3), ("frame", "y", "x", "rgb"), "clip", per_sample=True
+    ),
     ArrayLayout("mu", "float64", (), (), "friction"),
-    ArrayLayout("material", "int16", (), (), "fabric", categories=("royal-target", "camel-ponte-roma")),
+    ArrayLayout(
+        "material", "int16", (), (), "fabric", categories=("royal-target", "camel-ponte-roma")
+    ),
     ArrayLayout("composed", "bool", (), (), "from a trace"),
     ArrayLayout("light", "float32", (3,), ("of_light",), "lamp"),
     *COMMON_ARRAYS,

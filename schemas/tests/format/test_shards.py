@@ -15,7 +15,9 @@ from stickslip_schemas.format.codecs import (
 )
 from stickslip_schemas.spec.arrays import ArrayLayout
 
-TRAJECTORY = ArrayLayout("positions", "float32", (100, 500, 3), ("t", "vertex", "xyz"), "", is_trajectory=True)
+TRAJECTORY = ArrayLayout(
+    "positions", "float32", (100, 500, 3), ("t", "vertex", "xyz"), "", is_trajectory=True
+)
 
 
 def test_chunk_round_trip() -> None:
@@ -41,7 +43,9 @@ def test_a_chunk_of_another_size_is_refused(size: int) -> None:
     chunk = encode_chunk(np.zeros(size, dtype=np.uint8))
     decode_chunk(chunk, np.empty(size, dtype=np.uint8))
     for wrong in (size - 1, size + 1):
-        with pytest.raises(CorruptChunkError, match=f"decodes to {size} bytes, and {wrong} are expected"):
+        with pytest.raises(
+            CorruptChunkError, match=f"decodes to {size} bytes, and {wrong} are expected"
+        ):
             decode_chunk(chunk, np.empty(wrong, dtype=np.uint8))
 
 

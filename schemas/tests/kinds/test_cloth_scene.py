@@ -24,23 +24,41 @@ SCENE: dict[str, Any] = {
     "parameters": {
         "mu": {"low": 0, "high": 2, "sets": ["friction.ball.cloth", "friction.cloth.floor"]},
         "fabric": {"sets": ["sheets.cloth.material"]},
-        "late": {"unit": "s", "low": 0.6, "high": 1.9, "sets": ["sheets.cloth.holders.hand.motion.keys.1.time"]},
-        "early": {"unit": "s", "low": 0, "high": 0.9, "sets": ["sheets.cloth.holders.hand.motion.keys.0.time"]},
+        "late": {
+            "unit": "s",
+            "low": 0.6,
+            "high": 1.9,
+            "sets": ["sheets.cloth.holders.hand.motion.keys.1.time"],
+        },
+        "early": {
+            "unit": "s",
+            "low": 0,
+            "high": 0.9,
+            "sets": ["sheets.cloth.holders.hand.motion.keys.0.time"],
+        },
     },
     "sheets": {
         "cloth": {
             "material": "gray-interlock",
             "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [8, 4]},
-            "holders": {"hand": {"edge": "left", "motion": {"keys": [{"time": 0.5}, {"time": 1.0}]}}},
+            "holders": {
+                "hand": {"edge": "left", "motion": {"keys": [{"time": 0.5}, {"time": 1.0}]}}
+            },
         },
-        "under": {"material": "gray-interlock", "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [8, 4]}},
+        "under": {
+            "material": "gray-interlock",
+            "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [8, 4]},
+        },
     },
     "bodies": {
         "floor": {"type": "plane"},
         "ball": {"type": "sphere", "radius": 0.1, "origin": [0, 0, 1]},
         "figure": {"type": "mesh", "file": MESH},
     },
-    "friction": [{"between": ["cloth", "ball"], "mu": 0.3}, {"between": ["cloth", "floor"], "mu": 0.3}],
+    "friction": [
+        {"between": ["cloth", "ball"], "mu": 0.3},
+        {"between": ["cloth", "floor"], "mu": 0.3},
+    ],
     "default_friction": 0.4,
     "looks": {"sheets": {"under": {"texture": PICTURE}}},
 }
@@ -48,7 +66,12 @@ SCENE: dict[str, Any] = {
 
 def document(**change: Any) -> dict[str, Any]:
     """Return a spec; `scene` and `axes` change some keys of theirs."""
-    axes = {"mu": [0.2, 0.4], "texture": ["checker", "plaid"], "viewpoint": "front", **change.pop("axes", {})}
+    axes = {
+        "mu": [0.2, 0.4],
+        "texture": ["checker", "plaid"],
+        "viewpoint": "front",
+        **change.pop("axes", {}),
+    }
     scene = {**SCENE, **change.pop("scene", {})}
     return {"kind": "cloth_scene", "scene": scene, "frames": 5, "axes": axes, **change}
 
@@ -78,7 +101,9 @@ def test_documents_have_the_values_of_parameters_at_all_their_places() -> None:
     for point in found:
         simulation = spec.simulation(point.labels)
         assert canonical_json(simulation.model_dump(mode="json")) == point.simulation_text
-        assert canonical_json(spec.render(point.labels).model_dump(mode="json")) == point.render_text  # type: ignore[union-attr]
+        assert (
+            canonical_json(spec.render(point.labels).model_dump(mode="json")) == point.render_text
+        )  # type: ignore[union-attr]
         physics = simulation.scene  # type: ignore[attr-defined]
         assert {pair.mu for pair in physics.friction} == {point.labels["mu"]}
         assert physics.sheets["cloth"].material == point.labels["fabric"]
@@ -89,7 +114,15 @@ def test_a_parameter_without_an_axis_is_a_label_with_its_default() -> None:
     (first, *_) = points()
     assert (first.labels["fabric"], first.labels["late"]) == ("gray-interlock", 1.0)
     names = [array.name for array in layout(made())]
-    assert {"mu", "fabric", "late", "cloth.positions", "under.contact", "holder_force", "camera"} <= set(names)
+    assert {
+        "mu",
+        "fabric",
+        "late",
+        "cloth.positions",
+        "under.contact",
+        "holder_force",
+        "camera",
+    } <= set(names)
     assert len(set(names)) == len(names)
 
 
@@ -97,7 +130,14 @@ def test_a_parameter_without_an_axis_is_a_label_with_its_default() -> None:
     "change",
     [
         {"scene": {"looks": {"sheets": {"under": {"texture": "dots"}}}}},
-        {"scene": {"looks": {**SCENE["looks"], "cameras": {"front": {"position": [1, 0, 1], "target": [0, 0, 0]}}}}},
+        {
+            "scene": {
+                "looks": {
+                    **SCENE["looks"],
+                    "cameras": {"front": {"position": [1, 0, 1], "target": [0, 0, 0]}},
+                }
+            }
+        },
         {"scene": {"name": "else", "description": "of something"}},
         {"quality": "draft"},
         {"frames": 4},
@@ -124,20 +164,29 @@ def test_what_is_simulated_is_in_the_key(change: dict[str, Any]) -> None:
 
 def test_tasks_name_the_files_that_they_read() -> None:
     spec = made()
-    assert spec.artifacts == {"/scene/bodies/figure/file": "a" * 64, "/scene/looks/sheets/under/texture": "b" * 64}
-    (first, *_) = points()
-    assert input_digests(SimulateTask(simulation=spec.simulation(first.labels)), lambda _: b"") == ("a" * 64,)
-    task = {"render": spec.render(first.labels), "record": {"digest": "d" * 64, "row": 0}}
-    assert set(input_digests(RenderTask.model_validate(task), lambda _: b"")) == {"d" * 64, "a" * 64, "b" * 64} - {
-        "a" * 64
+    assert spec.artifacts == {
+        "/scene/bodies/figure/file": "a" * 64,
+        "/scene/looks/sheets/under/texture": "b" * 64,
     }
+    (first, *_) = points()
+    assert input_digests(SimulateTask(simulation=spec.simulation(first.labels)), lambda _: b"") == (
+        "a" * 64,
+    )
+    task = {"render": spec.render(first.labels), "record": {"digest": "d" * 64, "row": 0}}
+    assert set(input_digests(RenderTask.model_validate(task), lambda _: b"")) == {
+        "d" * 64,
+        "a" * 64,
+        "b" * 64,
+    } - {"a" * 64}
 
 
 def test_a_built_in_scene_is_named() -> None:
     spec = job_spec_adapter.validate_python(document() | {"scene": "turning-ball"})
     assert isinstance(spec, ClothSceneSpec)
     assert spec.scene.name == "turning-ball"
-    assert job_spec_adapter.validate_json(spec.model_dump_json()).content_digest == spec.content_digest
+    assert (
+        job_spec_adapter.validate_json(spec.model_dump_json()).content_digest == spec.content_digest
+    )
 
 
 @pytest.mark.parametrize(
@@ -147,12 +196,22 @@ def test_a_built_in_scene_is_named() -> None:
         ({"axes": {"mu": [0.3, 3.0]}}, "/axes/mu/1", "must be within 0 to 2 [1]", "3.0"),
         ({"axes": {"late": [0.7, 3.0]}}, "/axes/late/1", "must be within 0.6 to 1.9 [s]", "3.0"),
         (
-            {"axes": {"early": [0.1, 0.8], "late": {"type": "random", "low": 0.7, "high": 1, "num": 3}}},
+            {
+                "axes": {
+                    "early": [0.1, 0.8],
+                    "late": {"type": "random", "low": 0.7, "high": 1, "num": 3},
+                }
+            },
             "/axes",
             "keys must ascend in time, and 0.7 s comes after 0.8 s",
             '{"early": 0.8, "late": 0.7}',
         ),
-        ({"axes": {"fabric": "silk"}}, "/axes", "must be one of 11oz-black-denim", '{"fabric": "silk"}'),
+        (
+            {"axes": {"fabric": "silk"}},
+            "/axes",
+            "must be one of 11oz-black-denim",
+            '{"fabric": "silk"}',
+        ),
         ({"axes": {"mu": "high"}}, "/axes/mu/0", "must be within 0 to 2", '"high"'),
         ({"axes": {"viewpoint": "left"}}, "/axes/viewpoint", "one of front, side, high", '"left"'),
         (
@@ -161,13 +220,20 @@ def test_a_built_in_scene_is_named() -> None:
             "did you mean cells",
             '"sheets.cloth.mesh.cels"',
         ),
-        ({"set": {"duration": -1.0}}, "/set/duration", "sets duration: Input should be greater than 0 [s]", "-1.0"),
+        (
+            {"set": {"duration": -1.0}},
+            "/set/duration",
+            "sets duration: Input should be greater than 0 [s]",
+            "-1.0",
+        ),
         ({"frames": 22}, "", "frames must be at most 21, the instants of the motion; got 22", ""),
         ({"mesh": 21}, "/mesh", "there is no such field", "21"),
         ({"scene": "turning-bal"}, "/scene", "did you mean turning-ball", '"turning-bal"'),
     ],
 )
-def test_a_wrong_spec_is_refused(change: dict[str, Any], pointer: str, rule: str, value: str) -> None:
+def test_a_wrong_spec_is_refused(
+    change: dict[str, Any], pointer: str, rule: str, value: str
+) -> None:
     given = document(**{key: value for key, value in change.items() if key != "scene"})
     given |= {key: value for key, value in change.items() if key == "scene"}
     with pytest.raises(ValidationError) as caught:

@@ -32,7 +32,12 @@ FLOOR = {"albedo": [0.2, 0.3], "roughness": [0.5, 0.6]}
 
 
 def _document(**more: Any) -> dict[str, Any]:
-    axes = {"material": "gray-interlock", "mu": 0.3, "texture": ["dots", "logo"], "viewpoint": ["left", "lab"]}
+    axes = {
+        "material": "gray-interlock",
+        "mu": 0.3,
+        "texture": ["dots", "logo"],
+        "viewpoint": ["left", "lab"],
+    }
     return {
         "kind": "cloth_drag",
         "axes": axes | {"lighting": ["drawn", "bench"], "substrate": ["baize", "any"]},
@@ -65,7 +70,9 @@ def test_documents_hold_what_is_the_users_own_and_nothing_else() -> None:
         render, point = sample.render, sample.labels
         assert isinstance(render, ClothDragRender)
         assert render.image == (f"sha256:{'a' * 64}" if point["texture"] == "logo" else None)
-        assert render.camera == (Calibration(**LAB).camera("lab") if point["viewpoint"] == "lab" else None)
+        assert render.camera == (
+            Calibration(**LAB).camera("lab") if point["viewpoint"] == "lab" else None
+        )
         assert (render.lamp is None) == (point["lighting"] == "drawn")
         assert (render.finish is None) == (point["substrate"] == "any")
 
@@ -81,7 +88,9 @@ def test_documents_hold_what_is_the_users_own_and_nothing_else() -> None:
 )
 def test_every_number_is_in_the_key_of_the_render_and_in_no_other(change: dict[str, Any]) -> None:
     before, after = list(samples(_spec(), BUILDS)), list(samples(_spec(**change), BUILDS))
-    assert [sample.simulation_key for sample in before] == [sample.simulation_key for sample in after]
+    assert [sample.simulation_key for sample in before] == [
+        sample.simulation_key for sample in after
+    ]
     changed = [one.render_key != other.render_key for one, other in zip(before, after, strict=True)]
     assert sum(changed) == len(changed) / 2  # those of one of two names
 
@@ -93,7 +102,11 @@ def _errors(document: dict[str, Any]) -> dict[str, str]:
 
 
 def lab(fx: float, cx: float) -> dict[str, Any]:
-    return {"viewpoints": {"lab": LAB | {"camera_matrix": [[fx, 0.0, cx], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]}}}
+    return {
+        "viewpoints": {
+            "lab": LAB | {"camera_matrix": [[fx, 0.0, cx], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]}
+        }
+    }
 
 
 @pytest.mark.parametrize(
@@ -106,13 +119,26 @@ def lab(fx: float, cx: float) -> dict[str, Any]:
             "textures must not redefine what is built in, and 'dots' is",
         ),
         ({"textures": {}}, "/axes/texture/1", "Input should be one of checker, .*, terrazzo"),
-        ({"viewpoints": {"lab": LAB | {"distortion": [0.0] * 5 + [0.1]}}}, "/viewpoints/lab", "must be 0 after k1"),
-        ({"viewpoints": {"lab": LAB | {"distortion": [-6.0]}}}, "/viewpoints/lab", "in their order over the whole"),
-        ({"viewpoints": {"lab": LAB | {"distortion": [0.0, 0.0, 9.0]}}}, "/viewpoints/lab", "in their order over"),
+        (
+            {"viewpoints": {"lab": LAB | {"distortion": [0.0] * 5 + [0.1]}}},
+            "/viewpoints/lab",
+            "must be 0 after k1",
+        ),
+        (
+            {"viewpoints": {"lab": LAB | {"distortion": [-6.0]}}},
+            "/viewpoints/lab",
+            "in their order over the whole",
+        ),
+        (
+            {"viewpoints": {"lab": LAB | {"distortion": [0.0, 0.0, 9.0]}}},
+            "/viewpoints/lab",
+            "in their order over",
+        ),
         (
             {
                 "viewpoints": {
-                    "lab": LAB | {"camera_matrix": [[700.0, 2.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]}
+                    "lab": LAB
+                    | {"camera_matrix": [[700.0, 2.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]}
                 }
             },
             "/viewpoints/lab",
@@ -121,16 +147,42 @@ def lab(fx: float, cx: float) -> dict[str, Any]:
         (lab(1e-6, 320.0), "/viewpoints/lab", "fx from 85.74 to 1.222e.04 px.* it is 1e-06 px"),
         (lab(1e12, 320.0), "/viewpoints/lab", "it is 1e.12 px"),
         (lab(700.0, 961.0), "/viewpoints/lab", "cx from -320 to 960 px"),
-        ({"viewpoints": {"lab": LAB | {"tvec": [0.0, 9.0, 1.0]}}}, "/viewpoints/lab", r"it is at \(0, -1, 9\) m"),
-        ({"viewpoints": {"lab": LAB | {"tvec": [0.0, -0.2, 1.0]}}}, "/viewpoints/lab", "above the floor"),
-        ({"viewpoints": {"lab": LAB | {"image_size": [640.5, 480]}}}, "/viewpoints/lab/image_size/0", "integer"),
-        ({"lamps": {"bench": LAMP | {"power": [1.0, 11.0]}}}, "/lamps/bench/power/1", "less than or equal to 10"),
-        ({"lamps": {"bench": LAMP | {"power": [1.0, 0.9]}}}, "/lamps/bench", r"power must be \[low, high\]"),
+        (
+            {"viewpoints": {"lab": LAB | {"tvec": [0.0, 9.0, 1.0]}}},
+            "/viewpoints/lab",
+            r"it is at \(0, -1, 9\) m",
+        ),
+        (
+            {"viewpoints": {"lab": LAB | {"tvec": [0.0, -0.2, 1.0]}}},
+            "/viewpoints/lab",
+            "above the floor",
+        ),
+        (
+            {"viewpoints": {"lab": LAB | {"image_size": [640.5, 480]}}},
+            "/viewpoints/lab/image_size/0",
+            "integer",
+        ),
+        (
+            {"lamps": {"bench": LAMP | {"power": [1.0, 11.0]}}},
+            "/lamps/bench/power/1",
+            "less than or equal to 10",
+        ),
+        (
+            {"lamps": {"bench": LAMP | {"power": [1.0, 0.9]}}},
+            "/lamps/bench",
+            r"power must be \[low, high\]",
+        ),
         ({"substrates": {"baize": FLOOR | {"albedo": 0.2}}}, "/substrates/baize/albedo", "tuple"),
-        ({"substrates": {"baize": FLOOR | {"colour": 1}}}, "/substrates/baize/colour", "there is no such field"),
+        (
+            {"substrates": {"baize": FLOOR | {"colour": 1}}},
+            "/substrates/baize/colour",
+            "there is no such field",
+        ),
     ],
 )
-def test_what_cannot_be_rendered_is_refused(change: dict[str, Any], pointer: str, rule: str) -> None:
+def test_what_cannot_be_rendered_is_refused(
+    change: dict[str, Any], pointer: str, rule: str
+) -> None:
     errors = _errors(_document(**change))
     assert list(errors) == [pointer]
     assert re.search(rule, errors[pointer]), errors
@@ -148,13 +200,18 @@ def test_a_calibration_of_the_clips_size_is_taken_as_it_is() -> None:
 
 
 def test_a_large_image_is_cut_to_its_middle_and_made_smaller() -> None:
-    """A point is where it is in the calibrated image, less the cut, over the scale; edges of pixels go onto edges."""
+    """A point is where it is in the calibrated image, less the cut, over the scale.
+
+    Edges of pixels go onto edges.
+    """
     camera = Calibration(**LAB).camera("lab")
     point = np.array([[0.05, 0.1, 0.12]])
     pixels, _ = camera.project(point)
     x = point[0] @ np.asarray(camera.rotation).T + np.asarray(LAB["tvec"])
     u, v = 700.0 * x[0] / x[2] + 319.5, 700.0 * x[1] / x[2] + 239.5
-    np.testing.assert_allclose(pixels[0], [(u - 80 + 0.5) * 224 / 480 - 0.5, (v + 0.5) * 224 / 480 - 0.5])
+    np.testing.assert_allclose(
+        pixels[0], [(u - 80 + 0.5) * 224 / 480 - 0.5, (v + 0.5) * 224 / 480 - 0.5]
+    )
 
 
 def test_rotations_of_rodrigues_are_those_of_opencv() -> None:
@@ -167,7 +224,8 @@ def test_rotations_of_rodrigues_are_those_of_opencv() -> None:
         np.testing.assert_allclose(own.rotation, camera.rotation, atol=1e-9)
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
+# --- pictures
+# ---------------------------------------------------------------------------------------------------------
 
 RANDOM = np.random.Generator(np.random.PCG64(3)).integers(0, 256, (80, 80, 3), dtype=np.uint8)
 
@@ -182,11 +240,20 @@ def test_pictures_are_read_as_they_are() -> None:
     picture = Image.fromarray(RANDOM)
     assert np.array_equal(read_picture(_file(picture)), RANDOM)
     assert np.array_equal(read_picture(_file(picture.convert("RGBA"))), RANDOM)
-    assert np.array_equal(read_picture(_file(picture.convert("L")))[..., 1], np.asarray(picture.convert("L")))
-    assert np.abs(read_picture(_file(picture, "JPEG", quality=95, subsampling=0)).astype(int) - RANDOM).mean() < 5
+    assert np.array_equal(
+        read_picture(_file(picture.convert("L")))[..., 1], np.asarray(picture.convert("L"))
+    )
+    assert (
+        np.abs(
+            read_picture(_file(picture, "JPEG", quality=95, subsampling=0)).astype(int) - RANDOM
+        ).mean()
+        < 5
+    )
     exif = Image.Exif()
     exif[0x0112] = 3  # upside down
-    turned = read_picture(_file(Image.fromarray(np.rot90(RANDOM, 2)), "JPEG", quality=100, subsampling=0, exif=exif))
+    turned = read_picture(
+        _file(Image.fromarray(np.rot90(RANDOM, 2)), "JPEG", quality=100, subsampling=0, exif=exif)
+    )
     assert np.abs(turned.astype(int) - RANDOM).mean() < 5
 
 
@@ -194,7 +261,9 @@ def _deep() -> bytes:
     """Return a PNG in colour with 16 bits a channel."""
     parts = [(b"IHDR", struct.pack(">IIBBBBB", 80, 80, 16, 2, 0, 0, 0))]
     parts += [(b"IDAT", zlib.compress(bytes(80 * (1 + 80 * 6)))), (b"IEND", b"")]
-    packed = [struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts]
+    packed = [
+        struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
@@ -211,10 +280,16 @@ def _transparent() -> Image.Image:
         (b"GIF89a" + bytes(100), "whole PNG or JPEG"),
         (_file(Image.fromarray(RANDOM), "GIF"), "whole PNG or JPEG"),
         (_file(Image.fromarray(RANDOM))[:-4000], "whole PNG or JPEG"),
-        (_file(Image.fromarray(RANDOM[:70])), "square, of 64 to 4096 pixels a side, and it has 80 x 70"),
+        (
+            _file(Image.fromarray(RANDOM[:70])),
+            "square, of 64 to 4096 pixels a side, and it has 80 x 70",
+        ),
         (_file(Image.fromarray(RANDOM[:60, :60])), "it has 60 x 60"),
         (_file(Image.new("1", (5000, 5000))), "it has 5000 x 5000"),
-        (_file(Image.fromarray(np.zeros((80, 80), dtype=np.uint16))), "8 bits a channel, and its mode is I;16"),
+        (
+            _file(Image.fromarray(np.zeros((80, 80), dtype=np.uint16))),
+            "8 bits a channel, and its mode is I;16",
+        ),
         (_deep(), "at most 8 bits a channel, and it has 16"),
         (_file(Image.fromarray(RANDOM).convert("CMYK"), "JPEG"), "its mode is CMYK"),
         (_file(_transparent()), "opaque"),

@@ -24,7 +24,16 @@ def test_codes_of_labels_are_pinned() -> None:
         "white-dots-on-blk": 8,
         "white-swim-solid": 9,
     }
-    textures = ["checker", "dots", "stripes", "plaid", "gingham", "herringbone", "houndstooth", "floral"]
+    textures = [
+        "checker",
+        "dots",
+        "stripes",
+        "plaid",
+        "gingham",
+        "herringbone",
+        "houndstooth",
+        "floral",
+    ]
     assert list(Texture)[:8] == textures
     assert list(VIEWPOINTS)[:3] == ["calibrated", "left", "right"]
     assert KERNELS == ("baseline", "x86-64-v3", "x86-64-v4")

@@ -20,11 +20,20 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 
 RODS: dict[str, Any] = {
     "kind": "rod_hang",
-    "axes": {"gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": 4}, "phi0": [0.2, 6], "phi1": 12},
+    "axes": {
+        "gamma": {"type": "linspace", "start": 100, "stop": 1300, "num": 4},
+        "phi0": [0.2, 6],
+        "phi1": 12,
+    },
 }
 CLOTH: dict[str, Any] = {
     "kind": "cloth_drag",
-    "axes": {"material": ["royal-target"], "mu": [0.1, 0.2], "texture": "dots", "viewpoint": ["left"]},
+    "axes": {
+        "material": ["royal-target"],
+        "mu": [0.1, 0.2],
+        "texture": "dots",
+        "viewpoint": ["left"],
+    },
 }
 
 
@@ -47,7 +56,10 @@ def errors_of(document: Any) -> list[FieldError]:
 def test_a_scene_s_axis_with_a_wrong_name_and_no_type_is_refused_by_fields() -> None:
     axes = {"viewpoint": [0], "x-axis": {"low": 0.0, "high": 0.0, "num": 1}}
     fields = errors_of({"kind": "cloth_scene", "axes": axes})
-    assert {field.pointer for field in fields if "x-axis" in field.pointer} == {"/axes/x-axis", "/axes/x-axis/type"}
+    assert {field.pointer for field in fields if "x-axis" in field.pointer} == {
+        "/axes/x-axis",
+        "/axes/x-axis/type",
+    }
 
 
 def test_short_and_long_forms_are_one_spec() -> None:
@@ -77,13 +89,28 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
 @pytest.mark.parametrize(
     ("document", "pointer", "rule", "value"),
     [
-        (changed(CLOTH, "/axes/material", ["royal-target", "silk"]), "/axes/material/1", "white-swim-solid", '"silk"'),
-        (changed(CLOTH, "/axes/mu", [0.1, -0.1]), "/axes/mu/1", "greater than or equal to 0", "-0.1"),
+        (
+            changed(CLOTH, "/axes/material", ["royal-target", "silk"]),
+            "/axes/material/1",
+            "white-swim-solid",
+            '"silk"',
+        ),
+        (
+            changed(CLOTH, "/axes/mu", [0.1, -0.1]),
+            "/axes/mu/1",
+            "greater than or equal to 0",
+            "-0.1",
+        ),
         (changed(CLOTH, "/axes/mu", -0.1), "/axes/mu", "greater than or equal to 0", "-0.1"),
         (changed(CLOTH, "/axes/texture", "velvet"), "/axes/texture", "herringbone", '"velvet"'),
         (changed(CLOTH, "/mesh", 3), "/mesh", "greater than or equal to 5", "3"),
         (changed(RODS, "/axes/gamma", [float("nan")]), "/axes/gamma/0", "finite number", "NaN"),
-        (changed(RODS, "/axes/gamma", [float("inf")]), "/axes/gamma/0", "finite number", "Infinity"),
+        (
+            changed(RODS, "/axes/gamma", [float("inf")]),
+            "/axes/gamma/0",
+            "finite number",
+            "Infinity",
+        ),
         (changed(RODS, "/axes/gamma", ["7"]), "/axes/gamma/0", "valid number", '"7"'),
         (changed(RODS, "/axes/phi0", []), "/axes/phi0", "at least 1 item", "[]"),
         (
@@ -92,10 +119,20 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
             "values must differ unless axes are zipped, and 1.0 is there twice",
             "[1.0, 2.0, 1.0]",
         ),
-        (changed(RODS, "/axes/gamma/num", 10**12), "/axes/gamma/num", "less than or equal to 1000000", str(10**12)),
+        (
+            changed(RODS, "/axes/gamma/num", 10**12),
+            "/axes/gamma/num",
+            "less than or equal to 1000000",
+            str(10**12),
+        ),
         (changed(RODS, "/axes/gamma/num", 0), "/axes/gamma/num", "greater than or equal to 1", "0"),
         (changed(RODS, "/axes/gamma/sto", 2), "/axes/gamma/sto", "did you mean stop?", "2"),
-        (changed(RODS, "/axes/gamma/type", "cubic"), "/axes/gamma/type", "list, linspace, random, sobol", '"cubic"'),
+        (
+            changed(RODS, "/axes/gamma/type", "cubic"),
+            "/axes/gamma/type",
+            "list, linspace, random, sobol",
+            '"cubic"',
+        ),
         (
             changed(RODS, "/axes/phi1", {"type": "sobol", "low": 2, "high": 2, "num": 3}),
             "/axes/phi1",
@@ -109,9 +146,19 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
         (changed(RODS, "/samples_per_shard", True), "/samples_per_shard", "valid integer", "true"),
         (changed(CLOTH, "/frames", 30.5), "/frames", "valid integer", "30.5"),
         (changed(CLOTH, "/quality", "hihg"), "/quality", "did you mean high?", '"hihg"'),
-        (changed(CLOTH, "/axes/texture", ["dot"]), "/axes/texture/0", "did you mean dots?", '"dot"'),
+        (
+            changed(CLOTH, "/axes/texture", ["dot"]),
+            "/axes/texture/0",
+            "did you mean dots?",
+            '"dot"',
+        ),
         (changed(RODS, "/kind", "rod-hang"), "/kind", "did you mean rod_hang?", '"rod-hang"'),
-        (changed(RODS, "/splits", {"train": 0.5, "validation": 0, "test": 0}), "/splits", "add up to 0.5", "0.5"),
+        (
+            changed(RODS, "/splits", {"train": 0.5, "validation": 0, "test": 0}),
+            "/splits",
+            "add up to 0.5",
+            "0.5",
+        ),
         (changed(RODS, "/combine", "zip"), "", "one length", '"kind": "rod_hang"'),
         ({"kind": "rod_hang", "axes": {"gamma": 1, "phi0": 1}}, "/axes/phi1", "required", ""),
         ([], "", "must be an object", "[]"),
@@ -128,7 +175,9 @@ POINT = {"material": "royal-target", "mu": 0.1, "texture": "dots", "viewpoint": 
 
 
 @pytest.mark.parametrize(("given", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)])
-def test_dragged_cloth_has_self_contact_unless_its_spec_says_null(given: dict[str, Any], meant: float | None) -> None:
+def test_dragged_cloth_has_self_contact_unless_its_spec_says_null(
+    given: dict[str, Any], meant: float | None
+) -> None:
     spec = job_spec_adapter.validate_python(CLOTH | given)
     simulation = spec.simulation(POINT)
     assert isinstance(simulation, ClothDragSimulation)
@@ -171,7 +220,9 @@ def test_no_two_arrays_have_one_name() -> None:
     truth = ["depth", "segmentation", "normals", "uv", "flow"]
     looks = {"texture": ["plaid"], "viewpoint": ["front"]}
     specs = [RODS, changed(CLOTH, "/ground_truth", truth)]
-    specs.append({"kind": "cloth_scene", "scene": "turning-ball", "axes": looks, "ground_truth": truth})
+    specs.append(
+        {"kind": "cloth_scene", "scene": "turning-ball", "axes": looks, "ground_truth": truth}
+    )
     for document in specs:
         spec = job_spec_adapter.validate_python(document)
         names = [array.name for array in (*spec.arrays(), *COMMON_ARRAYS)]

@@ -9,14 +9,20 @@ from stickslip_schemas.plan.costs import Estimate, Interval, count, estimated
 from stickslip_schemas.spec.names import Texture
 
 
-def estimate(slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any) -> Estimate:
+def estimate(
+    slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any
+) -> Estimate:
     spec = job_spec_adapter.validate_python(document)
     return estimated(spec, count(spec), measured or {}, slots)
 
 
 def rods(number: int, quality: str) -> dict[str, Any]:
     gamma = {"type": "linspace", "start": 100.0, "stop": 1300.0, "num": number}
-    return {"kind": "rod_hang", "axes": {"gamma": gamma, "phi0": 1.0, "phi1": 6.0}, "quality": quality}
+    return {
+        "kind": "rod_hang",
+        "axes": {"gamma": gamma, "phi0": 1.0, "phi1": 6.0},
+        "quality": quality,
+    }
 
 
 def clips(*textures: str, mu: Any = 0.3, **more: Any) -> dict[str, Any]:
@@ -39,7 +45,9 @@ def clips(*textures: str, mu: Any = 0.3, **more: Any) -> dict[str, Any]:
         (clips("dots", mesh=41), Stage.simulate, 31.0),
     ],
 )
-def test_usual_costs_fit_the_jobs_that_they_were_taken_from(document: Any, stage: Stage, cost: float) -> None:
+def test_usual_costs_fit_the_jobs_that_they_were_taken_from(
+    document: Any, stage: Stage, cost: float
+) -> None:
     """Not a check of accuracy: these jobs gave the numbers. It holds the units and the counts."""
     found = estimate(**document).stages[stage]
     assert found.median == pytest.approx(cost, rel=0.4)
@@ -51,14 +59,19 @@ def test_what_was_measured_replaces_what_is_usual() -> None:
     costs = estimate(slots=4, measured={Stage.simulate: known}, **clips("dots", frames=10))
     assert costs.stages[Stage.simulate] == known
     assert costs.measured == (Stage.simulate,)
-    assert costs.cpu_seconds.median == pytest.approx(sum(stage.median for stage in costs.stages.values()))
+    assert costs.cpu_seconds.median == pytest.approx(
+        sum(stage.median for stage in costs.stages.values())
+    )
     assert costs.wall_seconds is not None
     assert costs.wall_seconds.high == pytest.approx(costs.cpu_seconds.high / 4)
     assert estimate(slots=0, **rods(2, "draft")).wall_seconds is None
 
 
 def test_textures_share_a_shading_and_nothing_is_rendered_without_views() -> None:
-    one, four = (estimate(**clips(*names)).stages[Stage.render].median for names in (["dots"], ["dots", "plaid"]))
+    one, four = (
+        estimate(**clips(*names)).stages[Stage.render].median
+        for names in (["dots"], ["dots", "plaid"])
+    )
     assert four < 1.5 * one
     assert estimate(**(rods(20, "high") | {"views": None})).stages[Stage.render].high == 0.0
 

@@ -14,10 +14,15 @@ BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" 
 
 
 def numbers(low: float, high: float, length: int | None = None) -> st.SearchStrategy[Any]:
-    """Axes of numbers in [low, high], of a given length or of any; some ranges are so narrow that values repeat."""
+    """Axes of numbers in [low, high], of a given length or of any.
+
+    Some ranges are so narrow that values repeat.
+    """
     sizes = st.integers(1, 4) if length is None else st.just(length)
     values = st.floats(low, high, allow_nan=False)
-    lists = sizes.flatmap(lambda size: st.lists(values, min_size=size, max_size=size, unique=length is None))
+    lists = sizes.flatmap(
+        lambda size: st.lists(values, min_size=size, max_size=size, unique=length is None)
+    )
     start = high / 2
     narrow = st.just({"type": "linspace", "start": start, "stop": start * (1 + 3e-16)})
     wide = st.just({"type": "linspace", "start": low, "stop": high})
@@ -30,17 +35,28 @@ def numbers(low: float, high: float, length: int | None = None) -> st.SearchStra
 
 def words(known: list[str], length: int | None = None) -> st.SearchStrategy[Any]:
     size = (1, 3) if length is None else (length, length)
-    return st.lists(st.sampled_from(known), min_size=size[0], max_size=size[1], unique=length is None)
+    return st.lists(
+        st.sampled_from(known), min_size=size[0], max_size=size[1], unique=length is None
+    )
 
 
 @st.composite
 def specs(draw: st.DrawFn) -> dict[str, Any]:
     combine = draw(st.sampled_from(["product", "zip"]))
     length = draw(st.integers(1, 3)) if combine == "zip" else None
-    rest = {"combine": combine, "samples_per_shard": draw(st.integers(1, 5)), "seed": draw(st.integers(0, 3))}
+    rest = {
+        "combine": combine,
+        "samples_per_shard": draw(st.integers(1, 5)),
+        "seed": draw(st.integers(0, 3)),
+    }
     if draw(st.booleans()):
         axes = {name: draw(numbers(1.0, 40.0, length)) for name in ("gamma", "phi0", "phi1")}
-        return {"kind": "rod_hang", "axes": axes, "views": draw(st.sampled_from(["rod-4", None])), **rest}
+        return {
+            "kind": "rod_hang",
+            "axes": axes,
+            "views": draw(st.sampled_from(["rod-4", None])),
+            **rest,
+        }
     axes = {
         "material": draw(words(["gray-interlock", "royal-target", "camel-ponte-roma"], length)),
         "mu": draw(numbers(0.1, 0.9, length)),
@@ -63,7 +79,9 @@ def test_counts_are_those_of_the_grid(document: dict[str, Any]) -> None:
     counts = count(spec)
     assert counts.sample_count == len(points)
     assert counts.simulation_count == len({point.simulation_key for point in points})
-    assert counts.render_count == len({point.render_key for point in points if point.render_key is not None})
+    assert counts.render_count == len(
+        {point.render_key for point in points if point.render_key is not None}
+    )
     assert counts.shards == -(-len(points) // spec.samples_per_shard)
     assert sum(counts.expected_splits.values()) == counts.sample_count
     assert counts.task_count == counts.simulation_count + counts.render_count + counts.shards + 1
@@ -71,7 +89,9 @@ def test_counts_are_those_of_the_grid(document: dict[str, Any]) -> None:
 
 def test_splits_are_about_what_is_expected() -> None:
     wide = {"type": "linspace", "start": 1, "stop": 9, "num": 100}
-    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": wide, "phi0": wide, "phi1": 1}})
+    spec = job_spec_adapter.validate_python(
+        {"kind": "rod_hang", "axes": {"gamma": wide, "phi0": wide, "phi1": 1}}
+    )
     counts = count(spec)
     assert counts.expected_splits == {"train": 8000, "validation": 1000, "test": 1000}
     drawn = [0, 0, 0]
@@ -86,6 +106,10 @@ def test_a_million_samples_are_counted(combine: str) -> None:
     size = 100 if combine == "product" else 1_000_000
     axis = {"type": "linspace", "start": 1, "stop": 9, "num": size}
     spec = job_spec_adapter.validate_python(
-        {"kind": "rod_hang", "combine": combine, "axes": {"gamma": axis, "phi0": axis, "phi1": axis}}
+        {
+            "kind": "rod_hang",
+            "combine": combine,
+            "axes": {"gamma": axis, "phi0": axis, "phi1": axis},
+        }
     )
     assert count(spec).simulation_count == 1_000_000

@@ -23,7 +23,11 @@ def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: B
 
 
 def one(
-    poisson: float = 0.5, seed: int = 0, builds: Builds = BUILDS, name: str | None = None, **more: object
+    poisson: float = 0.5,
+    seed: int = 0,
+    builds: Builds = BUILDS,
+    name: str | None = None,
+    **more: object,
 ) -> Sample:
     document = {
         "kind": "rod_hang",
@@ -38,13 +42,17 @@ def one(
 
 
 def test_pinned_keys() -> None:
-    """Keys of finished work: if one of these changes, every dataset in the world would be recomputed."""
+    """Keys of finished work: if one of these changes, every dataset in the world would be
+    recomputed.
+    """
     sample = one()
     assert sample.simulation_key == PINNED["simulation"]
     assert sample.split == PINNED["split"]
     assert isinstance(sample.render, RodHangRender)
     assert sample.render.color_seed == PINNED["color_seed"]
-    spec = job_spec_adapter.validate_python({"kind": "rod_hang", "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0}})
+    spec = job_spec_adapter.validate_python(
+        {"kind": "rod_hang", "axes": {"gamma": 100.0, "phi0": 1.0, "phi1": 6.0}}
+    )
     assert spec.content_digest == PINNED["spec"]
     dragged = {
         "kind": "cloth_drag",
@@ -53,7 +61,9 @@ def test_pinned_keys() -> None:
     (cloth,) = samples(job_spec_adapter.validate_python(dragged), BUILDS)
     assert cloth.simulation_key == PINNED["cloth_simulation"]
     assert cloth.render_key == PINNED["cloth_render"]
-    (through,) = samples(job_spec_adapter.validate_python(dragged | {"self_friction": None}), BUILDS)
+    (through,) = samples(
+        job_spec_adapter.validate_python(dragged | {"self_friction": None}), BUILDS
+    )
     assert through.simulation_key == PINNED["cloth_through_itself"]
 
 
@@ -88,8 +98,12 @@ def test_neighbours_in_the_grid_change_no_sample() -> None:
     """Extending a grid must find the old samples again: nothing of them depends on their slot."""
     small = {"kind": "rod_hang", "axes": {"gamma": [100, 200], "phi0": 1, "phi1": 6}}
     large = {"kind": "rod_hang", "axes": {"gamma": [50, 100, 200], "phi0": [0.5, 1], "phi1": 6}}
-    before = {sample.key: sample for sample in samples(job_spec_adapter.validate_python(small), BUILDS)}
-    after = {sample.key: sample for sample in samples(job_spec_adapter.validate_python(large), BUILDS)}
+    before = {
+        sample.key: sample for sample in samples(job_spec_adapter.validate_python(small), BUILDS)
+    }
+    after = {
+        sample.key: sample for sample in samples(job_spec_adapter.validate_python(large), BUILDS)
+    }
     assert set(before) < set(after)
     assert all(after[key].split == sample.split for key, sample in before.items())
 
@@ -106,7 +120,9 @@ GRID = {
 
 
 def test_splits_by_clip_part_the_renders_of_a_simulation_and_change_no_other_key() -> None:
-    """For comparison with the thesis, whose test clips very likely show simulations that were trained on."""
+    """For comparison with the thesis, whose test clips very likely show simulations that were
+    trained on.
+    """
     spec = job_spec_adapter.validate_python(GRID)
     by_clip = job_spec_adapter.validate_python(GRID | {"splits": {"by": "clip"}})
     found: dict[str, set[int]] = {}
@@ -129,17 +145,28 @@ def test_renders_of_one_simulation_share_its_split() -> None:
 
 SPLIT_SPEC = {
     "kind": "rod_hang",
-    "axes": {"gamma": {"type": "linspace", "start": 0, "stop": 1, "num": 4000}, "phi0": 1, "phi1": 6},
+    "axes": {
+        "gamma": {"type": "linspace", "start": 0, "stop": 1, "num": 4000},
+        "phi0": 1,
+        "phi1": 6,
+    },
     "splits": {"train": 0.5, "validation": 0.35, "test": 0.15},
     "views": None,
 }
 
 
 def test_each_split_has_its_share() -> None:
-    """Code 0 is train, 1 validation and 2 test; shares are within five standard deviations of 4000 draws."""
-    drawn = Counter(point.split for point in keyed_points(job_spec_adapter.validate_python(SPLIT_SPEC), BUILDS))
+    """Code 0 is train, 1 validation and 2 test.
+
+    Shares are within five standard deviations of 4000 draws.
+    """
+    drawn = Counter(
+        point.split for point in keyed_points(job_spec_adapter.validate_python(SPLIT_SPEC), BUILDS)
+    )
     for split, share in enumerate((0.5, 0.35, 0.15)):
-        assert abs(drawn[split] / 4000 - share) < 5 * (share * (1 - share) / 4000) ** 0.5, SPLITS[split]
+        assert abs(drawn[split] / 4000 - share) < 5 * (share * (1 - share) / 4000) ** 0.5, SPLITS[
+            split
+        ]
 
 
 @pytest.mark.parametrize("alone", SPLITS)
@@ -165,7 +192,12 @@ def test_a_larger_training_share_only_takes_samples_from_validation() -> None:
 
 def test_another_seed_draws_other_splits() -> None:
     first, second = (
-        [point.split for point in keyed_points(job_spec_adapter.validate_python(GRID | {"seed": seed}), BUILDS)]
+        [
+            point.split
+            for point in keyed_points(
+                job_spec_adapter.validate_python(GRID | {"seed": seed}), BUILDS
+            )
+        ]
         for seed in (0, 1)
     )
     assert first != second
@@ -173,7 +205,9 @@ def test_another_seed_draws_other_splits() -> None:
 
 def _rods(count: int = 5, **more: object) -> JobSpec:
     axes = {"gamma": list(range(1, count + 1)), "phi0": 1, "phi1": 6}
-    return job_spec_adapter.validate_python({"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **more})
+    return job_spec_adapter.validate_python(
+        {"kind": "rod_hang", "axes": axes, "samples_per_shard": 2, **more}
+    )
 
 
 def test_shards_are_whole_and_have_their_keys() -> None:
@@ -210,7 +244,9 @@ def test_a_pack_key_holds_what_a_shard_is_made_of() -> None:
         "samples_per_shard": pack_key(_rods(2, samples_per_shard=3), 0, [first, second], BUILDS),
     }
     assert len({key, *others.values()}) == 1 + len(others), others
-    assert key == pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"sim_core": "d" * 64}))
+    assert key == pack_key(
+        spec, 0, [first, second], BUILDS.model_copy(update={"sim_core": "d" * 64})
+    )
 
 
 def test_a_pack_key_holds_the_codes_of_labels() -> None:
@@ -255,7 +291,9 @@ PINNED: dict[str, object] = {
 
 
 def test_points_are_the_samples_of_the_models() -> None:
-    """The fast way over texts and the plain way over models give the same keys, for every kind and optional axis."""
+    """The fast way over texts and the plain way over models give the same keys, for every kind and
+    optional axis.
+    """
     own = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
     cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
     looks = {"texture": ["dots", "plaid"], "viewpoint": "high"}
@@ -265,20 +303,31 @@ def test_points_are_the_samples_of_the_models() -> None:
         {
             "kind": "cloth_drag",
             "materials": {"mine": own},
-            "axes": cloth | {"viewpoint": "left", "bending": [0.5, 2.0], "substrate": ["matt", "ceramic"]},
+            "axes": cloth
+            | {"viewpoint": "left", "bending": [0.5, 2.0], "substrate": ["matt", "ceramic"]},
         },
-        {"kind": "cloth_scene", "scene": "turning-ball", "axes": looks | {"speed": 2.0, "mu": [0.3, 1.0]}},
+        {
+            "kind": "cloth_scene",
+            "scene": "turning-ball",
+            "axes": looks | {"speed": 2.0, "mu": [0.3, 1.0]},
+        },
         {
             "kind": "cloth_scene",
             "scene": "on-cloth",
             "set": {"materials": {"mine": own}},
             "axes": looks | {"mu": 0.3, "stretched_fabric": ["mine", "camel-ponte-roma"]},
         },
-        {"kind": "cloth_scene", "scene": "shawl", "axes": looks | {"self_friction": [0.2, 0.4], "swing": [0.5, 1.0]}},
+        {
+            "kind": "cloth_scene",
+            "scene": "shawl",
+            "axes": looks | {"self_friction": [0.2, 0.4], "swing": [0.5, 1.0]},
+        },
     ]
     for document in documents:
         spec = job_spec_adapter.validate_python(document)
-        for slot, (point, sample) in enumerate(zip(keyed_points(spec, BUILDS), samples(spec, BUILDS), strict=True)):
+        for slot, (point, sample) in enumerate(
+            zip(keyed_points(spec, BUILDS), samples(spec, BUILDS), strict=True)
+        ):
             assert point.slot == sample.slot == slot
             assert point.labels == sample.labels
             assert json.loads(point.labels_text) == sample.labels
@@ -293,7 +342,12 @@ def test_points_are_the_samples_of_the_models() -> None:
 
 
 def test_textures_share_light_and_simulations_do_not() -> None:
-    axes = {"material": "royal-target", "mu": [0.3, 0.4], "texture": ["dots", "plaid"], "viewpoint": ["left", "right"]}
+    axes = {
+        "material": "royal-target",
+        "mu": [0.3, 0.4],
+        "texture": ["dots", "plaid"],
+        "viewpoint": ["left", "right"],
+    }
     spec = job_spec_adapter.validate_python({"kind": "cloth_drag", "axes": axes})
     lights: dict[tuple[str, str], set[int]] = {}
     for sample in samples(spec, BUILDS):

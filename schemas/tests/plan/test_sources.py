@@ -69,8 +69,12 @@ def test_every_change_changes_the_digests_and_no_other(made: Path) -> None:
 
 def test_what_is_cut_is_not_followed(made: Path) -> None:
     assert "stickslip_made/other.py" in sources(["stickslip_made.asks"])
-    assert set(sources(["stickslip_made.asks"], cut=("stickslip_made.registry",))) == {"stickslip_made/asks.py"}
-    assert set(sources(["stickslip_made.work"], cut=("stickslip_made.deep.*", "stickslip_made.late"))) == {
+    assert set(sources(["stickslip_made.asks"], cut=("stickslip_made.registry",))) == {
+        "stickslip_made/asks.py"
+    }
+    assert set(
+        sources(["stickslip_made.work"], cut=("stickslip_made.deep.*", "stickslip_made.late"))
+    ) == {
         "stickslip_made/work.py",
         "stickslip_made/table.toml",
     }

@@ -56,7 +56,10 @@ SCENE: dict[str, Any] = {
         "block": {"type": "box", "size": [0.1, 0.1, 0.02], "rounding": 0.005, "origin": [1, 0, 0]},
         "actor": {"type": "mesh", "file": "actor.npz", "strength": 1.0},
     },
-    "friction": [{"between": ["lower", "ball"], "mu": 0.5}, {"between": ["upper", "lower"], "mu": 0.2}],
+    "friction": [
+        {"between": ["lower", "ball"], "mu": 0.5},
+        {"between": ["upper", "lower"], "mu": 0.2},
+    ],
     "default_friction": 0.4,
     "looks": {
         "sheets": {"upper": {"texture": "plaid"}},
@@ -70,8 +73,9 @@ NAN, FAR = float("nan"), 1000.0
 UPPER, LOWER, BALL = "sheets.upper", "sheets.lower", "bodies.ball"
 SPIN, KEYS = f"{BALL}.motion.spin", f"{UPPER}.holders.hand.motion.keys"
 
-# Where, what stands there, the place that the answer names (empty: the same), a part of the rule with its unit, and the
-# value that is shown, where it is not what stands at the place that the answer names.
+# Where, what stands there, the place that the answer names (empty: the same), a part of the rule
+# with its unit, and the value that is shown, where it is not what stands at the place that the
+# answer names.
 WRONG: list[tuple[Any, ...]] = [
     ("format", "stickslip-scene/2", "", "must be one of stickslip-scene/1"),
     ("format", GONE, "", "this field is required"),
@@ -83,7 +87,13 @@ WRONG: list[tuple[Any, ...]] = [
     ("duration", "2 s", "", "valid number [s]"),
     ("duration", GONE, "", "one of duration [s] and end must be given", "null"),
     ("end", {"when": "rest", "at_most": 3.0}, "duration", "and not both"),
-    ("duration", 9999.0, "frame_rate", "length [s] times frame_rate [1/s] must be at most 10000 frames", "30.0"),
+    (
+        "duration",
+        9999.0,
+        "frame_rate",
+        "length [s] times frame_rate [1/s] must be at most 10000 frames",
+        "30.0",
+    ),
     ("frame_rate", 0, "", "greater than 0 [1/s]"),
     ("gravity", [0, 0, -FAR], "gravity.2", "greater than or equal to -100 [m/s^2]"),
     ("gravity", [0, -9.81], "gravity.2", "this field is required"),
@@ -100,13 +110,24 @@ WRONG: list[tuple[Any, ...]] = [
         "redefine",
         '"gray-interlock"',
     ),
-    ("materials.Felt", {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}, "", "pattern", '"Felt"'),
+    (
+        "materials.Felt",
+        {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3},
+        "",
+        "pattern",
+        '"Felt"',
+    ),
     (f"{UPPER}.material", "fellt", "", "did you mean felt"),
     (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
     (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 6.2832 [rad]"),
     (f"{UPPER}.thickness", 0.0, "", "greater than or equal to 0.00001 [m]"),
     (f"{UPPER}.self_contact", False, "", "must be true where there are several sheets"),
-    (f"{UPPER}.factors", {"density": 0.01}, f"{UPPER}.factors.density", "greater than or equal to 0.1"),
+    (
+        f"{UPPER}.factors",
+        {"density": 0.01},
+        f"{UPPER}.factors.density",
+        "greater than or equal to 0.1",
+    ),
     (f"{UPPER}.mesh", {"type": "hexagons"}, f"{UPPER}.mesh.type", "must be one of"),
     (f"{UPPER}.mesh.spacing", -0.02, "", "greater than 0 [m]"),
     (f"{UPPER}.mesh.spacing", 1e-5, "sheets", "at most 100000 vertices", "115497375"),
@@ -117,23 +138,63 @@ WRONG: list[tuple[Any, ...]] = [
     (f"{LOWER}.start.strain", [0.5, 0.0], f"{LOWER}.start.strain.0", "less than or equal to 0.2"),
     (f"{LOWER}.start", {"type": "file"}, LOWER, "start.file must name a file"),
     ("sheets.towel.start", {"type": "hung"}, "sheets.towel", "can be hung only from holders"),
-    ("sheets.towel.start", {"type": "file", "file": "/etc/passwd"}, "sheets.towel.start.file", "in the folder"),
+    (
+        "sheets.towel.start",
+        {"type": "file", "file": "/etc/passwd"},
+        "sheets.towel.start.file",
+        "in the folder",
+    ),
     ("sheets.towel.mesh.file", "../towel.obj", "", "in the folder of the scene"),
     ("sheets.towel.mesh.file", "sha256:12", "", "64 hexadecimal digits"),
     ("sheets.towel.mesh.file", "https://example.org/towel.obj", "", "in the folder of the scene"),
-    (f"{LOWER}.holders.rim.low", [0, 0], f"{LOWER}.holders.rim", "one of low and high, edge, rim and vertices"),
+    (
+        f"{LOWER}.holders.rim.low",
+        [0, 0],
+        f"{LOWER}.holders.rim",
+        "one of low and high, edge, rim and vertices",
+    ),
     (f"{LOWER}.holders.rim.rim", GONE, f"{LOWER}.holders.rim", "and it has none"),
     (f"{LOWER}.holders.rim.grasp", [1.0, 0.5], f"{LOWER}.holders.rim", "ascending order [s]"),
-    (f"{LOWER}.holders.rim", {"vertices": [3, 45]}, f"{LOWER}.holders.rim.vertices.1", "a vertex of the sheet"),
+    (
+        f"{LOWER}.holders.rim",
+        {"vertices": [3, 45]},
+        f"{LOWER}.holders.rim.vertices.1",
+        "a vertex of the sheet",
+    ),
     (f"{LOWER}.holders.rim", {"edge": "north"}, f"{LOWER}.holders.rim.edge", "must be one of left"),
-    (f"{UPPER}.holders.hand.high", GONE, f"{UPPER}.holders.hand", "low and high must both be given"),
-    (f"{UPPER}.holders.hand.high", [-0.06, 0.05], f"{UPPER}.holders.hand", "low must be at most high in both [m]"),
-    (f"{KEYS}.1.time", 0.0, f"{UPPER}.holders.hand.motion", "keys must ascend in time, and 0 s comes after 0 s"),
+    (
+        f"{UPPER}.holders.hand.high",
+        GONE,
+        f"{UPPER}.holders.hand",
+        "low and high must both be given",
+    ),
+    (
+        f"{UPPER}.holders.hand.high",
+        [-0.06, 0.05],
+        f"{UPPER}.holders.hand",
+        "low must be at most high in both [m]",
+    ),
+    (
+        f"{KEYS}.1.time",
+        0.0,
+        f"{UPPER}.holders.hand.motion",
+        "keys must ascend in time, and 0 s comes after 0 s",
+    ),
     (f"{KEYS}.0.time", -1.0, "", "greater than or equal to 0 [s]"),
     (f"{KEYS}.1.move", [0, 0, FAR], f"{KEYS}.1.move.2", "less than or equal to 100 [m]"),
     (KEYS, [], "", "must have at least 1 item"),
-    (f"{UPPER}.holders.hand.motion.path", "way.csv", f"{UPPER}.holders.hand.motion", "one of keys, spin and path"),
-    (f"{UPPER}.holders.hand.motion.ramp", 0.1, f"{UPPER}.holders.hand.motion", "motion is not linear; ramp is 0.1 s"),
+    (
+        f"{UPPER}.holders.hand.motion.path",
+        "way.csv",
+        f"{UPPER}.holders.hand.motion",
+        "one of keys, spin and path",
+    ),
+    (
+        f"{UPPER}.holders.hand.motion.ramp",
+        0.1,
+        f"{UPPER}.holders.hand.motion",
+        "motion is not linear; ramp is 0.1 s",
+    ),
     (f"{UPPER}.holders.hand.motion.interpolation", "cubic", "", "must be one of smooth"),
     (f"{SPIN}.axis", [0, 0, 0], SPIN, "axis must not be 0"),
     (f"{SPIN}.speed", 2000.0, "", "less than or equal to 1000 [rad/s]"),
@@ -160,7 +221,12 @@ WRONG: list[tuple[Any, ...]] = [
     ("looks.cameras.door.focal_length", 5.0, "", "greater than or equal to 10 [mm]"),
     ("looks.cameras.door.target", [1, 1, 0], "looks.cameras.door", "straight above or below"),
     ("looks.cameras", "drags", "looks.cameras", "did you mean drag"),
-    ("parameters.mu.sets", ["friction.ball.tower"], "parameters.mu.sets.0", "no pair of ball and tower"),
+    (
+        "parameters.mu.sets",
+        ["friction.ball.tower"],
+        "parameters.mu.sets.0",
+        "no pair of ball and tower",
+    ),
     ("parameters.mu.high", 20.0, "", "friction.0.mu: Input should be less than or equal to 10"),
     ("parameters.mu.low", 3.0, "", "low below high"),
     ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2 [1]", "0.5"),
@@ -170,12 +236,44 @@ WRONG: list[tuple[Any, ...]] = [
     ("parameters.mu.unit", "N", "", "must be 1, as of friction.ball.lower"),
     ("parameters.speed.unit", GONE, "", "must be rad/s", '"1"'),
     ("parameters.fabric.low", 1.0, "", "for numbers without a list of values"),
-    ("parameters.fabric.values", ["silk"], "parameters.fabric.sets.0", "default within silk", '"gray-interlock"'),
-    ("parameters.texture", {"sets": [f"{UPPER}.material"]}, "", "name of an axis of all scenes", '"texture"'),
-    ("parameters.n", {"low": 1, "high": 9, "sets": [f"{LOWER}.mesh.cells.0"]}, "parameters.n.sets.0", "shapes of"),
-    ("parameters.t", {"low": 1, "high": 9, "sets": ["duration"]}, "parameters.t.sets.0", "shapes of arrays"),
-    ("parameters.f", {"sets": ["bodies.actor.file"]}, "parameters.f.sets.0", "must lead to a number or a material"),
-    ("parameters.two", {"low": 0, "high": 1, "sets": ["friction.lower.ball"]}, "parameters.two.sets.0", "where 'mu'"),
+    (
+        "parameters.fabric.values",
+        ["silk"],
+        "parameters.fabric.sets.0",
+        "default within silk",
+        '"gray-interlock"',
+    ),
+    (
+        "parameters.texture",
+        {"sets": [f"{UPPER}.material"]},
+        "",
+        "name of an axis of all scenes",
+        '"texture"',
+    ),
+    (
+        "parameters.n",
+        {"low": 1, "high": 9, "sets": [f"{LOWER}.mesh.cells.0"]},
+        "parameters.n.sets.0",
+        "shapes of",
+    ),
+    (
+        "parameters.t",
+        {"low": 1, "high": 9, "sets": ["duration"]},
+        "parameters.t.sets.0",
+        "shapes of arrays",
+    ),
+    (
+        "parameters.f",
+        {"sets": ["bodies.actor.file"]},
+        "parameters.f.sets.0",
+        "must lead to a number or a material",
+    ),
+    (
+        "parameters.two",
+        {"low": 0, "high": 1, "sets": ["friction.lower.ball"]},
+        "parameters.two.sets.0",
+        "where 'mu'",
+    ),
     (
         "parameters.both",
         {"unit": "m", "low": 0.01, "high": 1, "sets": [f"{BALL}.radius", "bodies.rod.length"]},
@@ -235,14 +333,17 @@ def test_every_number_has_a_unit_but_those_that_are_pure() -> None:
         name: {
             field
             for field, said in model.get("properties", {}).items()
-            if '"number"' in json.dumps(said) and not re.search(r"\[.+\]", said.get("description", ""))
+            if '"number"' in json.dumps(said)
+            and not re.search(r"\[.+\]", said.get("description", ""))
         }
         for name, model in models.items()
     }
     assert {name: fields for name, fields in pure.items() if fields} == PURE
 
 
-@pytest.mark.parametrize("row", WRONG, ids=lambda row: f"{row[0]}={'missing' if row[1] is GONE else row[1]}"[:60])
+@pytest.mark.parametrize(
+    "row", WRONG, ids=lambda row: f"{row[0]}={'missing' if row[1] is GONE else row[1]}"[:60]
+)
 def test_a_wrong_scene_is_refused(row: tuple[Any, ...]) -> None:
     place, value, said, rule, *shown = row
     document = changed(place, value)
@@ -254,4 +355,8 @@ def test_a_wrong_scene_is_refused(row: tuple[Any, ...]) -> None:
     assert rule in found.rule
     if "required" not in rule:
         shown = shown or [json.dumps(at(document, said or place))]
-    assert found.value == (shown[0] if len(shown[0]) <= 200 else f"{shown[0][:197]}...") if shown else not found.value
+    assert (
+        found.value == (shown[0] if len(shown[0]) <= 200 else f"{shown[0][:197]}...")
+        if shown
+        else not found.value
+    )

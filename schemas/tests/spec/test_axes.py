@@ -12,7 +12,9 @@ _AXIS: TypeAdapter[Any] = TypeAdapter(GammaAxis)
 
 
 def values(document: Any, dimension: int = 0) -> list[float]:
-    return [float(value) for value in axis_values(_AXIS.validate_python(document), dimension=dimension)]
+    return [
+        float(value) for value in axis_values(_AXIS.validate_python(document), dimension=dimension)
+    ]
 
 
 def sampled(kind: str, seed: int, num: int = 100) -> dict[str, Any]:
@@ -35,7 +37,9 @@ def test_samples_are_in_range_and_depend_on_seed_and_dimension(kind: str) -> Non
 
 
 def test_sobol_fills_evenly() -> None:
-    """Each of 2^k equal cells gets one point of a scrambled sequence of 2^k, in every dimension [Owen 1995]."""
+    """Each of 2^k equal cells gets one point of a scrambled sequence of 2^k, in every dimension
+    [Owen 1995].
+    """
     for dimension in range(3):
         unit = (np.array(values(sampled("sobol", 5, 64), dimension)) - 100) / 1200
         assert sorted((unit * 64).astype(int)) == list(range(64))

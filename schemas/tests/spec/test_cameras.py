@@ -57,7 +57,9 @@ def test_position_is_where_the_depth_vanishes() -> None:
         ([0.0, 0.0, 1.0], 0.0, 0.0, -0.5 + 130.0 / 3.0),  # row 60 - 103.3
     ],
 )
-def test_overflow_is_measured_in_pixels(point: list[float], radius: float, margin: float, expected: float) -> None:
+def test_overflow_is_measured_in_pixels(
+    point: list[float], radius: float, margin: float, expected: float
+) -> None:
     assert LEVEL.overflow([point], radius, margin) == pytest.approx(expected)
 
 
@@ -67,7 +69,14 @@ def test_one_point_outside_is_enough() -> None:
 
 def test_looking_at_puts_the_target_in_the_middle_and_up_on_top() -> None:
     camera = looking_at(
-        (0.1, -0.2, 0.3), azimuth=30.0, elevation=20.0, distance=2.0, name="a", width=64, height=48, focal=80.0
+        (0.1, -0.2, 0.3),
+        azimuth=30.0,
+        elevation=20.0,
+        distance=2.0,
+        name="a",
+        width=64,
+        height=48,
+        focal=80.0,
     )
     (middle, above), depth = camera.project([[0.1, -0.2, 0.3], [0.1, -0.2, 0.4]])
     np.testing.assert_allclose(middle, [31.5, 23.5])
@@ -107,33 +116,49 @@ def test_rod_4_is_four_upright_views_that_never_face_each_other() -> None:
         assert top[0] == pytest.approx(111.5, abs=1e-6)
         assert top[1] < 20.0
     azimuths = [float(np.degrees(np.arctan2(*camera.position[1::-1]))) for camera in rig]
-    np.testing.assert_allclose(np.sort(np.mod(azimuths, 180.0)), [0.0, 45.0, 90.0, 135.0], atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(np.mod(azimuths, 180.0)), [0.0, 45.0, 90.0, 135.0], atol=1e-6
+    )
 
 
 def test_rod_4_holds_every_rod_of_the_thesis_grid() -> None:
-    # Envelope of 1,200 solved rods over the grid, rounded up: down to z, the reach from the vertical axis [L].
+    # Envelope of 1,200 solved rods over the grid, rounded up: down to z, the reach from the
+    # vertical axis [L].
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for z, reach in ((-0.05, 0.12), (-0.1, 0.14), (-0.6, 0.21), (-0.9, 0.31), (-0.95, 0.21), (-0.99, 0.13)):
+    for z, reach in (
+        (-0.05, 0.12),
+        (-0.1, 0.14),
+        (-0.6, 0.21),
+        (-0.9, 0.31),
+        (-0.95, 0.21),
+        (-0.99, 0.13),
+    ):
         points = np.column_stack([reach * ring, np.full(len(ring), z)])
         for camera in load_rig("rod-4"):
             assert camera.overflow(points, radius=0.008, margin=1.0) <= 0.0, (camera.name, z)
 
 
 def test_the_digest_of_a_rig_changes_only_on_purpose() -> None:
-    # It is in the content key of every picture: new numbers here mean that all of them are rendered again.
+    # It is in the content key of every picture: new numbers here mean that all of them are rendered
+    # again.
     assert rig_digest("rod-4") == "7f05db0f5bd5091e8af78f9fbeb82fb6cd977bfd2a3a3f79a15e0cb0d2e0932c"
 
 
 def test_drag_is_the_viewpoints_and_holds_the_stage() -> None:
     rig = load_rig("drag")
-    names = [camera.name for camera in rig]  # in the order of their codes, to which names may only be added
+    names = [
+        camera.name for camera in rig
+    ]  # in the order of their codes, to which names may only be added
     assert names[:5] == ["calibrated", "left", "right", "azimuth-minus-15", "azimuth-minus-10"]
     assert (names[9], names[14]) == ("elevation-minus-15", "elevation-plus-15")
-    # After the drop by 6 cm, the lower edge lies up to 6 cm from the plane of the holders. Then friction holds it back,
-    # so it is never further out than where it lay or where the holders have been, and 7 cm.
+    # After the drop by 6 cm, the lower edge lies up to 6 cm from the plane of the holders. Then
+    # friction holds it back, so it is never further out than where it lay or where the holders have
+    # been, and 7 cm.
     floor = [(x, y, 0.0) for x in (-0.07, 0.37) for y in (-0.11, 0.11)]
-    held = [(x, y, 0.15) for x in (0.0, 0.3) for y in (-0.105, 0.105)] + [(0.0, y, 0.21) for y in (-0.105, 0.105)]
+    held = [(x, y, 0.15) for x in (0.0, 0.3) for y in (-0.105, 0.105)] + [
+        (0.0, y, 0.21) for y in (-0.105, 0.105)
+    ]
     for camera in rig:
         assert camera.overflow(floor + held, margin=1.0) <= 0.0, camera.name
     for camera in rig[:3]:
@@ -163,7 +188,9 @@ def test_a_lens_moves_points_as_opencv_says() -> None:
     """Numbers of cv2.projectPoints, for x, y = 0.1, -0.05 and 0.3, 0.2."""
     camera = LEVEL.model_copy(update={"distortion": PHONE})
     pixels, _ = camera.project([[0.0, 0.3, 0.15], [0.0, 0.9, -0.6]])
-    np.testing.assert_allclose(pixels, [[119.884022, 44.563022], [176.831667, 119.887224]], atol=1e-5)
+    np.testing.assert_allclose(
+        pixels, [[119.884022, 44.563022], [176.831667, 119.887224]], atol=1e-5
+    )
 
 
 def test_rays_and_pinhole_undo_the_lens() -> None:
@@ -185,7 +212,13 @@ def test_rays_and_pinhole_undo_the_lens() -> None:
 def test_a_lens_has_none_four_or_five_numbers() -> None:
     numbers = LEVEL.model_dump()
     assert Camera.model_validate(numbers | {"distortion": []}).distortion == (0.0,) * 5
-    assert Camera.model_validate(numbers | {"distortion": [1, 2, 3, 4]}).distortion == (1.0, 2.0, 3.0, 4.0, 0.0)
+    assert Camera.model_validate(numbers | {"distortion": [1, 2, 3, 4]}).distortion == (
+        1.0,
+        2.0,
+        3.0,
+        4.0,
+        0.0,
+    )
     with pytest.raises(ValidationError, match="distortion"):
         Camera.model_validate(numbers | {"distortion": [0.1]})
 

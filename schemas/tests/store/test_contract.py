@@ -15,7 +15,14 @@ import pytest
 import zarr
 import zarr.storage
 from stickslip_schemas.base import sha256
-from stickslip_schemas.store import CorruptArtifactError, DirectoryStore, Store, artifact_name, open_store, store_place
+from stickslip_schemas.store import (
+    CorruptArtifactError,
+    DirectoryStore,
+    Store,
+    artifact_name,
+    open_store,
+    store_place,
+)
 from zarr.abc.store import Store as ZarrStore
 
 if TYPE_CHECKING:
@@ -44,13 +51,20 @@ def directory(root: Path) -> Place:
     def damage(digest: str, data: bytes) -> None:
         store.path(digest).write_bytes(data)
 
-    return Place(root.as_uri(), store, damage, lambda path: zarr.storage.LocalStore(root / path, read_only=True))
+    return Place(
+        root.as_uri(),
+        store,
+        damage,
+        lambda path: zarr.storage.LocalStore(root / path, read_only=True),
+    )
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator["Proxy"]:
     """A real S3 server behind a proxy."""
-    pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+    pytest.importorskip(
+        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+    )
     pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
     from stickslip_testing.s3 import s3_proxy
 
@@ -159,7 +173,9 @@ def test_what_is_not_there_is_said_so(store: Store) -> None:
     assert not store.is_shown("ds-1", 1)
 
 
-@pytest.mark.parametrize("name", ["", "../../etc/passwd", "A" * 64, "f" * 63, f".{'f' * 64}./x.tmp", f".{'f' * 64}.tm"])
+@pytest.mark.parametrize(
+    "name", ["", "../../etc/passwd", "A" * 64, "f" * 63, f".{'f' * 64}./x.tmp", f".{'f' * 64}.tm"]
+)
 def test_only_a_digest_names_an_artifact(store: Store, name: str) -> None:
     for ask in (
         store.read,
@@ -215,8 +231,13 @@ def test_a_version_shows_artifacts_until_it_is_hidden(store: Store) -> None:
     assert store.shows(shard, "ds-1", 1, "views/c/0")
     assert not store.shows(other, "ds-1", 1, "views/c/0")
     assert not store.shows(shard, "ds-1", 1, "views/c/1")
-    assert [(found.dataset, found.version) for found in store.versions("views/c/0")] == [("ds-1", 1), ("ds-1", 12)]
-    assert [(found.dataset, found.version) for found in store.versions("manifest.json")] == [("ds-2", 1)]
+    assert [(found.dataset, found.version) for found in store.versions("views/c/0")] == [
+        ("ds-1", 1),
+        ("ds-1", 12),
+    ]
+    assert [(found.dataset, found.version) for found in store.versions("manifest.json")] == [
+        ("ds-2", 1)
+    ]
     assert sorted(file.name for file in store.stored()) == sorted([shard, other])
     for _ in range(2):
         store.hide("ds-1", 1)
@@ -242,7 +263,9 @@ def test_a_version_keeps_what_it_shows(store: Store) -> None:
     assert store.shows(digest, "ds-1", 1, "file")
 
 
-@pytest.mark.parametrize("path", ["", "/etc/passwd", "../v2/file", "views/../../x", "views//c", "./file"])
+@pytest.mark.parametrize(
+    "path", ["", "/etc/passwd", "../v2/file", "views/../../x", "views//c", "./file"]
+)
 def test_a_version_shows_nothing_outside_itself(store: Store, path: str) -> None:
     digest = store.publish(b"shard")
     for ask in (store.show, store.shows):
@@ -298,7 +321,11 @@ def test_a_plain_zarr_reader_opens_a_version(place: Place) -> None:
 def test_stores_are_opened_by_path_and_by_url(tmp_path: Path) -> None:
     root = tmp_path / "a store"
     digest = open_store(root).publish(b"data")
-    for place in (str(root), root.as_uri(), f"file://localhost{root.as_uri().removeprefix('file://')}"):
+    for place in (
+        str(root),
+        root.as_uri(),
+        f"file://localhost{root.as_uri().removeprefix('file://')}",
+    ):
         assert open_store(place).read(digest) == b"data"
 
 
@@ -309,12 +336,16 @@ def test_stores_are_opened_by_path_and_by_url(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_other_urls_are_refused(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"store must be a directory, .*; got '.*'\. Write \./NAME"):
+    with pytest.raises(
+        ValueError, match=r"store must be a directory, .*; got '.*'\. Write \./NAME"
+    ):
         open_store(url)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_is_the_same_for_every_process_of_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_is_the_same_for_every_process_of_a_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     here = str(tmp_path / "a store")
     for place in ("a store", Path("a store"), here, Path(here).as_uri()):
@@ -329,6 +360,7 @@ def test_a_bucket_without_obstore_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delitem(sys.modules, "stickslip_schemas.store.bucket", raising=False)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(
-        ValueError, match=r"needs obstore, which is not installed: pip install 'stickslip-schemas\[s3\]'"
+        ValueError,
+        match=r"needs obstore, which is not installed: pip install 'stickslip-schemas\[s3\]'",
     ):
         open_store("s3://bucket/store")

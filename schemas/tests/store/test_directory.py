@@ -71,8 +71,14 @@ def test_a_damaged_artifact_is_mended_in_all_versions(tmp_path: Path, wrong: byt
     store.path(digest).write_bytes(wrong)
     assert store.read_shown("ds-1", 2, "views/c/0") == wrong
     store.publish(b"shard")
-    assert [store.read_shown("ds-1", version, "views/c/0") for version in (1, 2)] == [b"shard", b"shard"]
-    assert [store.read_shown("ds-1", version, "views/c/1") for version in (1, 2)] == [b"other", b"other"]
+    assert [store.read_shown("ds-1", version, "views/c/0") for version in (1, 2)] == [
+        b"shard",
+        b"shard",
+    ]
+    assert [store.read_shown("ds-1", version, "views/c/1") for version in (1, 2)] == [
+        b"other",
+        b"other",
+    ]
     assert store.path(digest).stat().st_nlink == 3
 
 
@@ -86,9 +92,15 @@ def test_link_copies_where_it_cannot_link(tmp_path: Path, monkeypatch: pytest.Mo
     assert (store.dataset_path("ds-1", 1) / "file").read_bytes() == b"shard"
 
 
-def test_a_file_and_its_name_are_synced_before_a_write_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_and_its_name_are_synced_before_a_write_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     synced: list[Path] = []
-    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()))
+    monkeypatch.setattr(
+        os,
+        "fsync",
+        lambda descriptor: synced.append(Path(f"/proc/self/fd/{descriptor}").readlink()),
+    )
     write_durably(tmp_path / "file", b"data")
     assert synced[0].name.startswith(".file.")
     assert synced[1:] == [tmp_path]

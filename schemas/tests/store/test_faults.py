@@ -9,7 +9,9 @@ import pytest
 from stickslip_schemas.base import sha256
 from stickslip_schemas.store import is_unavailable
 
-pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'")
+pytest.importorskip(
+    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
+)
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 import obstore
@@ -32,7 +34,9 @@ def server() -> Iterator[Proxy]:
 
 
 @pytest.fixture
-def proxy(server: Proxy, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+def proxy(
+    server: Proxy, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Proxy]:
     for variable, value in variables(server).items():
         monkeypatch.setenv(variable, value)
     server.fault = no_fault
@@ -46,7 +50,9 @@ def store(proxy: Proxy, request: pytest.FixtureRequest) -> BucketStore:
     return BucketStore("bucket", request.node.name)
 
 
-def test_a_bucket_without_a_request_for_many_deletes_one_by_one(proxy: Proxy, store: BucketStore) -> None:
+def test_a_bucket_without_a_request_for_many_deletes_one_by_one(
+    proxy: Proxy, store: BucketStore
+) -> None:
     kept, gone = store.publish(SMALL), store.publish(LARGE)
     store.show(gone, "dataset", 1, "a")
     store.show(gone, "dataset", 1, "b")
@@ -61,7 +67,11 @@ def test_a_bucket_without_a_request_for_many_deletes_one_by_one(proxy: Proxy, st
 @pytest.mark.parametrize("fault", FAULTS)
 def test_every_request_may_fail_once(proxy: Proxy, store: BucketStore, fault: str) -> None:
     for data in (SMALL, LARGE):
-        for step in (store.publish, lambda data: store.read(sha256(data)), lambda data: store.size(sha256(data))):
+        for step in (
+            store.publish,
+            lambda data: store.read(sha256(data)),
+            lambda data: store.size(sha256(data)),
+        ):
             seen: set[tuple[str, str]] = set()
 
             def once(method: str, path: str, seen: set[tuple[str, str]] = seen) -> str:
@@ -118,14 +128,18 @@ def test_one_conditional_put_of_many_wins(proxy: Proxy, store: BucketStore) -> N
 
     def put(name: str, number: int) -> int | None:
         try:
-            obstore.put(store._objects, name, bytes([number]) * 1000, mode="create", use_multipart=False)
+            obstore.put(
+                store._objects, name, bytes([number]) * 1000, mode="create", use_multipart=False
+            )
             return number
         except obstore.exceptions.AlreadyExistsError:
             return None
 
     for race in range(25):
         with ThreadPoolExecutor(8) as writers:
-            results = list(writers.map(lambda number, name=f"race-{race}": put(name, number), range(8)))
+            results = list(
+                writers.map(lambda number, name=f"race-{race}": put(name, number), range(8))
+            )
         (winner,) = [number for number in results if number is not None]
         assert store._get(f"race-{race}") == bytes([winner]) * 1000
 

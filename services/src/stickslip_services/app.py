@@ -3,8 +3,8 @@
     python -m stickslip_services.app --data DIR --port N
     python -m stickslip_services.app --openapi > docs/openapi.json
 
-The port is bound first, so that `--port 0` can print the port that it got. The line `listening on http://...` on
-standard output means that requests are answered.
+The port is bound first, so that `--port 0` can print the port that it got. The line `listening on
+http://...` on standard output means that requests are answered.
 """
 
 import asyncio
@@ -60,7 +60,10 @@ GRACE_SECONDS = 3
 
 
 async def _repeat(run_once: Callable[[], object], seconds: float) -> None:
-    """Call a function in a thread, again and again, with pauses of `seconds` [s]. Log its errors, and go on."""
+    """Call a function in a thread, again and again, with pauses of `seconds` [s].
+
+    Log its errors, and go on.
+    """
     while True:
         await asyncio.sleep(seconds)
         try:
@@ -112,15 +115,20 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.feeds = Feeds(context)
     app.state.renewals = workers.Gathering(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
-    # The routes of the workers come first: they are asked for most, and a request is compared with one after the other.
+    # The routes of the workers come first: they are asked for most, and a request is compared with
+    # one after the other.
     modules = (workers, jobs, catalog, health, job_pages, dataset_pages)
     app.state.routes = [route for module in modules for route in module.router.routes]
     app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     problems.install(app)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign]
-    app.add_middleware(middleware.KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required)
-    app.add_middleware(middleware.OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host))
+    app.add_middleware(
+        middleware.KeyMiddleware, ring=KeyRing(context.database), required=settings.keys_required
+    )
+    app.add_middleware(
+        middleware.OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host)
+    )
     app.add_middleware(middleware.RequestMiddleware, observe=metrics.observe)
     return app
 
@@ -128,7 +136,14 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
 def openapi_text() -> str:
     """Return the OpenAPI document in its committed form."""
     with TemporaryDirectory() as data:
-        return json.dumps(make_app(Settings(data=Path(data), database=None)).openapi(), indent=2, sort_keys=True) + "\n"
+        return (
+            json.dumps(
+                make_app(Settings(data=Path(data), database=None)).openapi(),
+                indent=2,
+                sort_keys=True,
+            )
+            + "\n"
+        )
 
 
 class _Server(uvicorn.Server):
@@ -140,8 +155,11 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
-        gc.freeze()  # modules and application stay: each look through them would stop all requests for 50 ms
-        gc.set_threshold(50_000)  # a plan has a million small objects without cycles: looking often takes a fifth of it
+        # modules and application stay: each look through them would stop all requests for 50 ms
+        gc.freeze()
+        gc.set_threshold(
+            50_000
+        )  # a plan has a million small objects without cycles: looking often takes a fifth of it
         if self.started:
             sys.stdout.write(f"listening on {self._url}\n")
             sys.stdout.flush()
@@ -165,14 +183,20 @@ def _coordinator(settings: Settings, openapi: bool, migrate: bool, fd: int | Non
     if migrate:
         with opened(settings, Role.visitor):
             return 0
-    # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its data itself.
+    # `stickslip up` hands down its socket and its lock. Alone, the coordinator keeps others off its
+    # data itself.
     with locked(settings.data) if fd is None else nullcontext():
-        return _serve(settings, listen(settings.host, settings.port) if fd is None else socket.socket(fileno=fd))
+        return _serve(
+            settings,
+            listen(settings.host, settings.port) if fd is None else socket.socket(fileno=fd),
+        )
 
 
 def main(arguments: list[str] | None = None) -> int:
     try:
-        return int(_coordinator.main(arguments, "python -m stickslip_services.app", standalone_mode=False))
+        return int(
+            _coordinator.main(arguments, "python -m stickslip_services.app", standalone_mode=False)
+        )
     except click.ClickException as error:
         error.show()
     except (ClientError, CommandError) as error:

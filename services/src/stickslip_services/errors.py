@@ -7,7 +7,10 @@ from stickslip_schemas.documents.problems import FieldError
 
 
 class StickslipError(Exception):
-    """Base of the errors of the coordinator; `fields` are the fields of the request that break a rule."""
+    """Base of the errors of the coordinator.
+
+    `fields` are the fields of the request that break a rule.
+    """
 
     fields: Sequence[FieldError] = ()
 
@@ -77,7 +80,9 @@ class DamagedRowsError(StickslipError):
 
     def __init__(self, results: Sequence[int] = ()) -> None:
         self.results = results
-        super().__init__("rows of the job are damaged in the database. If it cannot go on, submit its spec again")
+        super().__init__(
+            "rows of the job are damaged in the database. If it cannot go on, submit its spec again"
+        )
 
 
 class CommandError(Exception):

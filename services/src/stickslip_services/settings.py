@@ -30,13 +30,21 @@ class Settings(BaseSettings):
     data: Path = Path("stickslip-data")
     """Directory of keys and logs, and by default of database and store (stickslip-data)."""
     store: str | None = None
-    """Place of the store, a directory or `s3://BUCKET/PREFIX`; by default `store` in the data directory."""
+    """Place of the store, a directory or `s3://BUCKET/PREFIX`; by default `store` in the data
+    directory.
+    """
     database: SecretStr | None = None
-    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; give one with a password as STICKSLIP_DATABASE."""
+    """URL of a PostgreSQL database, `postgresql://USER@HOST/NAME`; give one with a password as
+    STICKSLIP_DATABASE.
+    """
     secrets_key: SecretStr | None = None
-    """Key that seals secrets in the database, 32 bytes in base64; null: that of the file `data/secrets-key`."""
+    """Key that seals secrets in the database, 32 bytes in base64; null: that of the file
+    `data/secrets-key`.
+    """
     host: str = "127.0.0.1"
-    """Address to listen on (127.0.0.1); off loopback only with keys, and with TLS or behind a proxy."""
+    """Address to listen on (127.0.0.1); off loopback only with keys, and with TLS or behind a
+    proxy.
+    """
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535)
     """Port to listen on (8765); 0: any free one."""
 
@@ -54,7 +62,9 @@ class Settings(BaseSettings):
     """Private key of OpenSSH that signs the versions that are published."""
 
     durable: bool = True
-    """Wait for the disk at each commit; tests turn it off. Without it a power cut may lose accepted results."""
+    """Wait for the disk at each commit; tests turn it off. Without it a power cut may lose accepted
+    results.
+    """
     lease_seconds: float = Field(default=30.0, gt=0)
     """Duration of a lease without a heartbeat [s]."""
     max_tries: int = Field(default=3, ge=1)
@@ -70,7 +80,9 @@ class Settings(BaseSettings):
     sweep_seconds: float = Field(default=1.0, gt=0)
     """Polling interval for expired leases and due retries [s]."""
     plan_samples: int = Field(default=500, ge=1)
-    """Largest job that is planned at once, and size of the pieces of larger ones [samples], 30 to 60 ms each."""
+    """Largest job that is planned at once, and size of the pieces of larger ones [samples], 30 to
+    60 ms each.
+    """
     lease_limit: int = Field(default=1000, ge=1)
     """Largest number of tasks of one stage that a request gets."""
     min_free_bytes: int = Field(default=256 * 2**20, ge=0)
@@ -82,18 +94,29 @@ class Settings(BaseSettings):
 
     @classmethod
     def chosen(cls, **values: Any) -> Self:
-        """Return settings with these values, those that are not given from the environment; raise SettingsError."""
+        """Return settings with these values, those that are not given from the environment; raise
+        SettingsError.
+        """
         try:
             return cls(**{name: value for name, value in values.items() if value not in (None, ())})
         except ValidationError as error:
-            rules = (item["msg"].removeprefix("Value error, ") for item in error.errors(include_input=False))
+            rules = (
+                item["msg"].removeprefix("Value error, ")
+                for item in error.errors(include_input=False)
+            )
             raise SettingsError("; ".join(rules)) from None
 
     @field_validator("allowed_hosts")
     @classmethod
     def _are_names(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
-        if wrong := [host for host in hosts if re.fullmatch(r"[\w.-]+|\[[\da-fA-F:]+\]", host, re.ASCII) is None]:
-            raise ValueError(f"allowed_hosts must be names or addresses without a port; one is {wrong[0]!r}")
+        if wrong := [
+            host
+            for host in hosts
+            if re.fullmatch(r"[\w.-]+|\[[\da-fA-F:]+\]", host, re.ASCII) is None
+        ]:
+            raise ValueError(
+                f"allowed_hosts must be names or addresses without a port; one is {wrong[0]!r}"
+            )
         return hosts
 
     @field_validator("store")
@@ -120,13 +143,17 @@ class Settings(BaseSettings):
                     shown = "something else, which is not shown because it may hold a password"
                 else:
                     shown = repr(value[:100])
-                raise ValueError(f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown}")
+                raise ValueError(
+                    f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown}"
+                )
         return database
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> Self:
         if (self.tls_certificate is None) != (self.tls_key is None):
-            raise ValueError("tls_certificate and tls_key must be given together; one of them is missing")
+            raise ValueError(
+                "tls_certificate and tls_key must be given together; one of them is missing"
+            )
         for name in ("tls_certificate", "tls_key", "signing_key"):
             path: Path | None = getattr(self, name)
             if path is not None and not path.is_file():
@@ -142,11 +169,19 @@ class Settings(BaseSettings):
     @property
     def keys_required(self) -> bool:
         """Whether every request without a key is refused."""
-        return self.require_keys or self.behind_proxy or self.tls_certificate is not None or not is_loopback(self.host)
+        return (
+            self.require_keys
+            or self.behind_proxy
+            or self.tls_certificate is not None
+            or not is_loopback(self.host)
+        )
 
     @property
     def database_url(self) -> URL | None:
-        """URL of the PostgreSQL database, which shows no password when printed; None if it is SQLite."""
+        """URL of the PostgreSQL database, which shows no password when printed.
+
+        None if it is SQLite.
+        """
         if self.database is None:
             return None
         return make_url(self.database.get_secret_value()).set(drivername="postgresql+psycopg")
@@ -160,7 +195,11 @@ class Settings(BaseSettings):
     def database_name(self) -> str:
         """Name of the database for messages, without a password."""
         url = self.database_url
-        return str(self.database_path) if url is None else url.set(drivername="postgresql", query={}).render_as_string()
+        return (
+            str(self.database_path)
+            if url is None
+            else url.set(drivername="postgresql", query={}).render_as_string()
+        )
 
     @property
     def database_option(self) -> str:
@@ -179,9 +218,13 @@ class Settings(BaseSettings):
     @property
     def url(self) -> str:
         """URL of the coordinator on this machine."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)  # where this machine reaches it
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(
+            self.host, self.host
+        )  # where this machine reaches it
         scheme = "http" if self.tls_certificate is None else "https"
-        return f"{scheme}://[{host}]:{self.port}" if ":" in host else f"{scheme}://{host}:{self.port}"
+        return (
+            f"{scheme}://[{host}]:{self.port}" if ":" in host else f"{scheme}://{host}:{self.port}"
+        )
 
     @property
     def variables(self) -> dict[str, str]:
@@ -190,12 +233,16 @@ class Settings(BaseSettings):
         for name in sorted(self.model_fields_set):
             value = getattr(self, name)
             text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
-            found[f"STICKSLIP_{name.upper()}"] = json.dumps(value) if isinstance(value, tuple) else text
+            found[f"STICKSLIP_{name.upper()}"] = (
+                json.dumps(value) if isinstance(value, tuple) else text
+            )
         return found
 
 
 def options(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command options for some settings: it gets the settings first, those without an option as by default."""
+    """Give a command options for some settings: it gets the settings first, those without an option
+    as by default.
+    """
 
     def decorate(command: Callable[..., R]) -> Callable[..., R]:
         @functools.wraps(command)
@@ -205,7 +252,9 @@ def options(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
         for name in reversed(names):
             field = Settings.model_fields[name]
             flag = "--allow-host" if name == "allowed_hosts" else f"--{name.replace('_', '-')}"
-            run = click.option(flag, name, help=field.description, **_KINDS.get(field.annotation, {}))(run)
+            run = click.option(
+                flag, name, help=field.description, **_KINDS.get(field.annotation, {})
+            )(run)
         return run
 
     return decorate

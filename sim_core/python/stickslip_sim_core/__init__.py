@@ -1,11 +1,27 @@
-"""The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python layer."""
+"""The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python
+layer.
+"""
 
 from stickslip_sim_core._sim_core import BuildInfo, PairForces, build_info, self_intersections
-from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface, box, capsule, cylinder, plane, sphere
+from stickslip_sim_core.cloth.contact import (
+    Body,
+    SelfContact,
+    Surface,
+    box,
+    capsule,
+    cylinder,
+    plane,
+    sphere,
+)
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric, fabric_names, isotropic
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.rods.fit import NaturalFit, ParameterFit, fit_natural_curvature, fit_parameters
+from stickslip_sim_core.rods.fit import (
+    NaturalFit,
+    ParameterFit,
+    fit_natural_curvature,
+    fit_parameters,
+)
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import OtherMinima, other_minima, reach, self_contact_distance
 from stickslip_sim_core.rods.solve import RodSolution, solve_general_rods, solve_rods

@@ -22,14 +22,17 @@ using namespace nb::literals;
 
 namespace {
 
-using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d, Eigen::Matrix3d>;
+using BodyTuple =
+    std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d, Eigen::Matrix3d>;
 
 using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
 using MotionCallback =
-    std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(double time)>;
+    std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(
+        double time)>;
 
-using PathCallback = std::function<std::pair<Points3, decltype(Track::poses)>(const std::vector<double>& times)>;
+using PathCallback =
+    std::function<std::pair<Points3, decltype(Track::poses)>(const std::vector<double>& times)>;
 
 struct DriveNow {
   Points3 gravity, held, surfaces;
@@ -48,21 +51,29 @@ std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
 
 void bind_cloth(nb::module_& m) {
   m.def(
-      "sheet_count", [](const Points2& rest, const Triangles& triangles) { return ClothMesh(rest, triangles).sheets; },
+      "sheet_count",
+      [](const Points2& rest, const Triangles& triangles) {
+        return ClothMesh(rest, triangles).sheets;
+      },
       "rest"_a, "triangles"_a,
-      "Internal: number of pieces of a mesh that hang together. Raises ValueError, naming the field, unless it is a "
+      "Internal: number of pieces of a mesh that hang together. Raises ValueError, naming the "
+      "field, unless it is a "
       "triangulation that cloth can have.");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
       "Internal: constants of the cloth solver by name; see cloth/settings.hpp.");
-  nb::class_<Observed>(m, "Observed", "Worst values over the accepted steps, for the checks of a run.")
+  nb::class_<Observed>(m, "Observed",
+                       "Worst values over the accepted steps, for the checks of a run.")
       .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
-      .def_ro("depth", &Observed::depth, "Largest depth in a body beyond what round bodies allow [cells].")
+      .def_ro("depth", &Observed::depth,
+              "Largest depth in a body beyond what round bodies allow [cells].")
       .def_ro("passages", &Observed::passages, "Triangles that passed the core of a body.")
-      .def_ro("contact_work", &Observed::contact_work, "Work of bodies on motion against them, where positive [J].")
-      .def_ro("flow", &Observed::flow, "Sum of the sizes of all changes of energy and of all work [J].")
+      .def_ro("contact_work", &Observed::contact_work,
+              "Work of bodies on motion against them, where positive [J].")
+      .def_ro("flow", &Observed::flow,
+              "Sum of the sizes of all changes of energy and of all work [J].")
       .def_ro("gain", &Observed::gain, "Largest energy gained beyond the work of all forces [J].");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
@@ -71,34 +82,42 @@ void bind_cloth(nb::module_& m) {
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
       .def_ro("steps", &StepReport::steps)
       .def_ro("unconverged", &StepReport::unconverged)
-      .def_ro("missed", &StepReport::missed, "Steps of the controller that are further off than it allows.")
+      .def_ro("missed", &StepReport::missed,
+              "Steps of the controller that are further off than it allows.")
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
       .def_ro("seen", &StepReport::seen)
-      .def_ro("sharpest", &StepReport::sharpest, "Least radius of a skeleton that cloth touched, in cells.")
+      .def_ro("sharpest", &StepReport::sharpest,
+              "Least radius of a skeleton that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,
-              "Distance of what drives the cloth from an even motion within a step of the controller [m].")
+              "Distance of what drives the cloth from an even motion within a step of the "
+              "controller [m].")
       .def_ro("least_distance", &StepReport::least_distance,
-              "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite where none are near.");
+              "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite "
+              "where none are near.");
   using PairForces = ClothSolver::PairForces;
-  nb::class_<PairForces>(
-      m, "PairForces", "Forces of cloth on cloth, surfaces and the skeletons of bodies, at P pairs of closest points.")
+  nb::class_<PairForces>(m, "PairForces",
+                         "Forces of cloth on cloth, surfaces and the skeletons of bodies, at P "
+                         "pairs of closest points.")
       .def_ro("vertices", &PairForces::vertices,
               "(P, 4); those of surfaces and then of skeletons come after those of the cloth.")
-      .def_ro("weights", &PairForces::weights, "(P, 4): the force acts on each vertex by its weight.")
+      .def_ro("weights", &PairForces::weights,
+              "(P, 4): the force acts on each vertex by its weight.")
       .def_ro("forces", &PairForces::forces, "(P, 3) [N]")
       .def_ro("distance", &PairForces::distance, "(P,) [m]")
       .def_ro("sliding", &PairForces::sliding, "(P,)")
       .def_ro("body", &PairForces::body, "(P,): number of the body, or -1.");
-  nb::class_<ClothSolver>(m, "ClothSolver", "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
+  nb::class_<ClothSolver>(m, "ClothSolver",
+                          "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
       .def(
           "__init__",
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
-             const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held, double tolerance,
-             int newton_max, double krylov_tolerance, int refactor_after, int patience, int halvings_max,
-             double step_error, double longest_step, int finest, const std::string& kernel,
-             const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_share, double second_share,
+             const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held,
+             double tolerance, int newton_max, double krylov_tolerance, int refactor_after,
+             int patience, int halvings_max, double step_error, double longest_step, int finest,
+             const std::string& kernel, const std::vector<double>& thickness,
+             const Eigen::MatrixXd& mu, double edge_share, double second_share,
              const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
              const Points3& surface_positions, const std::vector<double>& crease,
              const std::map<std::string, double>& changed) {
@@ -107,32 +126,35 @@ void bind_cloth(nb::module_& m) {
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, stretching, rigidity, damping});
             }
-            new (self) ClothSolver({rest,
-                                    triangles,
-                                    list,
-                                    held,
-                                    {tolerance, newton_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                                    {step_error, longest_step, finest},
-                                    kernel,
-                                    {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share,
-                                     second_share, constants.contact.surface_share},
-                                    {surface_triangles, surface_of_vertex, surface_positions, crease},
-                                    constants});
+            new (self) ClothSolver(
+                {rest,
+                 triangles,
+                 list,
+                 held,
+                 {tolerance, newton_max, krylov_tolerance, refactor_after, patience, halvings_max},
+                 {step_error, longest_step, finest},
+                 kernel,
+                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share,
+                  second_share, constants.contact.surface_share},
+                 {surface_triangles, surface_of_vertex, surface_positions, crease},
+                 constants});
           },
-          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a, "newton_max"_a,
-          "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a, "step_error"_a, "longest_step"_a,
-          "finest"_a, "kernel"_a, "thickness"_a, "mu"_a, "edge_share"_a, "second_share"_a, "surface_triangles"_a,
-          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a, "constants"_a = std::map<std::string, double>())
+          "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a,
+          "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a,
+          "step_error"_a, "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a,
+          "edge_share"_a, "second_share"_a, "surface_triangles"_a, "surface_of_vertex"_a,
+          "surface_positions"_a, "crease"_a, "constants"_a = std::map<std::string, double>())
       .def(
           "set_state",
-          [](ClothSolver& self, const Points3& positions, const Points3& velocities, const Points3& surfaces,
-             const std::vector<BodyTuple>& bodies,
-             bool begins) { self.set_state(positions, velocities, surfaces, bodies_of(bodies), begins); },
+          [](ClothSolver& self, const Points3& positions, const Points3& velocities,
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies, bool begins) {
+            self.set_state(positions, velocities, surfaces, bodies_of(bodies), begins);
+          },
           "positions"_a, "velocities"_a, "surfaces"_a, "bodies"_a, "begins"_a)
       .def(
           "step",
-          [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
-             const std::vector<BodyTuple>& bodies, double damping) {
+          [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held,
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies, double damping) {
             const std::vector<Body> list = bodies_of(bodies);
             nb::gil_scoped_release release;
             return self.step(dt, gravity, held, surfaces, list, damping);
@@ -140,7 +162,8 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
-          [](ClothSolver& self, double time, double event, const MotionCallback& motion, const PathCallback& path) {
+          [](ClothSolver& self, double time, double event, const MotionCallback& motion,
+             const PathCallback& path) {
             DriveNow now;
             nb::gil_scoped_release release;
             const auto drive = [&](double at) -> Drive {
@@ -149,11 +172,12 @@ void bind_cloth(nb::module_& m) {
               now = {gravity, held, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.surfaces, now.bodies, damping};
             };
-            const StepReport report = self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
-              nb::gil_scoped_acquire acquire;
-              auto [points, poses] = path(times);
-              return {points, poses};
-            });
+            const StepReport report =
+                self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
+                  nb::gil_scoped_acquire acquire;
+                  auto [points, poses] = path(times);
+                  return {points, poses};
+                });
             return std::make_tuple(time, report);
           },
           "time"_a, "event"_a, "motion"_a, "path"_a)

@@ -13,7 +13,8 @@ Eigen::RowVector4d combined(const Eigen::RowVector4d& k) {
   return {k[0] + 2.0 * k[1] + k[2], k[0] - k[2], k[0] - 2.0 * k[1] + k[2], 2.0 * k[3]};
 }
 
-// From the values at the angles of the table's rows to the coefficients of the quartic in y = cos(2 angle).
+// From the values at the angles of the table's rows to the coefficients of the quartic in y = cos(2
+// angle).
 Eigen::Matrix<double, 5, 5> powers_of_rows() {
   Eigen::Matrix<double, 5, 5> at_rows;
   const double y[5] = {1.0, std::sqrt(0.5), 0.0, -std::sqrt(0.5), -1.0};
@@ -28,7 +29,8 @@ std::vector<std::vector<int>> grouped(const Fabrics& fabrics) {
   std::vector<std::vector<int>> groups;
   const int count = static_cast<int>(fabrics.of_triangle.size());
   for (int t = 0; t < count; ++t) {
-    const bool other = groups.empty() || fabrics.of_triangle[groups.back()[0]] != fabrics.of_triangle[t];
+    const bool other =
+        groups.empty() || fabrics.of_triangle[groups.back()[0]] != fabrics.of_triangle[t];
     if (other || groups.back().size() == membrane_lanes) groups.emplace_back();
     groups.back().push_back(t);
   }
@@ -37,8 +39,8 @@ std::vector<std::vector<int>> grouped(const Fabrics& fabrics) {
 
 }  // namespace
 
-Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const Fabrics& fabrics,
-                 const Numbering& numbering, const Pattern& pattern)
+Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
+                 const Fabrics& fabrics, const Numbering& numbering, const Pattern& pattern)
     : fabric_(fabrics.of_triangle) {
   const int count = static_cast<int>(stencils.size());
   for (int t = 0; t < count; ++t) {
@@ -64,8 +66,10 @@ Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils, co
     const Rigidity& d = fabric.rigidity;
     rigidity_.insert(rigidity_.end(), {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)});
   }
-  data_ = {count,          begin_.data(),    nodes_.data(),      weights_.data(), area_.data(), spacing2_.data(),
-           fabric_.data(), rigidity_.data(), slot_begin_.data(), slots_.data()};
+  data_ = {count,           begin_.data(),    nodes_.data(),
+           weights_.data(), area_.data(),     spacing2_.data(),
+           fabric_.data(),  rigidity_.data(), slot_begin_.data(),
+           slots_.data()};
 }
 
 Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabrics& fabrics) {
@@ -96,8 +100,10 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
       for (int c = 0; c < 4; ++c) shape_[(4 * group + c) * W + lane] = inverse(c / 2, c % 2);
       area_[group * W + lane] = mesh.area[t];
       int* slots = &slots_[9 * (group * W + lane)];
-      const int pairs[9][2] = {{0, 1}, {1, 0}, {0, 2}, {2, 0}, {1, 2}, {2, 1}, {0, 0}, {1, 1}, {2, 2}};
-      for (int k = 0; k < 9; ++k) slots[k] = numbering.membrane.slot(n[pairs[k][0]], n[pairs[k][1]]);
+      const int pairs[9][2] = {{0, 1}, {1, 0}, {0, 2}, {2, 0}, {1, 2},
+                               {2, 1}, {0, 0}, {1, 1}, {2, 2}};
+      for (int k = 0; k < 9; ++k)
+        slots[k] = numbering.membrane.slot(n[pairs[k][0]], n[pairs[k][1]]);
     }
   }
   const Eigen::Matrix<double, 5, 5> powers = powers_of_rows();
@@ -117,14 +123,17 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
 
 void Membrane::lag_from(const ClothKernel& kernel, const double* x, double share) {
   data_.lag = nullptr;
-  if (share == 0.0 || std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; })) return;
+  if (share == 0.0 ||
+      std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; }))
+    return;
   lag_.resize(9L * membrane_lanes * data_.groups);
   kernel.membrane_lag(data_, x, share, lag_.data());
   data_.lag = lag_.data();
 }
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, int others, int bones, const FactorSettings& settings)
+                   const std::vector<std::int32_t>& held, int others, int bones,
+                   const FactorSettings& settings)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics)),
       compact_stencils(bending_stencils(mesh, fabrics, true)),
@@ -175,25 +184,27 @@ void Assembly::reserve_folds() {
   fold_nodes_.assign(data.begin[data.triangles], 0);
   fold_vectors_.assign(8L * data.begin[data.triangles], 0.0f);
   fold_coefficients_.assign(2L * data.triangles, 0.0f);
-  folds_ = {numbering.free_nodes, settings_.fold_smallest,  0, fold_begin_.data(), fold_nodes_.data(),
-            fold_vectors_.data(), fold_coefficients_.data()};
+  folds_ = {numbering.free_nodes,     settings_.fold_smallest, 0,
+            fold_begin_.data(),       fold_nodes_.data(),      fold_vectors_.data(),
+            fold_coefficients_.data()};
 }
 
 void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   std::fill(gradient.begin(), gradient.end(), 0.0);
   if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
-  membrane_energy =
-      kernel.membrane(membrane_.data(), x.data(), gradient.data(), with_matrix ? blocks_.data() : nullptr, definite);
-  bending_energy =
-      kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(), with_matrix ? &folds_ : nullptr);
+  membrane_energy = kernel.membrane(membrane_.data(), x.data(), gradient.data(),
+                                    with_matrix ? blocks_.data() : nullptr, definite);
+  bending_energy = kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(),
+                                  with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();
 }
 
 void Assembly::assemble_bending() {
   float change_max = 0.0f;
   for (std::size_t t = 0; t < rigidity_scale_.size(); ++t) {
-    change_max = std::max({change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
-                           rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
+    change_max = std::max(
+        {change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
+         rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
   }
   if (!(change_max > static_cast<float>(settings_.stiffening_change))) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
@@ -203,18 +214,21 @@ void Assembly::assemble_bending() {
 
 void Assembly::set_diagonal(double dt, double damping) {
   for (int i = 0; i < numbering.free_nodes; ++i) {
-    diagonal_[i] = static_cast<float>(mass[i] * (1.0 / (dt * dt) + (damping + own_damping[i]) / dt));
+    diagonal_[i] =
+        static_cast<float>(mass[i] * (1.0 / (dt * dt) + (damping + own_damping[i]) / dt));
   }
 }
 
 double Assembly::own_stiffness(int node) const {
   const float* block = &blocks_[12L * membrane_diagonal_[node]];
-  const double own = diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
+  const double own =
+      diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
   return std::max(own, static_cast<double>(diagonal_[node]));
 }
 
 Eigen::Matrix3d Assembly::own_block(int node) const {
-  const Eigen::Map<const Eigen::Matrix3f, 0, Eigen::OuterStride<4>> block(&blocks_[12L * membrane_diagonal_[node]]);
+  const Eigen::Map<const Eigen::Matrix3f, 0, Eigen::OuterStride<4>> block(
+      &blocks_[12L * membrane_diagonal_[node]]);
   const double alike = diagonal_[node] + scalars_[bending_diagonal_[node]];
   const Eigen::Matrix3d own = alike * Eigen::Matrix3d::Identity() + block.cast<double>();
   return own + std::max(0.0, diagonal_[node] - own.trace() / 3.0) * Eigen::Matrix3d::Identity();

@@ -53,7 +53,8 @@ class Assembly {
  public:
   // `others`: vertices of surfaces; `bones`: points of skeletons.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, int others, int bones, const FactorSettings& settings = {});
+           const std::vector<std::int32_t>& held, int others, int bones,
+           const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;
@@ -67,12 +68,16 @@ class Assembly {
   Buffer<double> gradient;                             // (nodes, 4), N
   double membrane_energy = 0.0, bending_energy = 0.0;  // J
   ClothMatrix matrix{};
-  // Whether the matrix has the positive part of the stress and of the law only, as that of a convex energy does.
+  // Whether the matrix has the positive part of the stress and of the law only, as that of a convex
+  // energy does.
   bool definite = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
-  // From now on stretching lags behind what it is at x by this share, none if 0: see kernels/membrane.hpp.
-  void lag_from(const Buffer<double>& x, double share) { membrane_.lag_from(kernel, x.data(), share); }
+  // From now on stretching lags behind what it is at x by this share, none if 0: see
+  // kernels/membrane.hpp.
+  void lag_from(const Buffer<double>& x, double share) {
+    membrane_.lag_from(kernel, x.data(), share);
+  }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);
   // Mean of a node's block on the diagonal, N/m.
@@ -80,8 +85,8 @@ class Assembly {
   // That block, N/m.
   Eigen::Matrix3d own_block(int node) const;
 
-  // K's neighbour that the factor is of: the positive part of the stress and of the law, and the plate element that
-  // couples six nodes in place of twelve.
+  // K's neighbour that the factor is of: the positive part of the stress and of the law, and the
+  // plate element that couples six nodes in place of twelve.
   ClothMatrix neighbour(const Buffer<double>& x, NeighbourNumbers& numbers);
 
  private:
@@ -90,7 +95,7 @@ class Assembly {
 
   Membrane membrane_;
   Bending bending_, compact_bending_;
-  std::vector<float> rigidity_scale_;                      // (triangles): 1 over the largest of its fabric, 1/(N m)
+  std::vector<float> rigidity_scale_;  // (triangles): 1 over the largest of its fabric, 1/(N m)
   std::vector<int> bending_diagonal_, membrane_diagonal_;  // slots
   Buffer<float> scalars_, blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)

@@ -20,31 +20,37 @@ void append(const Triangles& triangles, const int* node, Triples& out) {
 
 void check_thickness(const ClothMesh& mesh, const ContactMaterials& materials) {
   Buffer<double> rest(4L * mesh.rest.rows(), 0.0);
-  for (Eigen::Index i = 0; i < mesh.rest.rows(); ++i) at_node(rest, i).head<2>() = mesh.rest.row(i).transpose();
+  for (Eigen::Index i = 0; i < mesh.rest.rows(); ++i)
+    at_node(rest, i).head<2>() = mesh.rest.row(i).transpose();
   std::vector<int> vertices(mesh.rest.rows());
   std::iota(vertices.begin(), vertices.end(), 0);
   Triples triangles;
   append(mesh.triangles, vertices.data(), triangles);
   const Eigen::Index count = materials.mu.rows();
-  CollisionMask collides =
-      CollisionMask::Constant(count, count, false);  // sheets lie somewhere at rest, not on each other
+  CollisionMask collides = CollisionMask::Constant(
+      count, count, false);  // sheets lie somewhere at rest, not on each other
   for (Eigen::Index s = 0; s < count; ++s) collides(s, s) = materials.mu(s, s) >= 0.0;
   const double reach = *std::max_element(materials.thickness.begin(), materials.thickness.end());
-  for (const Candidate& pair : candidates(Surface(triangles, mesh.sheet_of_vertex, collides), rest, reach)) {
+  for (const Candidate& pair :
+       candidates(Surface(triangles, mesh.sheet_of_vertex, collides), rest, reach)) {
     const FourPoints at = points_of(pair, rest);
     const double thickness = materials.thickness[mesh.sheet_of_vertex[pair.node[0]]];
     if (between_closest(closest_weights(pair.kind, at), at).norm() > thickness) continue;
-    refuse(text("thickness: must be less than the distance at rest of vertices and edges that do not meet, and vertex ",
-                pair.node[0], " is nearer to one than ", thickness, " m"));
+    refuse(
+        text("thickness: must be less than the distance at rest of vertices and edges that do not "
+             "meet, and vertex ",
+             pair.node[0], " is nearer to one than ", thickness, " m"));
   }
 }
 
-// Radius of the smallest circle around a triangle at rest, m: its circumcircle, or that of its longest side.
+// Radius of the smallest circle around a triangle at rest, m: its circumcircle, or that of its
+// longest side.
 double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
   std::array<double, 3> side;
   for (int c = 0; c < 3; ++c) {
-    side[c] =
-        (mesh.rest.row(mesh.triangles(triangle, c)) - mesh.rest.row(mesh.triangles(triangle, (c + 1) % 3))).norm();
+    side[c] = (mesh.rest.row(mesh.triangles(triangle, c)) -
+               mesh.rest.row(mesh.triangles(triangle, (c + 1) % 3)))
+                  .norm();
   }
   std::sort(side.begin(), side.end());
   const auto [a, b, c] = side;
@@ -52,13 +58,16 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
 }
 
 // Sheets, and after them surfaces and skeletons.
-std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering, const SurfaceMeshes& surfaces,
+std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering,
+                                 const SurfaceMeshes& surfaces,
                                  const std::vector<Skeleton>& skeletons) {
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = mesh.sheet_of_vertex[i];
   const int* others = numbering.node.data() + numbering.vertices;
-  for (int i = 0; i < numbering.others; ++i) out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
-  int next = numbering.nodes - numbering.bones, sheet = mesh.sheets + static_cast<int>(surfaces.crease.size());
+  for (int i = 0; i < numbering.others; ++i)
+    out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
+  int next = numbering.nodes - numbering.bones,
+      sheet = mesh.sheets + static_cast<int>(surfaces.crease.size());
   for (const Skeleton& skeleton : skeletons) {
     for (std::size_t p = 0; p < skeleton.points.size(); ++p) out[next++] = sheet;
     ++sheet;
@@ -74,7 +83,8 @@ Bones bones_of(const Numbering& numbering, const std::vector<Skeleton>& skeleton
     const int count = static_cast<int>(skeleton.points.size());
     for (int p = 0; p < count; ++p) out.points.push_back(first + p);
     for (const auto& [a, b] : skeleton.segments) out.segments.push_back({first + a, first + b});
-    for (const auto& [a, b, c] : skeleton.triangles) out.triangles.push_back({first + a, first + b, first + c});
+    for (const auto& [a, b, c] : skeleton.triangles)
+      out.triangles.push_back({first + a, first + b, first + c});
     first += count;
   }
   return out;
@@ -90,13 +100,15 @@ double cell_of(const ClothMesh& mesh) {
     triangles[sheet] += 1.0;
   }
   double out = 0.0;
-  for (int s = 0; s < mesh.sheets; ++s) out = std::max(out, std::sqrt(2.0 * area[s] / triangles[s]));
+  for (int s = 0; s < mesh.sheets; ++s)
+    out = std::max(out, std::sqrt(2.0 * area[s] / triangles[s]));
   return out;
 }
 
 ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
                                 const std::vector<Body>& bodies, double cell) {
-  const Eigen::Index before = materials.mu.rows(), count = before + static_cast<Eigen::Index>(skeletons.size());
+  const Eigen::Index before = materials.mu.rows(),
+                     count = before + static_cast<Eigen::Index>(skeletons.size());
   Eigen::MatrixXd mu = Eigen::MatrixXd::Constant(count, count, -1.0);
   mu.topLeftCorner(before, before) = materials.mu;
   materials.cell = cell;
@@ -112,8 +124,10 @@ ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Sk
 }
 
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
-                                           const ContactMaterials& materials, const SurfaceMeshes& surfaces,
-                                           const std::vector<Skeleton>& skeletons, const Constants& constants) {
+                                           const ContactMaterials& materials,
+                                           const SurfaceMeshes& surfaces,
+                                           const std::vector<Skeleton>& skeletons,
+                                           const Constants& constants) {
   check_thickness(mesh, materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
@@ -121,16 +135,19 @@ std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numberin
   Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, skeletons),
                   (materials.mu.array() >= 0.0).matrix(), bones_of(numbering, skeletons));
   const double cell = std::sqrt(2.0 * mesh.area.mean());
-  return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact, constants.path,
-                                      constants.path.margin * cell, numbering.free_nodes);
+  return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact,
+                                      constants.path, constants.path.margin * cell,
+                                      numbering.free_nodes);
 }
 
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
-                                                 const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                                 const ContactMaterials& materials,
+                                                 const SurfaceMeshes& surfaces,
                                                  const SmoothSettings& settings) {
   Buffer<double> x(4L * numbering.nodes, 0.0);
   const int* others = numbering.node.data() + numbering.vertices;
-  for (int i = 0; i < numbering.others; ++i) at_node(x, others[i]) = surfaces.positions.row(i).transpose();
+  for (int i = 0; i < numbering.others; ++i)
+    at_node(x, others[i]) = surfaces.positions.row(i).transpose();
   Triples triangles;
   append(surfaces.triangles, others, triangles);
   std::vector<double> radius(numbering.free_nodes, 0.0);
@@ -141,8 +158,9 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
       if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
     }
   }
-  return std::make_unique<SmoothContact>(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, {}),
-                                         materials, surfaces.crease, x, radius, settings);
+  return std::make_unique<SmoothContact>(std::move(triangles),
+                                         sheets_of_nodes(mesh, numbering, surfaces, {}), materials,
+                                         surfaces.crease, x, radius, settings);
 }
 
 }  // namespace sim_core

@@ -51,14 +51,19 @@ struct Shelf {
     return begin;
   }
   void take(int name) {
-    items.erase(std::find_if(items.begin(), items.end(), [&](const Item& item) { return item.name == name; }));
+    items.erase(std::find_if(items.begin(), items.end(),
+                             [&](const Item& item) { return item.name == name; }));
   }
 };
 
 }  // namespace
 
-FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, const Dissection& dissection)
-    : piece(pieces_of(dissection)), due(piece.size(), 1), work(piece.size(), 0.0), pivot_begin(dissection.pivot_begin) {
+FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
+                             const Dissection& dissection)
+    : piece(pieces_of(dissection)),
+      due(piece.size(), 1),
+      work(piece.size(), 0.0),
+      pivot_begin(dissection.pivot_begin) {
   const int fronts = static_cast<int>(dissection.parent.size());
   std::vector<std::vector<int>> structure(fronts), below(fronts);
   for (int f = 0; f < fronts; ++f) {
@@ -71,7 +76,9 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
   child_begin.push_back(0);
   Shelf shelf;
   long kept = 0, panel_max = 0, local_max = 0;
-  const auto pad = [](long rows) { return (rows + front_padding - 1) / front_padding * front_padding; };
+  const auto pad = [](long rows) {
+    return (rows + front_padding - 1) / front_padding * front_padding;
+  };
   for (int f = 0; f < fronts; ++f) {
     const int first = pivot_begin[f], last = pivot_begin[f + 1];
     std::vector<int>& own = structure[f];
@@ -90,9 +97,10 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
     rows.insert(rows.end(), own.begin(), own.end());
     row_begin.push_back(static_cast<int>(rows.size()));
     const auto place = [&](int node) {
-      return node < last
-                 ? node - first
-                 : last - first + static_cast<int>(std::lower_bound(own.begin(), own.end(), node) - own.begin());
+      return node < last ? node - first
+                         : last - first +
+                               static_cast<int>(std::lower_bound(own.begin(), own.end(), node) -
+                                                own.begin());
     };
     for (int child : below[f]) {
       const std::vector<int>& theirs = structure[child];
@@ -136,7 +144,8 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane, co
     }
     children.insert(children.end(), below[f].begin(), below[f].end());
     child_begin.push_back(static_cast<int>(children.size()));
-    for (long c = 0; c < columns; ++c) work[f] += static_cast<double>(columns - c + others) * (columns - c + others);
+    for (long c = 0; c < columns; ++c)
+      work[f] += static_cast<double>(columns - c + others) * (columns - c + others);
   }
   run_begin.push_back(0);
   for (const std::vector<FrontRun>& some : runs_of) {
@@ -202,8 +211,8 @@ StaleFactor::StaleFactor(const Numbering& numbering)
       added_(6L * numbering.free_nodes, 0.0f),
       touched_(numbering.free_nodes, 0) {}
 
-double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
-                          const ClothSettings& settings) {
+double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+                          double dt, const ClothSettings& settings) {
   if (!age.exists() || age.too_much(settings)) {
     make(assembly, x, contact, dt);
     return 1.0;
@@ -215,7 +224,8 @@ double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const Con
   return share;
 }
 
-void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt) {
+void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+                       double dt) {
   storage_.mark_all();
   matrix_ = assembly.neighbour(x, numbers_);
   refresh(assembly, contact);

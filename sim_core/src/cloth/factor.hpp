@@ -1,4 +1,5 @@
-// A Cholesky factor that is kept while it is worth keeping: the preconditioner of every linear solve.
+// A Cholesky factor that is kept while it is worth keeping: the preconditioner of every linear
+// solve.
 #pragma once
 
 #include <Eigen/Core>
@@ -17,10 +18,12 @@
 
 namespace sim_core {
 
-// The arrays behind the multifrontal factor: which rows each front has, and what of the matrix goes into it.
+// The arrays behind the multifrontal factor: which rows each front has, and what of the matrix goes
+// into it.
 struct FactorStorage {
-  // Fronts that are made anew together, by one of them: a small subtree by its root, a large front by itself. What
-  // waits of it for the parent is kept, so that the parent can be made anew without it.
+  // Fronts that are made anew together, by one of them: a small subtree by its root, a large front
+  // by itself. What waits of it for the parent is kept, so that the parent can be made anew without
+  // it.
   std::vector<int> piece;
   std::vector<char> due;
   std::vector<double> work;  // of each front, flops
@@ -30,18 +33,20 @@ struct FactorStorage {
   std::vector<long> tile_begin, entry_begin, update_begin;
   Buffer<float> tiles, panel, updates, local;
 
-  // Patterns in the numbers of the order of elimination; that of bending holds that of the membrane.
+  // Patterns in the numbers of the order of elimination; that of bending holds that of the
+  // membrane.
   FactorStorage(const Pattern& bending, const Pattern& membrane, const Dissection& dissection);
 
   Factor view(bool half);
 
-  // Marks fronts as due: all of them, or those pieces in which `touched` (free nodes) is set, and what they lead to.
-  // The latter returns their share of the work.
+  // Marks fronts as due: all of them, or those pieces in which `touched` (free nodes) is set, and
+  // what they lead to. The latter returns their share of the work.
   void mark_all();
   double mark(const std::vector<char>& touched);
 };
 
-// Whether a factor was made, for steps of which length, and GMRES iterations that it has cost since.
+// Whether a factor was made, for steps of which length, and GMRES iterations that it has cost
+// since.
 class FactorAge {
  public:
   void made(double dt) { dt_ = dt, fresh_ = -1, last_ = excess_ = 0; }
@@ -68,8 +73,8 @@ class StaleFactor {
   FactorAge age;
 
   const Factor& view() const { return view_; }
-  // Makes it anew if it never was made or has cost more GMRES iterations than a new one would; where it is of other
-  // contacts, those parts that hold them. Returns the share that was made.
+  // Makes it anew if it never was made or has cost more GMRES iterations than a new one would;
+  // where it is of other contacts, those parts that hold them. Returns the share that was made.
   double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt,
                const ClothSettings& settings);
   void make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, double dt);
@@ -79,7 +84,8 @@ class StaleFactor {
 
   FactorStorage storage_;
   Factor view_;
-  // Without contact. Parts are made anew of the same: of one that moved on they would not fit the others.
+  // Without contact. Parts are made anew of the same: of one that moved on they would not fit the
+  // others.
   ClothMatrix matrix_{};
   NeighbourNumbers numbers_;
   Buffer<float> added_;
@@ -103,9 +109,10 @@ class FactorPool {
   std::size_t size_;
 };
 
-// The preconditioner while pairs are active: a factor with an order of its own, by nested dissection in the space where
-// the cloth is. In the plane at rest, layers of a fold would couple everywhere. Nodes that stick to bodies couple
-// nothing: sheets that lie on a floor do not hang together through it.
+// The preconditioner while pairs are active: a factor with an order of its own, by nested
+// dissection in the space where the cloth is. In the plane at rest, layers of a fold would couple
+// everywhere. Nodes that stick to bodies couple nothing: sheets that lie on a floor do not hang
+// together through it.
 class PairFactor {
  public:
   explicit PairFactor(const FactorSettings& constants) : constants_(constants) {}
@@ -115,13 +122,15 @@ class PairFactor {
 
   const Factor& view() const { return view_; }
 
-  // Makes it anew if it is of another length of step or has cost more GMRES iterations than a new one would; where too
-  // many nodes are held otherwise by pairs and bodies, those parts that hold them. Returns the share that was made.
-  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs,
-               double dt, const ClothSettings& settings);
+  // Makes it anew if it is of another length of step or has cost more GMRES iterations than a new
+  // one would; where too many nodes are held otherwise by pairs and bodies, those parts that hold
+  // them. Returns the share that was made.
+  double renew(Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+               const ContactSet& pairs, double dt, const ClothSettings& settings);
 
  private:
-  // An active pair: w_a w_b stiffness for each two of its nodes, which are -1 where they are held or pinned.
+  // An active pair: w_a w_b stiffness for each two of its nodes, which are -1 where they are held
+  // or pinned.
   struct Entry {
     std::array<int, 4> node;
     std::array<float, 4> weight;
@@ -132,7 +141,8 @@ class PairFactor {
   void collect(const ContactSet& pairs, int free_nodes);
   int compare(const Assembly& assembly, const ContactState& contact);
   int missing(const ContactState& contact) const;
-  void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact, const ContactSet& pairs);
+  void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
+             const ContactSet& pairs);
   void enter(bool whole);
   void read_matrix(Assembly& assembly, const Buffer<double>& x);
   void make(const Assembly& assembly);
@@ -151,9 +161,10 @@ class PairFactor {
   ClothMatrix matrix_{};
   NeighbourNumbers numbers_;
   Buffer<float> scalars_, blocks_, diagonal_, added_, ordered_;
-  std::vector<std::array<int, 2>> scalar_slots_, block_slots_;  // of the assembly's entries, and here
-  std::vector<Entry> wanted_, entries_;                         // entries_: those in the factor
-  std::vector<Hold> bodies_, holds_, held_;                     // of nodes, by bodies; with wanted_; in the factor
+  std::vector<std::array<int, 2>> scalar_slots_,
+      block_slots_;                          // of the assembly's entries, and here
+  std::vector<Entry> wanted_, entries_;      // entries_: those in the factor
+  std::vector<Hold> bodies_, holds_, held_;  // of nodes, by bodies; with wanted_; in the factor
   std::vector<char> touched_, due_;
 };
 

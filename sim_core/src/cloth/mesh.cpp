@@ -21,7 +21,8 @@ using Eigen::Vector3d;
 using Eigen::VectorXd;
 
 // Whether the open segment pq crosses the triangle abc [Möller & Trumbore 1997].
-bool crosses(const Vector3d& p, const Vector3d& q, const Vector3d& a, const Vector3d& b, const Vector3d& c) {
+bool crosses(const Vector3d& p, const Vector3d& q, const Vector3d& a, const Vector3d& b,
+             const Vector3d& c) {
   const Vector3d along = q - p, u = b - a, v = c - a, normal = along.cross(v);
   const double det = u.dot(normal);
   if (std::abs(det) < 1e-14 * along.norm() * u.norm() * v.norm()) return false;
@@ -45,10 +46,10 @@ struct SlopeFit {
   VectorXd weights;
 };
 
-// d/dn at the middle of an edge, exact for quadratics: least squares over the nodes of the two triangles and of their
-// neighbours, ring after ring until they determine a quadratic.
-SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& around, const ClothMesh::Edge& edge,
-                   const Vector2d& normal) {
+// d/dn at the middle of an edge, exact for quadratics: least squares over the nodes of the two
+// triangles and of their neighbours, ring after ring until they determine a quadratic.
+SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& around,
+                   const ClothMesh::Edge& edge, const Vector2d& normal) {
   const Vector2d a = mesh.rest.row(edge.a), b = mesh.rest.row(edge.b);
   const Vector2d middle = 0.5 * (a + b), tangent = (b - a).normalized();
   const double scale = (b - a).norm();
@@ -79,8 +80,8 @@ SlopeFit fit_slope(const ClothMesh& mesh, const std::vector<std::vector<int>>& a
     const Eigen::JacobiSVD<Eigen::MatrixXd> svd(fit, Eigen::ComputeThinU | Eigen::ComputeThinV);
     if (svd.singularValues()[5] < rank_min * svd.singularValues()[0]) continue;
     // Row of the pseudo-inverse that gives the coefficient of v.
-    const VectorXd row =
-        svd.matrixU() * (svd.singularValues().cwiseInverse().asDiagonal() * svd.matrixV().row(2).transpose());
+    const VectorXd row = svd.matrixU() * (svd.singularValues().cwiseInverse().asDiagonal() *
+                                          svd.matrixV().row(2).transpose());
     return {nodes, row.cwiseProduct(weight) / scale};
   }
   refuse(text("triangles: the nodes around edge (", edge.a, ", ", edge.b,
@@ -96,8 +97,9 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
     const double share = mesh.area[other] / areas;  // heights over the edge are as the areas
     fit.nodes[2 + side] = mesh.triangles(t, edge.corner[side]);
     for (int c = 0; c < 3; ++c) {
-      const Vector2d along =
-          (mesh.rest.row(mesh.triangles(t, (c + 2) % 3)) - mesh.rest.row(mesh.triangles(t, (c + 1) % 3))).transpose();
+      const Vector2d along = (mesh.rest.row(mesh.triangles(t, (c + 2) % 3)) -
+                              mesh.rest.row(mesh.triangles(t, (c + 1) % 3)))
+                                 .transpose();
       const Vector2d gradient = -normal_of(along) * along.norm() / (2.0 * mesh.area[t]);
       const int node = mesh.triangles(t, c);
       const int place = node == edge.a ? 0 : node == edge.b ? 1 : 2 + side;
@@ -123,7 +125,8 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
     for (int c = 0; c < 3; ++c) {
       const int v = triangles(t, c);
       if (v < 0 || v >= rest.rows()) {
-        refuse(text("triangles: must index ", rest.rows(), " vertices, got ", v, " in triangle ", t));
+        refuse(
+            text("triangles: must index ", rest.rows(), " vertices, got ", v, " in triangle ", t));
       }
       used[v] = 1;
     }
@@ -133,24 +136,28 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
     const double longest = std::max({u.squaredNorm(), v.squaredNorm(), (u - v).squaredNorm()});
     if (!(area[t] > 1e-3 * longest)) {
       refuse(
-          text("triangles: must run counter-clockwise and not be slivers (area over longest edge squared > 0.001), "
+          text("triangles: must run counter-clockwise and not be slivers (area over longest edge "
+               "squared > 0.001), "
                "and triangle ",
                t, " has ", area[t] / longest));
     }
     for (int c = 0; c < 3; ++c) {
       const int i = triangles(t, (c + 1) % 3), j = triangles(t, (c + 2) % 3);
-      const auto [at, fresh] = known.try_emplace({std::min(i, j), std::max(i, j)}, static_cast<int>(edges.size()));
+      const auto [at, fresh] =
+          known.try_emplace({std::min(i, j), std::max(i, j)}, static_cast<int>(edges.size()));
       if (fresh) edges.push_back({std::min(i, j), std::max(i, j)});
       Edge& edge = edges[at->second];
       const int side = edge.triangle[0] < 0 ? 0 : 1;
-      if (edge.triangle[side] >= 0) refuse(text("triangles: edge (", i, ", ", j, ") must belong to at most two"));
+      if (edge.triangle[side] >= 0)
+        refuse(text("triangles: edge (", i, ", ", j, ") must belong to at most two"));
       edge.triangle[side] = static_cast<int>(t);
       edge.corner[side] = c;
       triangle_edges[t][c] = at->second;
     }
   }
   for (Eigen::Index v = 0; v < rest.rows(); ++v) {
-    if (!used[v]) refuse(text("rest: every vertex must belong to a triangle, and ", v, " does not"));
+    if (!used[v])
+      refuse(text("rest: every vertex must belong to a triangle, and ", v, " does not"));
   }
   find_sheets();
 }
@@ -188,7 +195,8 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
   int found = 0;
   std::vector<int> seen(count, -1);
   for (int t = 0; t < count; ++t) {
-    const Eigen::Array3d from = (box[t].min() / size).array().floor(), to = (box[t].max() / size).array().floor();
+    const Eigen::Array3d from = (box[t].min() / size).array().floor(),
+                         to = (box[t].max() / size).array().floor();
     for (double x = from[0]; x <= to[0]; ++x) {
       for (double y = from[1]; y <= to[1]; ++y) {
         for (double z = from[2]; z <= to[2]; ++z) {
@@ -209,7 +217,8 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
             }
             bool hit = false;
             for (int c = 0; c < 3 && !hit; ++c) {
-              hit = crosses(p[c], p[(c + 1) % 3], q[0], q[1], q[2]) || crosses(q[c], q[(c + 1) % 3], p[0], p[1], p[2]);
+              hit = crosses(p[c], p[(c + 1) % 3], q[0], q[1], q[2]) ||
+                    crosses(q[c], q[(c + 1) % 3], p[0], p[1], p[2]);
             }
             found += hit;
           }
@@ -234,7 +243,8 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabr
     const ClothMesh::Edge& edge = mesh.edges[e];
     if (edge.boundary()) continue;
     const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
-    slopes[e] = compact ? mean_slope(mesh, edge, normal_of(along)) : fit_slope(mesh, around, edge, normal_of(along));
+    slopes[e] = compact ? mean_slope(mesh, edge, normal_of(along))
+                        : fit_slope(mesh, around, edge, normal_of(along));
   }
   std::vector<Stencil> stencils(count);
   for (int t = 0; t < count; ++t) {
@@ -256,9 +266,10 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabr
     for (int c = 0; c < 3; ++c) {
       const int e = mesh.triangle_edges[t][c];
       const ClothMesh::Edge& edge = mesh.edges[e];
-      const Eigen::Vector3d direction = length[c] / mesh.area[t] *
-                                        Eigen::Vector3d(normal[c].x() * normal[c].x(), normal[c].y() * normal[c].y(),
-                                                        2.0 * normal[c].x() * normal[c].y());
+      const Eigen::Vector3d direction =
+          length[c] / mesh.area[t] *
+          Eigen::Vector3d(normal[c].x() * normal[c].x(), normal[c].y() * normal[c].y(),
+                          2.0 * normal[c].x() * normal[c].y());
       if (edge.boundary()) {
         open.push_back(direction);
         continue;
@@ -268,7 +279,8 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabr
       for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
         add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
       }
-      for (int i = 0; i < 3; ++i) add(mesh.triangles(t, i), -normal[c].dot(gradient[i]) * direction);
+      for (int i = 0; i < 3; ++i)
+        add(mesh.triangles(t, i), -normal[c].dot(gradient[i]) * direction);
     }
     Eigen::Matrix3d project = Eigen::Matrix3d::Identity();
     if (!open.empty()) {

@@ -29,10 +29,12 @@ struct ClothMesh {
   std::vector<Edge> edges;
   std::vector<std::array<int, 3>> triangle_edges;  // opposite corner 0, 1, 2
   Eigen::VectorXd area;
-  std::vector<int> sheet_of_vertex;  // pieces that hang together, in the order of their first vertices
+  std::vector<int>
+      sheet_of_vertex;  // pieces that hang together, in the order of their first vertices
   int sheets = 0;
 
-  // Throws std::invalid_argument, naming the field, unless this is a triangulation of a surface with positive areas.
+  // Throws std::invalid_argument, naming the field, unless this is a triangulation of a surface
+  // with positive areas.
   ClothMesh(Points2 rest, Triangles triangles);
 
  private:
@@ -41,9 +43,10 @@ struct ClothMesh {
 
 using Rigidity = Eigen::Matrix3d;  // D of (H11, H22, 2 H12), N m
 
-// Stiffness against stretching after [Wang et al. 2011]: k0 ... k3 [N/m] of the energy k0 G00^2/2 + k1 G00 G11 +
-// k2 G11^2/2 + k3 G01^2. Row 0 holds at no strain, rows 1 ... 5 at `table_stretch` with the larger principal stretch
-// 0, 22.5, ..., 90 degrees from the first axis; kernels/stretching.hpp has the law in between.
+// Stiffness against stretching after [Wang et al. 2011]: k0 ... k3 [N/m] of the energy k0 G00^2/2 +
+// k1 G00 G11 + k2 G11^2/2 + k3 G01^2. Row 0 holds at no strain, rows 1 ... 5 at `table_stretch`
+// with the larger principal stretch 0, 22.5, ..., 90 degrees from the first axis;
+// kernels/stretching.hpp has the law in between.
 using StretchTable = Eigen::Matrix<double, 6, 4, Eigen::RowMajor>;
 
 struct ClothProperties {
@@ -61,7 +64,8 @@ struct Fabrics {
   // Throws std::invalid_argument, naming `fabric`, where there are too many or too few.
   Fabrics(const ClothMesh& mesh, std::vector<ClothProperties> list_in) : list(std::move(list_in)) {
     if (list.size() != 1 && static_cast<int>(list.size()) != mesh.sheets) {
-      refuse(text("fabric: must be one, or one for each of ", mesh.sheets, " sheets, got ", list.size()));
+      refuse(text("fabric: must be one, or one for each of ", mesh.sheets, " sheets, got ",
+                  list.size()));
     }
     for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
       of_triangle.push_back(list.size() == 1 ? 0 : mesh.sheet_of_vertex[mesh.triangles(t, 0)]);
@@ -79,10 +83,12 @@ struct Stencil {
   Eigen::Matrix<double, Eigen::Dynamic, 3> weights;  // 1/m^2
 };
 
-// Rotation-free Morley element: H = sum over edges e of phi_e |e|/A n_e n_e^T, phi_e = d_e - n_e . grad x_T, with the
-// slope d_e across the middle of the edge taken from a quadratic fitted to the nodes around [Morley 1968; the fit after
-// Grinspun et al. 2006]. At the boundary phi_e minimises the energy.
-// `compact`: the slope is that of the two triangles alone, an approximation that couples fewer nodes.
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, bool compact = false);
+// Rotation-free Morley element: H = sum over edges e of phi_e |e|/A n_e n_e^T, phi_e = d_e - n_e .
+// grad x_T, with the slope d_e across the middle of the edge taken from a quadratic fitted to the
+// nodes around [Morley 1968; the fit after Grinspun et al. 2006]. At the boundary phi_e minimises
+// the energy. `compact`: the slope is that of the two triangles alone, an approximation that
+// couples fewer nodes.
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics,
+                                      bool compact = false);
 
 }  // namespace sim_core

@@ -43,22 +43,26 @@ struct Dissector {
       const double u = points(a, axis), v = points(b, axis);
       return u != v ? u < v : a < b;
     });
-    // The separator is what touches the lower half from above; where the cut falls decides its size.
+    // The separator is what touches the lower half from above; where the cut falls decides its
+    // size.
     std::vector<int> best, best_low, best_high;
     const int size = static_cast<int>(nodes.size());
     for (double share : {0.44, 0.48, 0.5}) {
-      std::vector<int> lower(nodes.begin(), nodes.begin() + static_cast<int>(share * size)), cut, upper;
+      std::vector<int> lower(nodes.begin(), nodes.begin() + static_cast<int>(share * size)), cut,
+          upper;
       for (int i : nodes) side[i] = 2;
       for (int i : lower) side[i] = 1;
       for (std::size_t k = lower.size(); k < nodes.size(); ++k) {
         const int i = nodes[k];
-        const bool touches = std::any_of(graph[i].begin(), graph[i].end(), [&](int j) { return side[j] == 1; });
+        const bool touches =
+            std::any_of(graph[i].begin(), graph[i].end(), [&](int j) { return side[j] == 1; });
         (touches ? cut : upper).push_back(i);
       }
       if (best.empty() || cut.size() < best.size()) best = cut, best_low = lower, best_high = upper;
       for (int i : nodes) side[i] = 0;
     }
-    if (best_high.empty() || best_low.empty() || best.size() * 2 > nodes.size()) return emit(nodes, {});
+    if (best_high.empty() || best_low.empty() || best.size() * 2 > nodes.size())
+      return emit(nodes, {});
     const int first = dissect(best_low), second = dissect(best_high);
     return emit(best, {first, second});
   }
@@ -107,7 +111,8 @@ Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points) 
   return dissector.out;
 }
 
-Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place) {
+Pattern renumbered(const Graph& from, const std::vector<int>& order,
+                   const std::vector<int>& place) {
   Pattern out;
   for (int i : order) {
     for (int j : from[i]) out.node.push_back(place[j]);
@@ -124,7 +129,8 @@ int Pattern::slot(int i, int j) const {
   return at != last && *at == j ? static_cast<int>(at - node.begin()) : -1;
 }
 
-Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
+Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
+                     const std::vector<Stencil>& compact,
                      const std::vector<std::int32_t>& held_vertices, int others_in, int bones_in)
     : vertices(static_cast<int>(mesh.rest.rows())),
       others(others_in),

@@ -16,11 +16,12 @@ struct Dissection {
   std::vector<int> parent;       // (fronts): -1 at the root
 };
 
-// Bisects along the longest side of the remaining set, by coordinates in the plane or in space [George 1973].
+// Bisects along the longest side of the remaining set, by coordinates in the plane or in space
+// [George 1973].
 Dissection nested_dissection(const Graph& graph, const Eigen::MatrixXd& points);
 
-// Which nodes each row of a matrix has entries for, in compressed rows: those of row i are node[begin[i]] ... ,
-// ascending.
+// Which nodes each row of a matrix has entries for, in compressed rows: those of row i are
+// node[begin[i]] ... , ascending.
 struct Pattern {
   std::vector<int> begin{0}, node;
 
@@ -32,8 +33,8 @@ struct Pattern {
 // The pattern of a graph in the order of elimination; `place`: of each node in it.
 Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place);
 
-// Free vertices in the order of elimination, then held vertices, then the vertices of surfaces and the points of
-// skeletons, which are no cloth and move as prescribed.
+// Free vertices in the order of elimination, then held vertices, then the vertices of surfaces and
+// the points of skeletons, which are no cloth and move as prescribed.
 struct Numbering {
   int vertices, others, bones, nodes, free_nodes;
   std::vector<int> node, vertex;  // of a vertex, another or a point of a skeleton, and back
@@ -42,8 +43,9 @@ struct Numbering {
   Pattern bending, compact_bending, membrane;  // of the free nodes
 
   // Throws std::invalid_argument, naming `held`.
-  Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils, const std::vector<Stencil>& compact,
-            const std::vector<std::int32_t>& held, int others, int bones);
+  Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
+            const std::vector<Stencil>& compact, const std::vector<std::int32_t>& held, int others,
+            int bones);
 };
 
 }  // namespace sim_core

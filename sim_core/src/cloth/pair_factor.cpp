@@ -62,7 +62,8 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const int node = static_cast<int>(i);
     bodies_[i].setZero();
-    if (contact.mode[i] != contact_open) contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
+    if (contact.mode[i] != contact_open)
+      contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);
@@ -72,9 +73,11 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const float difference = (holds_[i] - held_[i]).squaredNorm();
     if (difference == 0.0f) continue;
-    const float least = hold_least * static_cast<float>(assembly.own_stiffness(static_cast<int>(i)));
-    const float most = std::max({hold_change * hold_change * holds_[i].squaredNorm(),
-                                 hold_change * hold_change * held_[i].squaredNorm(), least * least});
+    const float least =
+        hold_least * static_cast<float>(assembly.own_stiffness(static_cast<int>(i)));
+    const float most =
+        std::max({hold_change * hold_change * holds_[i].squaredNorm(),
+                  hold_change * hold_change * held_[i].squaredNorm(), least * least});
     if (difference > most) touched_[i] = 1, ++changed;
   }
   return changed;
@@ -84,7 +87,8 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
 int PairFactor::missing(const ContactState& contact) const {
   int count = 0;
   for (const Entry& entry : wanted_) count += !has_place(entry);
-  for (std::size_t i = 0; i < pinned_.size(); ++i) count += pinned_[i] && contact.mode[i] != contact_stick;
+  for (std::size_t i = 0; i < pinned_.size(); ++i)
+    count += pinned_[i] && contact.mode[i] != contact_stick;
   return count;
 }
 
@@ -100,7 +104,8 @@ template <class Call>
 void PairFactor::visit(const Entry& entry, const Call& call) const {
   for (int a = 0; a < 4; ++a) {
     for (int b = 0; b < a; ++b) {
-      if (entry.node[a] < 0 || entry.node[b] < 0 || entry.weight[a] * entry.weight[b] == 0.0f) continue;
+      if (entry.node[a] < 0 || entry.node[b] < 0 || entry.weight[a] * entry.weight[b] == 0.0f)
+        continue;
       const auto [low, high] = std::minmax(place_[entry.node[a]], place_[entry.node[b]]);
       call(membrane_.slot(high, low), entry.weight[a] * entry.weight[b]);
     }
@@ -113,8 +118,8 @@ bool PairFactor::has_place(const Entry& entry) const {
   return all;
 }
 
-void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
-                       const ContactSet& pairs) {
+void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
+                       const ContactState& contact, const ContactSet& pairs) {
   const Numbering& numbering = assembly.numbering;
   const int free_nodes = numbering.free_nodes;
   pinned_.resize(free_nodes);
@@ -144,7 +149,8 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const 
     }
     return graph;
   };
-  const Graph bending = graph_of(numbering.compact_bending), membrane = graph_of(numbering.membrane);
+  const Graph bending = graph_of(numbering.compact_bending),
+              membrane = graph_of(numbering.membrane);
   // Pinned nodes come last, each for itself.
   std::vector<int> loose, pins, number(free_nodes, -1);
   for (int i = 0; i < free_nodes; ++i) {
@@ -170,7 +176,8 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const 
   for (int i = 0; i < free_nodes; ++i) place_[order_[i]] = i;
   bending_ = renumbered(bending, order_, place_);
   membrane_ = renumbered(membrane, order_, place_);
-  // The factor reads a scalar in the row of the one that is eliminated first, and a block in that of the other.
+  // The factor reads a scalar in the row of the one that is eliminated first, and a block in that
+  // of the other.
   scalar_slots_.clear();
   block_slots_.clear();
   const auto find_slots = [&](const Pattern& from, const Pattern& to, bool upper,
@@ -197,8 +204,8 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x, const 
   view_.ordered = ordered_.data();
 }
 
-// Pairs at nodes that are held otherwise go, and those that are wanted there come, so that what is in the factor stays
-// that of some pairs, and positive.
+// Pairs at nodes that are held otherwise go, and those that are wanted there come, so that what is
+// in the factor stays that of some pairs, and positive.
 void PairFactor::enter(bool whole) {
   if (whole) {
     entries_.clear();
@@ -206,7 +213,9 @@ void PairFactor::enter(bool whole) {
   }
   std::fill(due_.begin(), due_.end(), 0);
   const auto meets = [&](const Entry& entry) {
-    if (std::none_of(entry.node.begin(), entry.node.end(), [&](int i) { return i >= 0 && touched_[i]; })) return false;
+    if (std::none_of(entry.node.begin(), entry.node.end(),
+                     [&](int i) { return i >= 0 && touched_[i]; }))
+      return false;
     for (int i : entry.node) {
       if (i >= 0) due_[i] = 1;
     }
@@ -227,11 +236,13 @@ void PairFactor::enter(bool whole) {
   }
 }
 
-// The matrix's neighbour, which parts are made anew of, too: of one that moved on they would not fit the others.
+// The matrix's neighbour, which parts are made anew of, too: of one that moved on they would not
+// fit the others.
 void PairFactor::read_matrix(Assembly& assembly, const Buffer<double>& x) {
   matrix_ = assembly.neighbour(x, numbers_);
   for (const auto& [from, to] : scalar_slots_) scalars_[to] = matrix_.bending[from];
-  for (const auto& [from, to] : block_slots_) std::copy_n(matrix_.membrane + 12L * from, 12, &blocks_[12L * to]);
+  for (const auto& [from, to] : block_slots_)
+    std::copy_n(matrix_.membrane + 12L * from, 12, &blocks_[12L * to]);
   for (std::size_t i = 0; i < place_.size(); ++i) diagonal_[place_[i]] = matrix_.diagonal[i];
   matrix_.bending = scalars_.data();
   matrix_.membrane = blocks_.data();
@@ -251,9 +262,11 @@ void PairFactor::make(const Assembly& assembly) {
       }
     });
   }
-  for (std::size_t i = 0; i < place_.size(); ++i) std::copy_n(held_[i].data(), 6, &added_[6L * place_[i]]);
+  for (std::size_t i = 0; i < place_.size(); ++i)
+    std::copy_n(held_[i].data(), 6, &added_[6L * place_[i]]);
   assembly.kernel.factor(view_, matrix_, added_.data());
-  for (auto b = before.rbegin(); b != before.rend(); ++b) std::copy_n(b->second.data(), 12, &blocks_[12L * b->first]);
+  for (auto b = before.rbegin(); b != before.rend(); ++b)
+    std::copy_n(b->second.data(), 12, &blocks_[12L * b->first]);
 }
 
 }  // namespace sim_core

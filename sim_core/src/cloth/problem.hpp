@@ -1,9 +1,9 @@
-// What the cloth kernels work on: plain arrays, owned by ClothSolver. Nothing here may pull in a template of the
-// standard library: kernels/kernel.cpp is compiled once per instruction set, and the linker must never merge their
-// instances.
+// What the cloth kernels work on: plain arrays, owned by ClothSolver. Nothing here may pull in a
+// template of the standard library: kernels/kernel.cpp is compiled once per instruction set, and
+// the linker must never merge their instances.
 //
-// Nodes are numbered in the order of elimination: free nodes first, held ones after. Vectors over nodes have four
-// components a node, the fourth is zero, so that a node is one vector register.
+// Nodes are numbered in the order of elimination: free nodes first, held ones after. Vectors over
+// nodes have four components a node, the fourth is zero, so that a node is one vector register.
 #pragma once
 
 #include "contact/rows.hpp"
@@ -18,7 +18,8 @@ constexpr int front_padding = 16;
 
 // A factor is kept in tiles of so many rows, and of at most so many columns: three of each node.
 constexpr int tile_rows = 16, tile_columns = 12;
-constexpr long half_from = 4'000'000;  // floats, 16 MB, from which half precision is used: solves then wait for memory
+constexpr long half_from =
+    4'000'000;  // floats, 16 MB, from which half precision is used: solves then wait for memory
 
 // Floats of a block of `width` columns with `below` rows under its triangle.
 constexpr long tile_floats(long width, long below) {
@@ -32,18 +33,22 @@ constexpr int krylov_max = 40;
 constexpr double table_stretch = 1.0 / 6.0;
 
 struct MembraneData {
-  int groups;             // of triangles of one fabric each
-  const int* nodes;       // (groups, 3, lanes)
-  const double* shape;    // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
-  const double* area;     // (groups, lanes), 0 in the lanes that pad the last group
-  const int* fabric;      // (groups)
-  const double* law;      // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
+  int groups;        // of triangles of one fabric each
+  const int* nodes;  // (groups, 3, lanes)
+  const double*
+      shape;           // (groups, 4, lanes): gradients of the shape functions of nodes 1 and 2, 1/m
+  const double* area;  // (groups, lanes), 0 in the lanes that pad the last group
+  const int* fabric;   // (groups)
+  const double* law;  // (fabrics, 24): A, B, C, D at no strain, then five coefficients of each, N/m
   const char* tabulated;  // (fabrics): whether these five are not all zero
-  const int* slots;       // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for held nodes
-  const double* lag;      // (groups, 9, lanes): strain at the start of a step, and what holds it there; null: nothing
+  const int* slots;   // (groups, lanes, 9): blocks 01 10 02 20 12 21 00 11 22 of the matrix, -1 for
+                      // held nodes
+  const double* lag;  // (groups, 9, lanes): strain at the start of a step, and what holds it there;
+                      // null: nothing
 };
 
-// Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the nodes of its stencil.
+// Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the
+// nodes of its stencil.
 struct BendingData {
   int triangles;
   const int* begin;        // (triangles + 1)
@@ -53,12 +58,13 @@ struct BendingData {
   const double* spacing2;  // (triangles), m^2: square of the length over which a fold turns
   const int* fabric;       // (triangles)
   const double* rigidity;  // (fabrics, 6): 11 12 16 22 26 66, N m
-  const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil, in order
+  const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil,
+                           // in order
   const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
 };
 
-// The part of bending's matrix that sharp folds add: of each, with vectors a and b over the free nodes of its stencil,
-// aa a a^T + ab (a b^T + b a^T).
+// The part of bending's matrix that sharp folds add: of each, with vectors a and b over the free
+// nodes of its stencil, aa a a^T + ab (a b^T + b a^T).
 struct FoldData {
   int free_nodes;
   double smallest;  // s from which a triangle is a fold
@@ -83,27 +89,32 @@ struct ClothMatrix {
   const PairData* pairs;  // may be null
 };
 
-// `count` rows of a front from `row` on are those of its parent from `place` on, in nodes, the parent's pivots first.
+// `count` rows of a front from `row` on are those of its parent from `place` on, in nodes, the
+// parent's pivots first.
 struct FrontRun {
   int row, count, place;
 };
 
 // A Cholesky factor by fronts (multifrontal). Front f eliminates nodes pivot_begin[f] ...
-// pivot_begin[f + 1]; its other rows are rows[row_begin[f]] ... . Children come before parents, in postorder.
+// pivot_begin[f + 1]; its other rows are rows[row_begin[f]] ... . Children come before parents, in
+// postorder.
 //
-// A front's columns go into blocks of `tile_columns`. Of each block come the inverse of its triangle, as one tile, and
-// then the rows below, tile after tile, so that a solve reads memory from one end to the other.
+// A front's columns go into blocks of `tile_columns`. Of each block come the inverse of its
+// triangle, as one tile, and then the rows below, tile after tile, so that a solve reads memory
+// from one end to the other.
 struct Factor {
   int fronts;
-  const char* due;         // (fronts): whether it must be refactored; where a child is due, the parent is
+  const char* due;  // (fronts): whether it must be refactored; where a child is due, the parent is
   const int* pivot_begin;  // (fronts + 1)
   const int* row_begin;    // (fronts + 1)
   const int* rows;         // nodes
   const int* child_begin;  // (fronts + 1)
   const int* children;     // fronts
-  const int* run_begin;    // (fronts + 1): rows of a front that follow each other in its parent's, too
+  const int*
+      run_begin;  // (fronts + 1): rows of a front that follow each other in its parent's, too
   const FrontRun* runs;
-  const long* update_begin;  // (fronts): where the part of a front that waits for its parent lies in `updates`
+  const long* update_begin;  // (fronts): where the part of a front that waits for its parent lies
+                             // in `updates`
   const long* tile_begin;    // (fronts + 1): offset of the first tile, floats
   const long* entry_begin;   // (fronts + 1): entries of K that go into the front
   const int* entry_slot;     // of a bending scalar
@@ -122,20 +133,23 @@ struct Factor {
 struct ClothKernel {
   const char* name;
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
-  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks, bool definite);
+  double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks,
+                     bool definite);
   void (*membrane_lag)(const MembraneData&, const double* x, double share, double* lag);
-  double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening, FoldData* folds);
+  double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening,
+                    FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);
-  // `added`: (nodes, 6), xx xy xz yy yz zz, N/m. A node keeps its own stiffness, and in contact some more: the factor
-  // need not be exact.
+  // `added`: (nodes, 6), xx xy xz yy yz zz, N/m. A node keeps its own stiffness, and in contact
+  // some more: the factor need not be exact.
   void (*factor)(const Factor&, const ClothMatrix&, const float* added);
   // Returns the iterations.
-  int (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x, float* work,
-                double tolerance);
+  int (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x,
+                float* work, double tolerance);
 };
 
-// One for each instruction set that they are compiled for; kernels/kernel.cpp is the code of all of them.
+// One for each instruction set that they are compiled for; kernels/kernel.cpp is the code of all of
+// them.
 extern const ClothKernel cloth_baseline, cloth_x86_64_v3, cloth_x86_64_v4;
 
 }  // namespace sim_core

@@ -16,7 +16,8 @@ void each_constant(Constants& constants, const Call& call) {
 
 void assign(double& to, const std::string&, double value) { to = value; }
 void assign(int& to, const std::string& name, double value) {
-  if (value != std::floor(value) || value > 1e9) refuse(text(name, ": must be an integer >= 1, got ", value));
+  if (value != std::floor(value) || value > 1e9)
+    refuse(text(name, ": must be an integer >= 1, got ", value));
   to = static_cast<int>(value);
 }
 

@@ -26,18 +26,22 @@ struct ClothSolver::Impl {
         surfaces(setup.surfaces),
         materials(with_skeletons(setup.touch, skeletons, bodies, cell_of(mesh))),
         assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons), setup.constants.factor),
+                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons),
+                 setup.constants.factor),
         stepper(mesh, assembly, setup.settings, setup.constants),
         controller(stepper, setup.control, setup.constants.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
     stepper.sheets = mesh.sheets;
-    for (int i = 0; i < numbering.free_nodes; ++i) newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
+    for (int i = 0; i < numbering.free_nodes; ++i)
+      newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
     if ((materials.mu.array() >= 0.0).any()) {
-      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, skeletons, setup.constants);
+      newton.pairs =
+          contact_set_of(mesh, numbering, materials, surfaces, skeletons, setup.constants);
     }
     if (numbering.others > 0) {
-      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
+      newton.contact.surfaces =
+          smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
     }
     stepper.skeletons = skeletons;
     newton.contact.whole_skeletons.assign(bodies.size(), 0);
@@ -51,9 +55,11 @@ struct ClothSolver::Impl {
   }
 
   void load(const Points3& positions, Buffer<double>& into) const {
-    if (positions.rows() != numbering.vertices) refuse("positions: must have a row for each vertex");
+    if (positions.rows() != numbering.vertices)
+      refuse("positions: must have a row for each vertex");
     if (!positions.allFinite()) refuse("positions: must be finite");
-    for (int i = 0; i < numbering.vertices; ++i) at_node(into, numbering.node[i]) = positions.row(i).transpose();
+    for (int i = 0; i < numbering.vertices; ++i)
+      at_node(into, numbering.node[i]) = positions.row(i).transpose();
   }
 
   // The state with other positions.
@@ -66,7 +72,8 @@ struct ClothSolver::Impl {
   void load_surfaces(const Points3& positions, Buffer<double>& into) const {
     if (positions.rows() != numbering.others) refuse("surfaces: must keep their vertices");
     if (!positions.allFinite()) refuse("surfaces: positions must be finite");
-    for (int i = 0; i < numbering.others; ++i) at_node(into, other(i)) = positions.row(i).transpose();
+    for (int i = 0; i < numbering.others; ++i)
+      at_node(into, other(i)) = positions.row(i).transpose();
   }
 
   int other(int i) const { return numbering.node[numbering.vertices + i]; }
@@ -76,7 +83,8 @@ struct ClothSolver::Impl {
     Points3 points(positions.rows() + others.rows(), 3);
     points << positions, others;
     Triangles all(mesh.triangles.rows() + surfaces.triangles.rows(), 3);
-    all << mesh.triangles, (surfaces.triangles.array() + static_cast<std::int32_t>(positions.rows())).matrix();
+    all << mesh.triangles,
+        (surfaces.triangles.array() + static_cast<std::int32_t>(positions.rows())).matrix();
     int unfelt = self_intersections(others, surfaces.triangles);
     if (!(materials.mu(0, 0) >= 0.0)) unfelt += self_intersections(positions, mesh.triangles);
     return self_intersections(points, all) > unfelt;
@@ -84,22 +92,26 @@ struct ClothSolver::Impl {
 
   Points3 unload(const Buffer<double>& from) const {
     Points3 out(numbering.vertices, 3);
-    for (int i = 0; i < numbering.vertices; ++i) out.row(i) = at_node(from, numbering.node[i]).transpose();
+    for (int i = 0; i < numbering.vertices; ++i)
+      out.row(i) = at_node(from, numbering.node[i]).transpose();
     return out;
   }
 };
 
-ClothSolver::ClothSolver(const ClothSetup& setup) : setup_(setup), impl_(std::make_unique<Impl>(setup_)) {}
+ClothSolver::ClothSolver(const ClothSetup& setup)
+    : setup_(setup), impl_(std::make_unique<Impl>(setup_)) {}
 ClothSolver::~ClothSolver() = default;
 
 // Before a first step: takes skeletons of these bodies in place of those of others.
 void ClothSolver::meet(const std::vector<Body>& bodies) {
   if (impl_->stepper.started()) return;
   const Points3 at = positions();
-  const double across = (setup_.rest.colwise().maxCoeff() - setup_.rest.colwise().minCoeff()).norm();
-  const std::vector<Skeleton> skeletons = skeletons_of(
-      bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(), at.colwise().maxCoeff().transpose(),
-      setup_.constants.skeleton.beyond * across, setup_.constants.skeleton);
+  const double across =
+      (setup_.rest.colwise().maxCoeff() - setup_.rest.colwise().minCoeff()).norm();
+  const std::vector<Skeleton> skeletons =
+      skeletons_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
+                   at.colwise().maxCoeff().transpose(), setup_.constants.skeleton.beyond * across,
+                   setup_.constants.skeleton);
   if (skeletons.empty() && impl_->stepper.skeletons.empty()) return;
   std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, skeletons);
   const long kept = 4L * (next->numbering.nodes - next->numbering.bones);
@@ -108,12 +120,13 @@ void ClothSolver::meet(const std::vector<Body>& bodies) {
   impl_ = std::move(next);
 }
 
-void ClothSolver::set_state(const Points3& positions, const Points3& velocities, const Points3& surfaces,
-                            const std::vector<Body>& bodies, bool begins) {
+void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
+                            const Points3& surfaces, const std::vector<Body>& bodies, bool begins) {
   impl_->load(positions, impl_->stepper.x);
   impl_->load_surfaces(surfaces, impl_->stepper.x);
   if (impl_->newton.pairs && impl_->crosses(positions, surfaces)) {
-    refuse("positions: must not cross a surface, and under self-contact cloth must not cross itself");
+    refuse(
+        "positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
   impl_->load(velocities, impl_->stepper.v);
   impl_->stepper.restart({});
@@ -121,20 +134,23 @@ void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
   impl_->controller.restart();
 }
 
-// Places the bodies before a first step, and refuses free vertices inside one where the scene `begins`.
+// Places the bodies before a first step, and refuses free vertices inside one where the scene
+// `begins`.
 void ClothSolver::begin(const std::vector<Body>& bodies, bool begins) {
   meet(bodies);
   if (begins) impl_->stepper.refuse_inside(bodies);
   impl_->stepper.restart(bodies);
 }
 
-StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
-                             const std::vector<Body>& bodies, double damping) {
+StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held,
+                             const Points3& surfaces, const std::vector<Body>& bodies,
+                             double damping) {
   meet(bodies);
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const Motion& motion, const Path& path) {
+StepReport ClothSolver::advance(double& time, double event, const Motion& motion,
+                                const Path& path) {
   if (!impl_->stepper.started()) begin(motion(time).bodies);
   return impl_->controller.advance(time, event, motion, path);
 }
@@ -153,7 +169,8 @@ void ClothSolver::each_bone_contact(const Call& call) const {
     if (!bone || !pair.active()) continue;
     for (int c = 0; c < 4; ++c) {
       const int vertex = impl_->numbering.vertex[pair.who.node[c]];
-      if (vertex < impl_->numbering.vertices && pair.weights[c] != 0.0) call(vertex, pair, bone->body);
+      if (vertex < impl_->numbering.vertices && pair.weights[c] != 0.0)
+        call(vertex, pair, bone->body);
     }
   }
 }
@@ -161,7 +178,8 @@ void ClothSolver::each_bone_contact(const Call& call) const {
 std::vector<std::int32_t> ClothSolver::contacts() const {
   const Numbering& numbering = impl_->numbering;
   std::vector<std::int32_t> out(numbering.vertices, -1);
-  for (int i = 0; i < numbering.free_nodes; ++i) out[numbering.vertex[i]] = impl_->newton.contact.touched[i];
+  for (int i = 0; i < numbering.free_nodes; ++i)
+    out[numbering.vertex[i]] = impl_->newton.contact.touched[i];
   each_bone_contact([&](int vertex, const Pair&, int body) { out[vertex] = body; });
   return out;
 }
@@ -172,7 +190,8 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
   }
-  each_bone_contact([&](int vertex, const Pair& pair, int) { out[vertex] |= pair.row.mode == contact_slip; });
+  each_bone_contact(
+      [&](int vertex, const Pair& pair, int) { out[vertex] |= pair.row.mode == contact_slip; });
   return out;
 }
 
@@ -187,7 +206,8 @@ Points3 ClothSolver::surface_forces() const {
     const Foot& foot = contact.surfaces->foot(i);
     for (int k = 0; k < 3; ++k) {
       const int vertex = impl_->numbering.vertex[contact.surfaces->triangles()[foot.triangle][k]];
-      out.row(vertex - impl_->numbering.vertices) -= foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
+      out.row(vertex - impl_->numbering.vertices) -=
+          foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
     }
   }
   return out;
@@ -202,8 +222,9 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     }
   }
   const auto count = static_cast<Eigen::Index>(some.size());
-  PairForces out{
-      {count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), Truths(count), Eigen::VectorXi(count)};
+  PairForces out{{count, 4},        {count, 4},
+                 Points3(count, 3), Eigen::VectorXd(count),
+                 Truths(count),     Eigen::VectorXi(count)};
   for (Eigen::Index p = 0; p < count; ++p) {
     for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->who.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
@@ -222,7 +243,8 @@ std::tuple<double, double, Points3> ClothSolver::energies(const Points3& positio
   return {assembly.membrane_energy, assembly.bending_energy, impl_->unload(assembly.gradient)};
 }
 
-// Inverse iteration: v <- (K + M/T^2)^-1 M v tends to the softest mode, and 1/growth - 1/T^2 to its eigenvalue.
+// Inverse iteration: v <- (K + M/T^2)^-1 M v tends to the softest mode, and 1/growth - 1/T^2 to its
+// eigenvalue.
 double ClothSolver::softest(const Points3& positions) {
   constexpr double period = 0.3;  // T, s
   constexpr int iterations = 40;
@@ -235,18 +257,22 @@ double ClothSolver::softest(const Points3& positions) {
   const ContactState open(free_nodes);
   StaleFactor factor(impl_->numbering);
   factor.make(assembly, x, open, period);
-  Buffer<float> v(4L * free_nodes + 64, 0.0f), y(v), work((2 * krylov_max + 1) * 4L * free_nodes + 64, 0.0f);
-  for (int i = 0; i < free_nodes; ++i) at_node(v, i).setConstant(1.0f + 0.1f * static_cast<float>(i % 7));
+  Buffer<float> v(4L * free_nodes + 64, 0.0f), y(v),
+      work((2 * krylov_max + 1) * 4L * free_nodes + 64, 0.0f);
+  for (int i = 0; i < free_nodes; ++i)
+    at_node(v, i).setConstant(1.0f + 0.1f * static_cast<float>(i % 7));
   double value = 0.0;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     double size = 0.0, growth = 0.0;
-    for (int i = 0; i < free_nodes; ++i) size += assembly.mass[i] * at_node(v, i).cast<double>().squaredNorm();
+    for (int i = 0; i < free_nodes; ++i)
+      size += assembly.mass[i] * at_node(v, i).cast<double>().squaredNorm();
     const float scale = static_cast<float>(1.0 / std::sqrt(size));
     for (float& component : v) component *= scale;
     Buffer<float> force = v;
     for (int i = 0; i < free_nodes; ++i) at_node(force, i) *= static_cast<float>(assembly.mass[i]);
     std::fill(y.begin(), y.end(), 0.0f);
-    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(), work.data(), 1e-3);
+    assembly.kernel.krylov(assembly.matrix, factor.view(), open.rows(), force.data(), y.data(),
+                           work.data(), 1e-3);
     for (int i = 0; i < free_nodes; ++i) {
       growth += assembly.mass[i] * at_node(v, i).cast<double>().dot(at_node(y, i).cast<double>());
     }

@@ -1,4 +1,5 @@
-// Dynamics of cloth in contact with moving bodies, itself and moving surfaces: implicit Euler, exact Coulomb friction.
+// Dynamics of cloth in contact with moving bodies, itself and moving surfaces: implicit Euler,
+// exact Coulomb friction.
 #pragma once
 
 #include <Eigen/Core>
@@ -19,8 +20,8 @@
 
 namespace sim_core {
 
-// Triangles that are no cloth, the surface that each of their vertices belongs to, the initial positions of these, and
-// the angle from which edges of each surface are sharp, rad.
+// Triangles that are no cloth, the surface that each of their vertices belongs to, the initial
+// positions of these, and the angle from which edges of each surface are sharp, rad.
 struct SurfaceMeshes {
   Triangles triangles;
   std::vector<std::int32_t> surface_of_vertex;
@@ -38,10 +39,13 @@ ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Sk
 
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
-                                           const ContactMaterials& materials, const SurfaceMeshes& surfaces,
-                                           const std::vector<Skeleton>& skeletons, const Constants& constants);
+                                           const ContactMaterials& materials,
+                                           const SurfaceMeshes& surfaces,
+                                           const std::vector<Skeleton>& skeletons,
+                                           const Constants& constants);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
-                                                 const ContactMaterials& materials, const SurfaceMeshes& surfaces,
+                                                 const ContactMaterials& materials,
+                                                 const SurfaceMeshes& surfaces,
                                                  const SmoothSettings& settings);
 
 // What a solver is made of.
@@ -63,13 +67,14 @@ class ClothSolver {
   explicit ClothSolver(const ClothSetup& setup);
   ~ClothSolver();
 
-  // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in the next step.
-  // `begins`: refuses free vertices inside a body.
+  // `surfaces`: positions of their vertices; `bodies`: where they are, or none: they do not move in
+  // the next step. `begins`: refuses free vertices inside a body.
   void set_state(const Points3& positions, const Points3& velocities, const Points3& surfaces,
                  const std::vector<Body>& bodies = {}, bool begins = true);
 
-  // `gravity`: acceleration of each vertex; `held` and `surfaces`: at the end of the step; bodies keep their
-  // number and order from step to step. `damping`: mass-proportional, 1/s, on top of the fabrics' own.
+  // `gravity`: acceleration of each vertex; `held` and `surfaces`: at the end of the step; bodies
+  // keep their number and order from step to step. `damping`: mass-proportional, 1/s, on top of the
+  // fabrics' own.
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
                   const std::vector<Body>& bodies, double damping);
 
@@ -80,18 +85,19 @@ class ClothSolver {
 
   Points3 positions() const;
   Points3 velocities() const;
-  // Force of bodies and smooth surfaces on each free vertex, of holders on each held one, at the end of the last step,
-  // N.
+  // Force of bodies and smooth surfaces on each free vertex, of holders on each held one, at the
+  // end of the last step, N.
   Points3 reactions() const;
-  // Which body each vertex touches, or after the bodies which surface (-1: none), and whether it slides.
+  // Which body each vertex touches, or after the bodies which surface (-1: none), and whether it
+  // slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
 
   // Force of the cloth on each vertex of the surfaces at the end of the last step, N.
   Points3 surface_forces() const;
 
-  // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices of surfaces and
-  // points of skeletons come after those of the cloth.
+  // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices
+  // of surfaces and points of skeletons come after those of the cloth.
   using Truths = Eigen::Matrix<bool, Eigen::Dynamic, 1>;
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
@@ -105,7 +111,8 @@ class ClothSolver {
 
   // Of membrane and bending, J, and the gradient of their sum, N.
   std::tuple<double, double, Points3> energies(const Points3& positions);
-  // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive where they are stable.
+  // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive
+  // where they are stable.
   double softest(const Points3& positions);
 
   const Eigen::VectorXd& masses() const;

@@ -14,15 +14,16 @@ using Eigen::Vector3d;
 
 namespace {
 
-// By how far flat triangles with a circle of radius `circle` around them sink into a body of radius `radius`, on whose
-// face their corners are.
+// By how far flat triangles with a circle of radius `circle` around them sink into a body of radius
+// `radius`, on whose face their corners are.
 double sagitta(double radius, double circle) {
   return radius - std::sqrt(std::max(0.0, radius * radius - circle * circle));
 }
 
 }  // namespace
 
-Watch::Watch(const ClothMesh& mesh, const Assembly& assembly) : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
+Watch::Watch(const ClothMesh& mesh, const Assembly& assembly)
+    : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
   std::vector<int> around(mesh.rest.rows(), 0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     Matrix2d sides;
@@ -31,11 +32,14 @@ Watch::Watch(const ClothMesh& mesh, const Assembly& assembly) : assembly_(assemb
       nodes_.push_back(assembly.numbering.node[vertex]);
       cell_[vertex] += 2.0 * mesh.area[t];
       ++around[vertex];
-      if (c > 0) sides.col(c - 1) = (mesh.rest.row(vertex) - mesh.rest.row(mesh.triangles(t, 0))).transpose();
+      if (c > 0)
+        sides.col(c - 1) =
+            (mesh.rest.row(vertex) - mesh.rest.row(mesh.triangles(t, 0))).transpose();
     }
     const Matrix2d inverse = sides.inverse();
     inverse_.insert(inverse_.end(), inverse.data(), inverse.data() + 4);
-    const double a = sides.col(0).norm(), b = sides.col(1).norm(), c = (sides.col(0) - sides.col(1)).norm();
+    const double a = sides.col(0).norm(), b = sides.col(1).norm(),
+                 c = (sides.col(0) - sides.col(1)).norm();
     circle_ = std::max(circle_, a * b * c / (4.0 * mesh.area[t]));
   }
   for (std::size_t v = 0; v < cell_.size(); ++v) cell_[v] = std::sqrt(cell_[v] / around[v]);
@@ -57,8 +61,10 @@ Observed Watch::see(const StepTaken& step, const Newton& newton) {
 double Watch::largest_stretch(const Buffer<double>& x) const {
   double largest = 0.0;
   const int* node = nodes_.data();
-  for (const double* inverse = inverse_.data(); inverse != inverse_.data() + inverse_.size(); inverse += 4, node += 3) {
-    const Vector3d p = at_node(x, node[0]), u = at_node(x, node[1]) - p, v = at_node(x, node[2]) - p;
+  for (const double* inverse = inverse_.data(); inverse != inverse_.data() + inverse_.size();
+       inverse += 4, node += 3) {
+    const Vector3d p = at_node(x, node[0]), u = at_node(x, node[1]) - p,
+                   v = at_node(x, node[2]) - p;
     const Vector3d f = u * inverse[0] + v * inverse[1], g = u * inverse[2] + v * inverse[3];
     const double ff = f.squaredNorm(), gg = g.squaredNorm(), fg = f.dot(g), half = 0.5 * (ff - gg);
     const double square = 0.5 * (ff + gg) + std::sqrt(half * half + fg * fg);
@@ -67,7 +73,8 @@ double Watch::largest_stretch(const Buffer<double>& x) const {
   return std::sqrt(largest);
 }
 
-// Where a body is rounder than the triangles, its depth is that of the vertices; else between them, too.
+// Where a body is rounder than the triangles, its depth is that of the vertices; else between them,
+// too.
 double Watch::depth_in(const Body& body, const Buffer<double>& x) const {
   double deepest = 0.0;
   const Numbering& numbering = assembly_.numbering;
@@ -84,22 +91,26 @@ double Watch::depth_in(const Body& body, const Buffer<double>& x) const {
     const double cell = cell_[numbering.vertex[node[0]]], from = gap_of(body, middle).distance;
     if (from > cell) continue;
     double least = from;
-    for (int c = 0; c < 3; ++c) least = std::min(least, gap_of(body, 0.5 * (p[c] + p[(c + 1) % 3])).distance);
+    for (int c = 0; c < 3; ++c)
+      least = std::min(least, gap_of(body, 0.5 * (p[c] + p[(c + 1) % 3])).distance);
     deepest = std::max(deepest, (-least - allowed) / cell);
   }
   return deepest;
 }
 
-void Watch::refuse_inside(const Body& body, int number, double inside, const Buffer<double>& x) const {
+void Watch::refuse_inside(const Body& body, int number, double inside,
+                          const Buffer<double>& x) const {
   const Numbering& numbering = assembly_.numbering;
   for (std::size_t t = 0; t < nodes_.size(); t += 3) {
     const int* node = &nodes_[t];
     if (std::min({node[0], node[1], node[2]}) >= numbering.free_nodes) continue;
-    const double depth = depth_beyond(body, {at_node(x, node[0]), at_node(x, node[1]), at_node(x, node[2])}, inside);
+    const double depth =
+        depth_beyond(body, {at_node(x, node[0]), at_node(x, node[1]), at_node(x, node[2])}, inside);
     if (depth == 0.0) continue;
     refuse(text("positions: triangles must not start more than ", 1e3 * inside,
-                " mm inside a body, and that of vertices ", numbering.vertex[node[0]], ", ", numbering.vertex[node[1]],
-                " and ", numbering.vertex[node[2]], " is ", 1e3 * depth, " mm inside body ", number));
+                " mm inside a body, and that of vertices ", numbering.vertex[node[0]], ", ",
+                numbering.vertex[node[1]], " and ", numbering.vertex[node[2]], " is ", 1e3 * depth,
+                " mm inside body ", number));
   }
 }
 
@@ -111,13 +122,15 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
   double farthest = 0.0, turned = (end.rotation - begin.rotation).norm();
   const Vector3d shift = end.origin - begin.origin;
   for (int i = 0; i < numbering.vertices; ++i) {
-    const Vector3d from = at_node(step.start, numbering.node[i]), to = at_node(step.x, numbering.node[i]);
+    const Vector3d from = at_node(step.start, numbering.node[i]),
+                   to = at_node(step.x, numbering.node[i]);
     double way = (to - from - shift).squaredNorm();
     if (turned > 0.0) way = std::pow(std::sqrt(way) + turned * (from - begin.origin).norm(), 2);
     farthest = std::max(farthest, way);
   }
   if (std::sqrt(farthest) + circle_ < core.radius) return 0;
-  const Matrix3d before = (begin.rotation * core.axes).transpose(), after = (end.rotation * core.axes).transpose();
+  const Matrix3d before = (begin.rotation * core.axes).transpose(),
+                 after = (end.rotation * core.axes).transpose();
   int count = 0;
   for (std::size_t t = 0; t < nodes_.size(); t += 3) {
     Corners from, to;
@@ -130,33 +143,39 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
   return count;
 }
 
-// Of each node that touches a body, the work R . (change of gap n + slip): contact only takes energy from the motion
-// against a body. The gap's change stands for the normal part of the motion, for a round face turns on the way. On a
-// fillet, n = sum w_i n_i, it is sum w_i times those of the gaps.
+// Of each node that touches a body, the work R . (change of gap n + slip): contact only takes
+// energy from the motion against a body. The gap's change stands for the normal part of the motion,
+// for a round face turns on the way. On a fillet, n = sum w_i n_i, it is sum w_i times those of the
+// gaps.
 void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& out) const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const int b = newton.contact.touched[i];
     if (b < 0 || b >= static_cast<int>(step.at_end.size())) continue;
-    const Vector3d from = at_node(step.start, i), to = at_node(step.x, i), force = at_node(newton.residual, i);
+    const Vector3d from = at_node(step.start, i), to = at_node(step.x, i),
+                   force = at_node(newton.residual, i);
     Bearing on = newton.contact.bearing(step.at_end, to);
     if (on.body != b) on = {gap_of(step.at_end[b], to), b};
     if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
     // The change of a gap, and the share of its normal.
     const Vector2d way = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
-      return {gap.distance - gap_of(step.at_start[body], from).distance, gap.normal.dot(on.gap.normal)};
+      return {gap.distance - gap_of(step.at_start[body], from).distance,
+              gap.normal.dot(on.gap.normal)};
     });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
     out.contact_work += std::max(0.0, force.dot(way[0] / way[1] * on.gap.normal + slip));
   }
 }
 
-// What the energy of motion and strain gains beyond the work of gravity and of what holds, bears and rubs the cloth.
+// What the energy of motion and strain gains beyond the work of gravity and of what holds, bears
+// and rubs the cloth.
 void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& out) {
   const Numbering& numbering = assembly_.numbering;
   double kinetic = 0.0, weight = 0.0, forces = 0.0, sizes = 0.0;
   const auto add = [&](double work) { forces += work, sizes += std::abs(work); };
-  const auto way_of = [&](int node) -> Vector3d { return at_node(step.x, node) - at_node(step.start, node); };
+  const auto way_of = [&](int node) -> Vector3d {
+    return at_node(step.x, node) - at_node(step.start, node);
+  };
   for (int i = 0; i < numbering.nodes - numbering.bones; ++i) {
     const Vector3d way = way_of(i);
     add(way.dot(at_node(newton.residual, i)));
@@ -165,12 +184,14 @@ void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& ou
     kinetic += 0.5 * assembly_.mass[i] * at_node(step.v, i).squaredNorm();
     weight += assembly_.mass[i] * step.gravity.row(vertex).dot(way);
   }
-  if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts is what cloth gets
+  if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts
+                       // is what cloth gets
     for (const Pair& pair : newton.pairs->list()) {
       if (!newton.pairs->bone_of(pair.who)) continue;
       Vector3d way = Vector3d::Zero();
       for (int c = 0; c < 4; ++c) {
-        if (pair.who.node[c] < numbering.nodes - numbering.bones) way += pair.weights[c] * way_of(pair.who.node[c]);
+        if (pair.who.node[c] < numbering.nodes - numbering.bones)
+          way += pair.weights[c] * way_of(pair.who.node[c]);
       }
       add(way.dot(pair.at.force));
     }

@@ -17,7 +17,8 @@ Corners at_share(const Corners& start, const Corners& end, double share) {
   return out;
 }
 
-// The share of the way at which `f` changes its sign, by bisection; NaN if it has one sign at both ends.
+// The share of the way at which `f` changes its sign, by bisection; NaN if it has one sign at both
+// ends.
 template <class F>
 double change_of_sign(const F& f) {
   constexpr int halvings = 30;
@@ -31,8 +32,8 @@ double change_of_sign(const F& f) {
   return high;
 }
 
-// Whether the inside of the triangle passes a point: where its volume with the point changes its sign, the point lies
-// in it.
+// Whether the inside of the triangle passes a point: where its volume with the point changes its
+// sign, the point lies in it.
 bool passes_point(const Corners& start, const Corners& end, const Vector3d& point) {
   const double share = change_of_sign([&](double t) {
     const Corners at = at_share(start, end, t);
@@ -47,17 +48,21 @@ bool passes_point(const Corners& start, const Corners& end, const Vector3d& poin
   return true;
 }
 
-// Whether a side of the triangle passes the segment of the core along its axis `along`, at `side` of the other one.
-bool passes_segment(const Core& core, const Corners& start, const Corners& end, int along, double side) {
+// Whether a side of the triangle passes the segment of the core along its axis `along`, at `side`
+// of the other one.
+bool passes_segment(const Core& core, const Corners& start, const Corners& end, int along,
+                    double side) {
   const auto across = [&](const Vector3d& p) { return Vector2d(p[1 - along] - side, p[2]); };
   for (int c = 0; c < 3; ++c) {
     const int d = (c + 1) % 3;
     const double share = change_of_sign([&](double t) {
-      const Vector2d a = across(start[c] + t * (end[c] - start[c])), b = across(start[d] + t * (end[d] - start[d]));
+      const Vector2d a = across(start[c] + t * (end[c] - start[c])),
+                     b = across(start[d] + t * (end[d] - start[d]));
       return a.x() * b.y() - a.y() * b.x();
     });
     if (std::isnan(share)) continue;
-    const Vector3d p = start[c] + share * (end[c] - start[c]), q = start[d] + share * (end[d] - start[d]);
+    const Vector3d p = start[c] + share * (end[c] - start[c]),
+                   q = start[d] + share * (end[d] - start[d]);
     const Vector2d a = across(p), b = across(q);
     const double way = (a - b).squaredNorm(), place = way > 0.0 ? a.dot(a - b) / way : 0.0;
     if (place < 0.0 || place > 1.0) continue;
@@ -79,11 +84,13 @@ bool passes_inside(const Core& core, const Corners& start, const Corners& end) {
 // Where the box from `low` to `high` lies along an axis.
 std::array<double, 2> range_along(const Vector3d& axis, const Vector3d& origin, const Vector3d& low,
                                   const Vector3d& high) {
-  const double middle = axis.dot(0.5 * (low + high) - origin), half = axis.cwiseAbs().dot(0.5 * (high - low));
+  const double middle = axis.dot(0.5 * (low + high) - origin),
+               half = axis.cwiseAbs().dot(0.5 * (high - low));
   return {middle - half, middle + half};
 }
 
-// Corners of the core: bit `a` of a corner's number says on which side of axis `a` it lies, where the core has one.
+// Corners of the core: bit `a` of a corner's number says on which side of axis `a` it lies, where
+// the core has one.
 Skeleton skeleton_of(const std::array<std::array<double, 2>, 3>& core, bool whole) {
   Skeleton out{};
   std::vector<int> axes;
@@ -128,7 +135,8 @@ Gap gap_of(const Body& body, const Vector3d& x) {
   Vector3d normal = Vector3d::Zero();
   if (r > 0.0) {
     for (int c = 0; c < 3; ++c) normal[c] = std::copysign(outside[c] / r, local[c]);
-    return {r - body.radius, body.rotation * normal, normal.cwiseAbs().maxCoeff() == 1.0 && body.core.minCoeff() > 0.0};
+    return {r - body.radius, body.rotation * normal,
+            normal.cwiseAbs().maxCoeff() == 1.0 && body.core.minCoeff() > 0.0};
   }
   int axis = 0;
   beyond.maxCoeff(&axis);
@@ -136,14 +144,15 @@ Gap gap_of(const Body& body, const Vector3d& x) {
   return {beyond[axis] - body.radius, body.rotation * normal};
 }
 
-// A body is convex, so its distance grows by at least the normal's share of the way from the triangle's middle. Where
-// that leaves it open, its quarters are looked at.
+// A body is convex, so its distance grows by at least the normal's share of the way from the
+// triangle's middle. Where that leaves it open, its quarters are looked at.
 double depth_beyond(const Body& body, const std::array<Vector3d, 3>& triangle, double allowed) {
   const auto& [a, b, c] = triangle;
   const Vector3d middle = (a + b + c) / 3.0;
   const Gap gap = gap_of(body, middle);
   if (gap.distance < -allowed) return -gap.distance;
-  const double lowest = std::min({gap.normal.dot(a - middle), gap.normal.dot(b - middle), gap.normal.dot(c - middle)});
+  const double lowest = std::min(
+      {gap.normal.dot(a - middle), gap.normal.dot(b - middle), gap.normal.dot(c - middle)});
   constexpr double error = 1e-6;  // m
   if (!(gap.distance + lowest < -allowed - error)) return 0.0;
   const Vector3d ab = 0.5 * (a + b), bc = 0.5 * (b + c), ca = 0.5 * (c + a);
@@ -169,7 +178,8 @@ Body between(const Body& a, const Body& b, double share) {
 }
 
 Core core_of(const Body& body) {
-  if (body.shape == Body::plane) return {std::numeric_limits<double>::infinity(), Vector2d::Zero(), {}};
+  if (body.shape == Body::plane)
+    return {std::numeric_limits<double>::infinity(), Vector2d::Zero(), {}};
   int thin = 0, first = 0;
   const double less = body.core.minCoeff(&thin);
   body.core.maxCoeff(&first);
@@ -206,8 +216,9 @@ bool passes(const Core& core, const Corners& start, const Corners& end) {
   return corners() || (wide && passes_inside(core, start, end));
 }
 
-std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell, const Vector3d& low,
-                                   const Vector3d& high, double beyond, const SkeletonSettings& settings) {
+std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell,
+                                   const Vector3d& low, const Vector3d& high, double beyond,
+                                   const SkeletonSettings& settings) {
   std::vector<Skeleton> out;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     const Body& body = bodies[b];

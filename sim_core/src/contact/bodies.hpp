@@ -9,8 +9,9 @@
 
 namespace sim_core {
 
-// At the end of a step. In its own axes a plane fills z < 0; a rounded body has all points within `radius` of a core,
-// the box from -core to core: a point of a sphere, a line without ends of a cylinder.
+// At the end of a step. In its own axes a plane fills z < 0; a rounded body has all points within
+// `radius` of a core, the box from -core to core: a point of a sphere, a line without ends of a
+// cylinder.
 struct Body {
   enum Shape : int { plane = 0, rounded = 1 };
   int shape;
@@ -25,7 +26,8 @@ struct Body {
   double mu_of(int sheet) const { return mu.size() == 1 ? mu[0] : mu[sheet]; }
 };
 
-// Signed distance of a point from a body [m], negative inside; the outward normal there, and whether the face is flat.
+// Signed distance of a point from a body [m], negative inside; the outward normal there, and
+// whether the face is flat.
 struct Gap {
   double distance;
   Eigen::Vector3d normal;
@@ -33,8 +35,10 @@ struct Gap {
 };
 Gap gap_of(const Body& body, const Eigen::Vector3d& x);
 
-// Depth in a body of a point of a triangle that is deeper than `allowed`, or 0 where none is, up to 1 um, m.
-double depth_beyond(const Body& body, const std::array<Eigen::Vector3d, 3>& triangle, double allowed);
+// Depth in a body of a point of a triangle that is deeper than `allowed`, or 0 where none is, up to
+// 1 um, m.
+double depth_beyond(const Body& body, const std::array<Eigen::Vector3d, 3>& triangle,
+                    double allowed);
 
 // Where the motion from `begin` to `end` carries the material point of the body that is at x.
 Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3d& x);
@@ -42,11 +46,13 @@ Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3
 // The body at a share of its motion from a to b: straight, and at an even turn.
 Body between(const Body& a, const Body& b, double share);
 
-// The core of a body, which no cloth may pass: the body that got thinner from all sides until one dimension was left
-// with no thickness. A ball's is its centre, a cylinder's its axis, and a box's a rectangle.
+// The core of a body, which no cloth may pass: the body that got thinner from all sides until one
+// dimension was left with no thickness. A ball's is its centre, a cylinder's its axis, and a box's
+// a rectangle.
 struct Core {
-  double radius;         // m: distance from the core to the body's face, where that is nearest
-  Eigen::Vector2d half;  // m: half edges of the rectangle, the longer first; infinite along a cylinder
+  double radius;  // m: distance from the core to the body's face, where that is nearest
+  Eigen::Vector2d
+      half;  // m: half edges of the rectangle, the longer first; infinite along a cylinder
   Eigen::Matrix3d axes;  // of the rectangle and across it, in the body's axes
 };
 
@@ -59,12 +65,14 @@ using Corners = std::array<Eigen::Vector3d, 3>;
 // Whether a triangle whose corners go straight from `start` to `end` passes the core.
 bool passes(const Core& core, const Corners& start, const Corners& end);
 
-// The points, segments and faces of a body's core, which cloth touches by pairs of closest points at the distance of
-// the radius. What is small against a cell slips through between vertices, so vertices do not feel it.
+// The points, segments and faces of a body's core, which cloth touches by pairs of closest points
+// at the distance of the radius. What is small against a cell slips through between vertices, so
+// vertices do not feel it.
 struct Skeleton {
   int body;
   double radius;  // m
-  bool whole;     // no vertex touches the body itself; else vertices do, and pairs hold what lies between them
+  bool whole;     // no vertex touches the body itself; else vertices do, and pairs hold what lies
+                  // between them
   std::vector<Eigen::Vector3d> points;  // in the body's axes, m
   std::vector<std::array<int, 2>> segments;
   std::vector<std::array<int, 3>> triangles;  // with two corners alike: a segment, for vertices
@@ -72,9 +80,10 @@ struct Skeleton {
   Eigen::Vector3d point(const Body& at, int i) const { return at.origin + at.rotation * points[i]; }
 };
 
-// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from the cloth, which
-// lies between `low` and `high`.
-std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell, const Eigen::Vector3d& low,
-                                   const Eigen::Vector3d& high, double beyond, const SkeletonSettings& settings);
+// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from
+// the cloth, which lies between `low` and `high`.
+std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell,
+                                   const Eigen::Vector3d& low, const Eigen::Vector3d& high,
+                                   double beyond, const SkeletonSettings& settings);
 
 }  // namespace sim_core

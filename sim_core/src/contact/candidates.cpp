@@ -57,7 +57,9 @@ class Grid {
   static constexpr double cells_per_item = 8.0;
 
   Eigen::Array3i place(const Array3d& p) const { return ((p - low_) / size_).floor().cast<int>(); }
-  int index(const Eigen::Array3i& at) const { return (at[2] * count_[1] + at[1]) * count_[0] + at[0]; }
+  int index(const Eigen::Array3i& at) const {
+    return (at[2] * count_[1] + at[1]) * count_[0] + at[0];
+  }
   template <class Call>
   void visit(const Box& box, const Call& call) const {
     const Eigen::Array3i from = place(box.min().array()), to = place(box.max().array());
@@ -90,13 +92,13 @@ class Around {
   }
   // Of those after one: whether they meet it.
   const std::vector<char>& meeting(int one) {
-    const double *low = low_[0].data(), *low_y = low_[1].data(), *low_z = low_[2].data(), *high = high_[0].data(),
-                 *high_y = high_[1].data(), *high_z = high_[2].data();
+    const double *low = low_[0].data(), *low_y = low_[1].data(), *low_z = low_[2].data(),
+                 *high = high_[0].data(), *high_y = high_[1].data(), *high_z = high_[2].data();
     char* meet = meet_.data();
     const int count = static_cast<int>(meet_.size());
     for (int j = one + 1; j < count; ++j) {
-      meet[j] = (low[one] <= high[j]) & (low[j] <= high[one]) & (low_y[one] <= high_y[j]) & (low_y[j] <= high_y[one]) &
-                (low_z[one] <= high_z[j]) & (low_z[j] <= high_z[one]);
+      meet[j] = (low[one] <= high[j]) & (low[j] <= high[one]) & (low_y[one] <= high_y[j]) &
+                (low_y[j] <= high_y[one]) & (low_z[one] <= high_z[j]) & (low_z[j] <= high_z[one]);
     }
     return meet_;
   }
@@ -106,7 +108,8 @@ class Around {
   std::vector<char> meet_;
 };
 
-void add_if_near(std::vector<Candidate>& out, Candidate pair, const Buffer<double>& x, double reach) {
+void add_if_near(std::vector<Candidate>& out, Candidate pair, const Buffer<double>& x,
+                 double reach) {
   const FourPoints at = points_of(pair, x);
   pair.distance = between_closest(closest_weights(pair.kind, at), at).norm();
   if (pair.distance <= reach) out.push_back(pair);
@@ -116,7 +119,8 @@ bool in_order(const Candidate& p, const Candidate& q) {
   return p.first != q.first ? p.first < q.first : p.second < q.second;
 }
 
-// Pairs with skeletons, which have few pieces and reach far: each is compared with all of the cloth.
+// Pairs with skeletons, which have few pieces and reach far: each is compared with all of the
+// cloth.
 struct SkeletonSearch {
   const Surface& surface;
   const Buffer<double>& x;
@@ -129,7 +133,8 @@ struct SkeletonSearch {
   template <class Pieces, class Call>
   void near(const Box& box, int node, const Pieces& pieces, int count, const Call& call) const {
     for (int i = 0; i < count; ++i) {
-      if (box.intersects(box_of(pieces[i], x, 0.0)) && surface.may_touch(pieces[i][0], node)) call(i);
+      if (box.intersects(box_of(pieces[i], x, 0.0)) && surface.may_touch(pieces[i][0], node))
+        call(i);
     }
   }
 
@@ -141,10 +146,13 @@ struct SkeletonSearch {
       for (int v = 0; v < surface.bone_vertices; ++v) {
         const int vertex = surface.vertices[v];
         if (!box.contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
-        add_if_near(
-            out,
-            {PairKind::vertex_triangle, vertex, static_cast<int>(t), {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
-            reach_of(corner[0]));
+        add_if_near(out,
+                    {PairKind::vertex_triangle,
+                     vertex,
+                     static_cast<int>(t),
+                     {vertex, corner[0], corner[1], corner[2]},
+                     0.0},
+                    x, reach_of(corner[0]));
       }
     }
     for (std::size_t v = surface.bone_vertices; v < surface.vertices.size(); ++v) {
@@ -152,8 +160,10 @@ struct SkeletonSearch {
       const Box box = box_of(std::array<int, 1>{vertex}, x, reach_of(vertex));
       near(box, vertex, surface.triangles, surface.bone_triangles, [&](int t) {
         const auto& corner = surface.triangles[t];
-        add_if_near(out, {PairKind::vertex_triangle, vertex, t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
-                    reach_of(vertex));
+        add_if_near(
+            out,
+            {PairKind::vertex_triangle, vertex, t, {vertex, corner[0], corner[1], corner[2]}, 0.0},
+            x, reach_of(vertex));
       });
     }
     if (out.size() > before) std::sort(out.begin(), out.end(), in_order);
@@ -164,7 +174,8 @@ struct SkeletonSearch {
       const auto& b = surface.edges[e];
       near(box_of(b, x, reach_of(b[0])), b[0], surface.edges, surface.bone_edges, [&](int i) {
         const auto& a = surface.edges[i];
-        add_if_near(out, {PairKind::edge_edge, i, static_cast<int>(e), {a[0], a[1], b[0], b[1]}, 0.0}, x,
+        add_if_near(out,
+                    {PairKind::edge_edge, i, static_cast<int>(e), {a[0], a[1], b[0], b[1]}, 0.0}, x,
                     reach_of(b[0]));
       });
     }
@@ -174,16 +185,19 @@ struct SkeletonSearch {
 }  // namespace
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
-  return {at_node(x, pair.node[0]), at_node(x, pair.node[1]), at_node(x, pair.node[2]), at_node(x, pair.node[3])};
+  return {at_node(x, pair.node[0]), at_node(x, pair.node[1]), at_node(x, pair.node[2]),
+          at_node(x, pair.node[3])};
 }
 
 std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
                                   const std::vector<double>& farther) {
   std::vector<Candidate> out;
   std::vector<Box> boxes;
-  for (int t = 0; t < surface.bone_triangles; ++t) boxes.push_back(box_of(surface.triangles[t], x, reach));
-  if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(),
-                                    [](const Box& box) { return box.min().allFinite() && box.max().allFinite(); })) {
+  for (int t = 0; t < surface.bone_triangles; ++t)
+    boxes.push_back(box_of(surface.triangles[t], x, reach));
+  if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
+        return box.min().allFinite() && box.max().allFinite();
+      })) {
     return out;
   }
   const Grid around_triangles(boxes);
@@ -193,17 +207,21 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
       const auto& corner = surface.triangles[*t];
-      if (!boxes[*t].contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
+      if (!boxes[*t].contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0]))
+        continue;
       if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
-      add_if_near(out, {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0}, x,
-                  reach);
+      add_if_near(
+          out,
+          {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0},
+          x, reach);
     }
   }
   const SkeletonSearch skeletons{surface, x, reach, farther};
   skeletons.find_vertices(out);
   const std::size_t vertex_pairs = out.size();
   boxes.clear();
-  for (int e = 0; e < surface.bone_edges; ++e) boxes.push_back(box_of(surface.edges[e], x, 0.5 * reach));
+  for (int e = 0; e < surface.bone_edges; ++e)
+    boxes.push_back(box_of(surface.edges[e], x, 0.5 * reach));
   const Grid edges(boxes);
   Around around;
   for (int cell = 0; cell < edges.cells(); ++cell) {
@@ -211,7 +229,8 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     around.take(boxes, begin, end);
     for (const int* i = begin; i < end; ++i) {
       const auto& a = surface.edges[*i];
-      if (a[0] > surface.last_collider[surface.sheet_of_node[a[0]]]) continue;  // nothing beyond touches it
+      if (a[0] > surface.last_collider[surface.sheet_of_node[a[0]]])
+        continue;  // nothing beyond touches it
       const std::vector<char>& meet = around.meeting(static_cast<int>(i - begin));
       for (const int* j = i + 1; j < end; ++j) {
         if (!meet[j - begin]) continue;

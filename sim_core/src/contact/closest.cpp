@@ -12,7 +12,8 @@ namespace {
 using Eigen::Vector3d;
 using Eigen::Vector4d;
 
-// Squared sine below which segments count as parallel: the determinant a e - b b then has lost all but 2 of 16 digits.
+// Squared sine below which segments count as parallel: the determinant a e - b b then has lost all
+// but 2 of 16 digits.
 constexpr double parallel = 1e-14;
 // Bounds the work where pieces slide past each other much slower than the bound of their speed.
 constexpr int advances_max = 1000;
@@ -21,7 +22,8 @@ Eigen::Vector2d closest_on_segments(const FourPoints& x) {
   const Vector3d u = x[1] - x[0], v = x[3] - x[2], r = x[0] - x[2];
   const double a = u.squaredNorm(), e = v.squaredNorm(), b = u.dot(v), c = u.dot(r), f = v.dot(r);
   const double denominator = a * e - b * b;
-  double s = denominator > parallel * a * e ? std::clamp((b * f - c * e) / denominator, 0.0, 1.0) : 0.0;
+  double s =
+      denominator > parallel * a * e ? std::clamp((b * f - c * e) / denominator, 0.0, 1.0) : 0.0;
   double t = e > 0.0 ? (b * s + f) / e : 0.0;
   if (t < 0.0 || t > 1.0) {
     t = std::clamp(t, 0.0, 1.0);
@@ -35,7 +37,8 @@ constexpr int leaf_max = 4;
 
 }  // namespace
 
-Vector3d closest_on_triangle(const Vector3d& p, const Vector3d& a, const Vector3d& b, const Vector3d& c) {
+Vector3d closest_on_triangle(const Vector3d& p, const Vector3d& a, const Vector3d& b,
+                             const Vector3d& c) {
   const Vector3d ab = b - a, ac = c - a, ap = p - a;
   const double d1 = ab.dot(ap), d2 = ac.dot(ap);
   if (d1 <= 0.0 && d2 <= 0.0) return {1.0, 0.0, 0.0};
@@ -104,9 +107,11 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, cons
     // The distance is at least `least` up to here, and above 0 up to `next`.
     const double safe = share + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next = std::min(1.0, share + std::max((1.0 - leaves.rest) * distance, distance - least) / fastest);
+    const double next =
+        std::min(1.0, share + std::max((1.0 - leaves.rest) * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
-    const double before = std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());
+    const double before =
+        std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());
     if (distance < least) return share + (before - least) / fastest;
     if (next == 1.0) return 1.0;
     share = next;
@@ -118,7 +123,8 @@ TriangleTree::TriangleTree(std::vector<std::array<int, 3>> triangles, const Buff
     : triangles_(std::move(triangles)), order_(triangles_.size()), corners_(triangles_.size()) {
   std::iota(order_.begin(), order_.end(), 0);
   std::vector<Vector3d> middles;
-  for (const auto& c : triangles_) middles.push_back((at_node(x, c[0]) + at_node(x, c[1]) + at_node(x, c[2])) / 3.0);
+  for (const auto& c : triangles_)
+    middles.push_back((at_node(x, c[0]) + at_node(x, c[1]) + at_node(x, c[2])) / 3.0);
   if (!triangles_.empty()) build(0, static_cast<int>(triangles_.size()), middles);
   fit(x);
 }
@@ -132,9 +138,10 @@ int TriangleTree::build(int begin, int end, const std::vector<Vector3d>& middles
   int axis = 0;
   around.diagonal().maxCoeff(&axis);
   const int middle = (begin + end) / 2;
-  std::nth_element(order_.begin() + begin, order_.begin() + middle, order_.begin() + end, [&](int a, int b) {
-    return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
-  });
+  std::nth_element(
+      order_.begin() + begin, order_.begin() + middle, order_.begin() + end, [&](int a, int b) {
+        return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
+      });
   build(begin, middle, middles);
   boxes_[own].right = build(middle, end, middles);
   return own;
@@ -157,7 +164,8 @@ void TriangleTree::fit(const Buffer<double>& x) {
   }
 }
 
-Nearest TriangleTree::nearest(const Vector3d& p, double reach, const std::function<bool(int)>& counts) const {
+Nearest TriangleTree::nearest(const Vector3d& p, double reach,
+                              const std::function<bool(int)>& counts) const {
   Nearest out;
   double best = reach * reach;
   const auto away = [&](int b) {

@@ -1,8 +1,9 @@
 // Closest points of a point and a triangle, and of two segments, as weights of their four nodes.
 //
-// The vector between them is rho = sum w_i x_i: from the triangle to the point with w = (1, -b), b barycentric, and
-// from the second segment to the first with w = (1 - s, s, -(1 - t), -t). At an optimum its length changes by n . sum
-// w_i dx_i, n = rho/|rho|, whatever the weights do: they are stationary.
+// The vector between them is rho = sum w_i x_i: from the triangle to the point with w = (1, -b), b
+// barycentric, and from the second segment to the first with w = (1 - s, s, -(1 - t), -t). At an
+// optimum its length changes by n . sum w_i dx_i, n = rho/|rho|, whatever the weights do: they are
+// stationary.
 #pragma once
 
 #include <Eigen/Geometry>
@@ -19,13 +20,13 @@ using FourPoints = std::array<Eigen::Vector3d, 4>;
 // Which four points: a point and the three of a triangle, or the two and two of segments.
 enum class PairKind : int { vertex_triangle = 0, edge_edge = 1 };
 
-// Barycentric coordinates of the point of the triangle abc that is closest to p; those that are zero are exactly so
-// [Ericson 2005, 5.1.5].
-Eigen::Vector3d closest_on_triangle(const Eigen::Vector3d& p, const Eigen::Vector3d& a, const Eigen::Vector3d& b,
-                                    const Eigen::Vector3d& c);
+// Barycentric coordinates of the point of the triangle abc that is closest to p; those that are
+// zero are exactly so [Ericson 2005, 5.1.5].
+Eigen::Vector3d closest_on_triangle(const Eigen::Vector3d& p, const Eigen::Vector3d& a,
+                                    const Eigen::Vector3d& b, const Eigen::Vector3d& c);
 
-// The same for the four points of a pair [Ericson 2005, 5.1.5 and 5.1.9]. Segments that are parallel have one of their
-// closest points.
+// The same for the four points of a pair [Ericson 2005, 5.1.5 and 5.1.9]. Segments that are
+// parallel have one of their closest points.
 Eigen::Vector4d closest_weights(PairKind kind, const FourPoints& x);
 
 // rho.
@@ -36,8 +37,8 @@ inline Eigen::Vector3d between_closest(const Eigen::Vector4d& weights, const Fou
 // Squared sine of the angle of the two segments.
 double crossing_squared(const FourPoints& x);
 
-// What a motion may leave of a distance, m: a share of it, or of `most` where that is less. Below `floor` it takes
-// nothing, else many motions would take a distance to rounding, and past it.
+// What a motion may leave of a distance, m: a share of it, or of `most` where that is less. Below
+// `floor` it takes nothing, else many motions would take a distance to rounding, and past it.
 struct Leaves {
   double share;
   double most;
@@ -47,8 +48,9 @@ struct Leaves {
   double of(double distance) const;
 };
 
-// A share of the straight motion from x to `to` up to which the distance stays above the required share of that at x; 1
-// if it does to the end. Never too large, and too small by little [Li et al. 2021, additive CCD, Algorithm 1].
+// A share of the straight motion from x to `to` up to which the distance stays above the required
+// share of that at x; 1 if it does to the end. Never too large, and too small by little [Li et al.
+// 2021, additive CCD, Algorithm 1].
 double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves);
 
 // The triangle that is nearest to a point.
@@ -64,8 +66,10 @@ class TriangleTree {
 
   // Takes the triangles to where they are at x.
   void fit(const Buffer<double>& x);
-  // Of the triangles that `counts`, within `reach`; of equally near ones that with the lower number.
-  Nearest nearest(const Eigen::Vector3d& p, double reach, const std::function<bool(int triangle)>& counts) const;
+  // Of the triangles that `counts`, within `reach`; of equally near ones that with the lower
+  // number.
+  Nearest nearest(const Eigen::Vector3d& p, double reach,
+                  const std::function<bool(int triangle)>& counts) const;
 
  private:
   struct Box {

@@ -13,16 +13,18 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector4d;
 
-// How the closest points move over their pieces, and how the normal turns, by a pair's motions m, m_1, m_2: they lie
-// where rho is across the directions a_k = sum w_ki x_i, so that
+// How the closest points move over their pieces, and how the normal turns, by a pair's motions m,
+// m_1, m_2: they lie where rho is across the directions a_k = sum w_ki x_i, so that
 //
-//     sum_l a_k . a_l dtheta_l = -(a_k . m + rho . m_k),   dn = (1 - n n^T) (m + sum a_k dtheta_k)/d.
+//     sum_l a_k . a_l dtheta_l = -(a_k . m + rho . m_k),   dn = (1 - n n^T) (m + sum a_k
+//     dtheta_k)/d.
 void turn(Pair& pair, const Buffer<double>& x) {
   pair.sliding.setZero();
   pair.turning.setZero();
   if (!pair.active() || pair.at.force.isZero(0.0)) return;
   const FourPoints at = points_of(pair.who, x);
-  const int count = (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
+  const int count =
+      (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
   const double distance = pair.at.gap + pair.thickness;
   const Vector3d n = pair.at.normal, rho = distance * n;
   Eigen::Matrix<double, 3, 2> a;
@@ -117,7 +119,8 @@ void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& r
   linearize_at(x);
   for (const Pair& pair : pairs_) {
     if (pair.at.force.isZero(0.0)) continue;
-    for (int c = 0; c < 4; ++c) at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.at.force;
+    for (int c = 0; c < 4; ++c)
+      at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.at.force;
   }
 }
 
@@ -126,7 +129,8 @@ void ContactSet::add_stiffness(double share, std::vector<double>& stiffness) con
     if (!pair.active()) continue;
     const double own = share * pair.row.symmetric.trace() / (3.0 * pair.penalty_scale);
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] < free_nodes_) stiffness[pair.who.node[c]] += pair.weights[c] * pair.weights[c] * own;
+      if (pair.who.node[c] < free_nodes_)
+        stiffness[pair.who.node[c]] += pair.weights[c] * pair.weights[c] * own;
     }
   }
 }
@@ -184,7 +188,9 @@ void ContactSet::return_to_best() {
 bool ContactSet::resume() {
   bool any = false;
   for (Pair& pair : pairs_) {
-    if (pair.active() || pair.at.force.isZero(0.0) || pair.at.gap > settings_.closing_gap * pair.scale) continue;
+    if (pair.active() || pair.at.force.isZero(0.0) ||
+        pair.at.gap > settings_.closing_gap * pair.scale)
+      continue;
     PairKinematics touching = pair.at;
     touching.gap = 0.0;
     const PairLinearization row = linearize(touching);
@@ -213,7 +219,8 @@ bool ContactSet::activate(const Buffer<float>& change) {
     for (Pair& pair : pairs_) {
       if (pair.who.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
-      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings_.closing_gap * pair.scale)) continue;
+      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings_.closing_gap * pair.scale))
+        continue;
       pair.row = linearize_closing(pair.at, motion);
       pair.added = any = true;
     }

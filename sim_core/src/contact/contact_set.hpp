@@ -1,5 +1,6 @@
-// Contacts of cloth with itself, with other cloth and with surfaces: the pairs of closest points (detection.cpp), their
-// forces from step to step (matching.cpp), which of them are active, and their rows of Newton's system.
+// Contacts of cloth with itself, with other cloth and with surfaces: the pairs of closest points
+// (detection.cpp), their forces from step to step (matching.cpp), which of them are active, and
+// their rows of Newton's system.
 #pragma once
 
 #include <Eigen/Core>
@@ -14,14 +15,15 @@
 
 namespace sim_core {
 
-// (m, m_1, m_2): motions of the pair's first point over its second, and of its two pieces along themselves, m.
+// (m, m_1, m_2): motions of the pair's first point over its second, and of its two pieces along
+// themselves, m.
 using PairMotions = Eigen::Matrix<double, 9, 1>;
 
 // One pair of closest points: its geometry, its force, and its part of Newton's system.
 struct Pair {
   Candidate who;
-  int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node (after the edges);
-                // or the second edge
+  int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node
+                // (after the edges); or the second edge
   Eigen::Vector4d weights;
   PairKinematics at;
   Eigen::Vector3d middle;  // of the two points, or with a skeleton that of the cloth, m
@@ -31,7 +33,8 @@ struct Pair {
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
   PairMotions given = PairMotions::Zero();
-  // Derivatives by the motions: of the places of the closest points, and of the force as the normal turns.
+  // Derivatives by the motions: of the places of the closest points, and of the force as the normal
+  // turns.
   Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
   Eigen::Matrix<double, 3, 9> turning = Eigen::Matrix<double, 3, 9>::Zero();
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force in the last linear problem, N
@@ -40,7 +43,8 @@ struct Pair {
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
   bool active() const { return row.mode != contact_open; }
-  // Motion of its first point over its second, m; all of its motions; and the change of its force by them, N.
+  // Motion of its first point over its second, m; all of its motions; and the change of its force
+  // by them, N.
   Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
   PairMotions motions(const Buffer<float>& change, int free_nodes) const;
   Eigen::Vector3d force_change(const Buffer<float>& change, int free_nodes) const;
@@ -77,22 +81,23 @@ class ContactSet {
 
   // Forgets all forces.
   void restart();
-  // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`; all nodes are
-  // `expected` where velocities lead. `own`: stiffness of the free nodes, N/m; `bone_turns`: of the
-  // skeletons in the step.
-  void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-             std::vector<Eigen::Matrix3d> own, std::vector<Eigen::Matrix3d> bone_turns);
+  // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
+  // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m;
+  // `bone_turns`: of the skeletons in the step.
+  void begin(const Buffer<double>& start, const Buffer<double>& ends,
+             const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own,
+             std::vector<Eigen::Matrix3d> bone_turns);
   // Keeps the forces at the end of a step for the next one.
   void keep();
 
-  // Finds and linearizes the pairs at x, with a share of the forces' last changes, and subtracts their forces from the
-  // residual.
+  // Finds and linearizes the pairs at x, with a share of the forces' last changes, and subtracts
+  // their forces from the residual.
   void update(const Buffer<double>& x, double share, Buffer<double>& residual);
-  // After the first look of a step: activates pairs that have a force and are open by no more than what a prediction on
-  // straight lines opens over curved cloth. Returns whether there are any.
+  // After the first look of a step: activates pairs that have a force and are open by no more than
+  // what a prediction on straight lines opens over curved cloth. Returns whether there are any.
   bool resume();
-  // After a linear problem: releases added pairs that would pull, and adds pairs that would come too near, vertices
-  // before edges. Returns whether the active set has changed.
+  // After a linear problem: releases added pairs that would pull, and adds pairs that would come
+  // too near, vertices before edges. Returns whether the active set has changed.
   bool activate(const Buffer<float>& change);
   // Takes over the changes of the forces from the solution of the linear problem.
   void solved(const Buffer<float>& change);
@@ -100,13 +105,15 @@ class ContactSet {
   void mark_best() { best_.assign(pairs_.begin(), pairs_.end()); }
   void return_to_best();
 
-  // Rows of the active pairs, for products with the matrix, second derivatives of the distance included.
+  // Rows of the active pairs, for products with the matrix, second derivatives of the distance
+  // included.
   PairData rows();
   // Subtracts from nodal forces what the pairs contribute to the right-hand side.
   void subtract_right_side(Buffer<float>& force) const;
   // Adds a share of the stiffness by which pairs hold the free nodes, N/m.
   void add_stiffness(double share, std::vector<double>& stiffness) const;
-  // Counts the forces by which the law is missed, where this stiffness [N/m] turns gaps and slips into forces.
+  // Counts the forces by which the law is missed, where this stiffness [N/m] turns gaps and slips
+  // into forces.
   void count_errors(double stiffness, Norms& norms) const;
 
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
@@ -119,7 +126,8 @@ class ContactSet {
   bool active() const;
   // Mean error of the forces by smoothing, N.
   double smoothed_force() const;
-  // Least distance of any two pieces without a common node at the last search, m; infinite where none is near.
+  // Least distance of any two pieces without a common node at the last search, m; infinite where
+  // none is near.
   double least_distance() const { return least_distance_; }
 
  private:
@@ -127,8 +135,10 @@ class ContactSet {
   void find(const Buffer<double>& x);
   void find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
   void find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
-  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights, const Buffer<double>& x);
-  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights, const Eigen::Vector3d& rho);
+  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights,
+           const Buffer<double>& x);
+  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights,
+                       const Eigen::Vector3d& rho);
   void transfer(double share);
   void merge();
   void linearize_at(const Buffer<double>& x);

@@ -24,8 +24,8 @@ struct Joined {
 
 }  // namespace
 
-CreasedTriangles::CreasedTriangles(std::vector<std::array<int, 3>> triangles_in, const Buffer<double>& x,
-                                   const std::vector<double>& crease)
+CreasedTriangles::CreasedTriangles(std::vector<std::array<int, 3>> triangles_in,
+                                   const Buffer<double>& x, const std::vector<double>& crease)
     : triangles(std::move(triangles_in)), around_begin(x.size() / 4 + 1, 0) {
   const int count = static_cast<int>(triangles.size());
   Sides sides;
@@ -49,11 +49,14 @@ CreasedTriangles::CreasedTriangles(std::vector<std::array<int, 3>> triangles_in,
 }
 
 int CreasedTriangles::corner_of(int t, int node) const {
-  return static_cast<int>(std::find(triangles[t].begin(), triangles[t].end(), node) - triangles[t].begin());
+  return static_cast<int>(std::find(triangles[t].begin(), triangles[t].end(), node) -
+                          triangles[t].begin());
 }
 
 // Whether i comes before j in the triangle.
-bool CreasedTriangles::runs(int t, int i, int j) const { return triangles[t][next(corner_of(t, i))] == j; }
+bool CreasedTriangles::runs(int t, int i, int j) const {
+  return triangles[t][next(corner_of(t, i))] == j;
+}
 
 // The triangle over the edge opposite a corner; -1 if there is none or more than one.
 int CreasedTriangles::other(const Sides& sides, int t, int k) const {
@@ -83,7 +86,8 @@ void CreasedTriangles::orient(const Sides& sides) {
   }
 }
 
-void CreasedTriangles::find_sharp(const Sides& sides, const Buffer<double>& x, const std::vector<double>& crease) {
+void CreasedTriangles::find_sharp(const Sides& sides, const Buffer<double>& x,
+                                  const std::vector<double>& crease) {
   const int count = static_cast<int>(triangles.size());
   across.assign(count, {-1, -1, -1});
   sharp.assign(count, {1, 1, 1});
@@ -97,7 +101,8 @@ void CreasedTriangles::find_sharp(const Sides& sides, const Buffer<double>& x, c
       const double angle = std::atan2(a.cross(b).norm(), a.dot(b));
       if (runs(beyond, i, j) || angle > std::min(crease[t], crease[beyond])) continue;
       sharp[t][k] = 0;
-      for (int node : {i, j}) joined.join(3 * t + corner_of(t, node), 3 * beyond + corner_of(beyond, node));
+      for (int node : {i, j})
+        joined.join(3 * t + corner_of(t, node), 3 * beyond + corner_of(beyond, node));
     }
   }
   std::vector<int> number(3 * static_cast<std::size_t>(count), -1);
@@ -111,7 +116,9 @@ void CreasedTriangles::find_sharp(const Sides& sides, const Buffer<double>& x, c
 
 Vector3d CreasedTriangles::facet_normal(const Buffer<double>& x, int t) const {
   const auto& c = triangles[t];
-  return (at_node(x, c[1]) - at_node(x, c[0])).cross(at_node(x, c[2]) - at_node(x, c[0])).normalized();
+  return (at_node(x, c[1]) - at_node(x, c[0]))
+      .cross(at_node(x, c[2]) - at_node(x, c[0]))
+      .normalized();
 }
 
 }  // namespace sim_core

@@ -19,8 +19,8 @@ struct Found {
   Vector4d weights;
 };
 
-// Derivatives of the weights by the places of the closest points: along both edges, or along the sides of the feature
-// of a triangle.
+// Derivatives of the weights by the places of the closest points: along both edges, or along the
+// sides of the feature of a triangle.
 std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights) {
   Vector4d first = Vector4d::Zero(), second = Vector4d::Zero();
   if (kind == PairKind::edge_edge) {
@@ -51,8 +51,9 @@ std::vector<double> farther_of(const ContactMaterials& materials) {
 
 }  // namespace
 
-ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, const ContactSettings& settings,
-                       const PathSettings& path, double margin, int free_nodes)
+ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
+                       const ContactSettings& settings, const PathSettings& path, double margin,
+                       int free_nodes)
     : near(std::move(surface), materials_in.farthest(), margin, path, farther_of(materials_in)),
       materials(materials_in),
       settings_(settings),
@@ -61,8 +62,9 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, co
       ways_(near.surface.sheet_of_node.size()),
       turns_(settings.turn_max) {}
 
-void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& expected,
-                       std::vector<Matrix3d> own, std::vector<Matrix3d> bone_turns) {
+void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
+                       const Buffer<double>& expected, std::vector<Matrix3d> own,
+                       std::vector<Matrix3d> bone_turns) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
@@ -86,21 +88,28 @@ const Bone* ContactSet::bone_of(const Candidate& pair) const {
   return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
-// `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a triangle. Such a
-// pair counts once, and only where all triangles around the feature agree: else a point inside one of them is closer.
-void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x) {
+// `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a
+// triangle. Such a pair counts once, and only where all triangles around the feature agree: else a
+// point inside one of them is closer.
+void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
+                               const Buffer<double>& x) {
   const Surface& surface = near.surface;
-  const int triangles = static_cast<int>(surface.triangles.size()), edges = static_cast<int>(surface.edges.size());
-  const auto around_node = [&](int node) { return surface.around_begin[node + 1] - surface.around_begin[node]; };
+  const int triangles = static_cast<int>(surface.triangles.size()),
+            edges = static_cast<int>(surface.edges.size());
+  const auto around_node = [&](int node) {
+    return surface.around_begin[node + 1] - surface.around_begin[node];
+  };
   const auto is_of = [&](std::size_t c, int vertex) {
-    return c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle && candidates[c].first == vertex;
+    return c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle &&
+           candidates[c].first == vertex;
   };
   std::vector<Found> found;
   std::size_t c = 0, end = 0;
   while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
     const int vertex = candidates[c].first;
     double reach = range;
-    for (; is_of(end, vertex); ++end) reach = std::max(reach, range + fastest(candidates[end], ways_));
+    for (; is_of(end, vertex); ++end)
+      reach = std::max(reach, range + fastest(candidates[end], ways_));
     found.clear();
     for (; c < end; ++c) {
       Candidate& who = candidates[c];
@@ -122,18 +131,22 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
     for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
       const int feature = found[i].feature;
       while (next < found.size() && found[next].feature == feature) ++next;
-      const int around = feature < triangles           ? 1
-                         : feature < triangles + edges ? surface.triangles_of_edge[feature - triangles]
-                                                       : around_node(feature - triangles - edges);
+      const int around = feature < triangles ? 1
+                         : feature < triangles + edges
+                             ? surface.triangles_of_edge[feature - triangles]
+                             : around_node(feature - triangles - edges);
       if (static_cast<int>(next - i) != around) continue;
       const Candidate& who = candidates[found[i].candidate];
       if (who.distance > near.apart(who) + reach) continue;
-      // Corners of the cloth touch a body by themselves where pairs only hold what lies between them.
-      if (const Bone* bone = bone_of(who); bone && !bone->whole && feature >= triangles + edges) continue;
+      // Corners of the cloth touch a body by themselves where pairs only hold what lies between
+      // them.
+      if (const Bone* bone = bone_of(who); bone && !bone->whole && feature >= triangles + edges)
+        continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
-        const auto first = std::lower_bound(pairs_.begin(), pairs_.end(), other,
-                                            [](const Pair& pair, int who) { return pair.who.first < who; });
+        const auto first =
+            std::lower_bound(pairs_.begin(), pairs_.end(), other,
+                             [](const Pair& pair, int who) { return pair.who.first < who; });
         if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
               return pair.who.first == other && pair.feature == triangles + edges + vertex;
             })) {
@@ -145,7 +158,8 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
   }
 }
 
-void ContactSet::find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x) {
+void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
+                            const Buffer<double>& x) {
   for (Candidate& who : candidates) {
     const double reach = near.apart(who) + range + fastest(who, ways_);
     if (who.kind != PairKind::edge_edge || who.distance > reach) continue;
@@ -159,13 +173,15 @@ void ContactSet::find_edges(std::vector<Candidate>& candidates, double range, co
   }
 }
 
-// With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum w_i^2/k_i: its
-// stiffness scales with the inverse of that.
-void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights, const Buffer<double>& x) {
+// With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum
+// w_i^2/k_i: its stiffness scales with the inverse of that.
+void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
+                     const Buffer<double>& x) {
   const FourPoints at = points_of(who, x);
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
-  const int a = near.surface.sheet_of_node[who.node[0]], b = near.surface.sheet_of_node[who.node[3]];
+  const int a = near.surface.sheet_of_node[who.node[0]],
+            b = near.surface.sheet_of_node[who.node[3]];
   const Bone* bone = materials.bone_of(a, b);
   if (!bone) least_distance_ = std::min(least_distance_, distance);
   if (!(distance > 0.0)) return;
@@ -193,16 +209,19 @@ void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
   Vector3d slip = this->slip(who, weights, rho);
   slip -= slip.dot(n) * n;
   const double thickness = materials.apart(who.kind, a, b), k = settings_.law_stiffness / softness;
-  const double along = smoothing > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
-  const double across = (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
-  const Vector3d first =
-      who.kind == PairKind::vertex_triangle ? at[0] : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  const double along =
+      smoothing > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
+  const double across =
+      (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
+  const Vector3d first = who.kind == PairKind::vertex_triangle
+                             ? at[0]
+                             : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
   const double back = !bone ? 0.5 : a > b ? 1.0 : 0.0;
   pairs_.push_back({who,
                     feature,
                     weights,
-                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along, across,
-                     k * smoothing * smoothing},
+                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k, along,
+                     across, k * smoothing * smoothing},
                     first - back * rho,
                     thickness,
                     bone ? materials.thickness[std::min(a, b)] : thickness,
@@ -211,8 +230,8 @@ void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
                     given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a body or surface, or half with each
-// sheet.
+// Motion of the first point over the second, less that by which rho turns: with a body or surface,
+// or half with each sheet.
 Vector3d ContactSet::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
@@ -223,7 +242,8 @@ Vector3d ContactSet::slip(const Candidate& who, const Vector4d& weights, const V
     for (int c = 0; c < 4; ++c) {
       const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
       const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
-      if (share * weights[c] != 0.0) turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+      if (share * weights[c] != 0.0)
+        turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
     }
   }
   return rho - turn * between_closest(weights, points_of(who, *start_));

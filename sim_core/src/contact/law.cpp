@@ -18,7 +18,8 @@ PairLinearization open_row(const PairKinematics& at) {
 
 PairLinearization stick_row(const PairKinematics& at) {
   const Vector3d& n = at.normal;
-  const Matrix3d stiffness = at.across * Matrix3d::Identity() + (at.along - at.across) * n * n.transpose();
+  const Matrix3d stiffness =
+      at.across * Matrix3d::Identity() + (at.along - at.across) * n * n.transpose();
   return {contact_stick, stiffness, stiffness, -at.along * at.gap * n - at.across * at.slip};
 }
 
@@ -38,7 +39,8 @@ PairLinearization slip_row(const PairKinematics& at) {
   const Matrix3d symmetric = kappa * n * n.transpose() + side * across;
   const double turns = soft ? 1.0 : (1.0 - beta) * pull;
   return {contact_slip, symmetric + at.mu * kappa * t * n.transpose(), symmetric,
-          -kappa * at.gap * n + (bound - t.dot(tangential) - at.mu * kappa * at.gap) * t - pull * (across * tangential),
+          -kappa * at.gap * n + (bound - t.dot(tangential) - at.mu * kappa * at.gap) * t -
+              pull * (across * tangential),
           pressing * (t * t.transpose() + turns * across) + at.mu * t * tangential.transpose()};
 }
 
@@ -54,7 +56,8 @@ struct Smoothed {
 
 // Halvings of an interval of doubles: 53 bits of one, and as many to bracket the root.
 constexpr int bisections_max = 100;
-// Pairs whose stiffness is below this share of k are left out of the matrix: that is the tolerance of GMRES with pairs.
+// Pairs whose stiffness is below this share of k are left out of the matrix: that is the tolerance
+// of GMRES with pairs.
 constexpr double share_least = 1e-4;
 
 // y >= 0 with y (f^2 (1 + y)^2 - a^2) = 2 q (1 + y)^2: then rho = a/(1 + y).
@@ -96,22 +99,26 @@ PairLinearization smoothed_row(const PairKinematics& at) {
   const Vector3d &n = at.normal, &t = law.direction;
   const double k = at.stiffness, pressing = at.force.dot(n);
   const Vector3d tangential = at.force - pressing * n;
-  const auto compliance = [&](double share, double proximal) { return (1.0 - share) / k + share / proximal; };
+  const auto compliance = [&](double share, double proximal) {
+    return (1.0 - share) / k + share / proximal;
+  };
   // dr_N = pull - press dg; then friction, of the bound mu (r_N + dr_N).
   const double soft = compliance(law.share, at.along), press = law.share / soft,
                pull = -(pressing - law.pressing) / (k * soft);
-  const double soft_along = compliance(law.along, at.across), soft_across = compliance(law.across, at.across);
+  const double soft_along = compliance(law.along, at.across),
+               soft_across = compliance(law.across, at.across);
   const double along = law.along / soft_along, across = law.across / soft_across;
   const double coupling = law.by_bound * at.mu / (k * soft_along);
   const Matrix3d side = Matrix3d::Identity() - n * n.transpose() - t * t.transpose();
   const Matrix3d symmetric = press * n * n.transpose() + along * t * t.transpose() + across * side;
-  const Vector3d force =
-      pull * n +
-      (coupling * (pressing + pull - law.pressing) - (t.dot(tangential) - law.friction) / (k * soft_along)) * t -
-      side * tangential / (k * soft_across);
+  const Vector3d force = pull * n +
+                         (coupling * (pressing + pull - law.pressing) -
+                          (t.dot(tangential) - law.friction) / (k * soft_along)) *
+                             t -
+                         side * tangential / (k * soft_across);
   if (law.share < share_least) return {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), force};
-  return {law.along > 0.5 ? contact_stick : contact_slip, symmetric + coupling * press * t * n.transpose(), symmetric,
-          force,
+  return {law.along > 0.5 ? contact_stick : contact_slip,
+          symmetric + coupling * press * t * n.transpose(), symmetric, force,
           pressing * ((1.0 - law.along) / (k * soft_along) * t * t.transpose() +
                       (1.0 - law.across) / (k * soft_across) * side) +
               coupling * t * tangential.transpose()};
@@ -160,10 +167,12 @@ ContactLinearization sticking_row(const ContactKinematics& at) {
           open * open + at.stiffness * at.stiffness * at.slip.squaredNorm()};
 }
 
-ContactLinearization slipping_row(const ContactKinematics& at, const Vector3d& direction, double turning) {
+ContactLinearization slipping_row(const ContactKinematics& at, const Vector3d& direction,
+                                  double turning) {
   const Vector3d& n = at.normal;
   const double pressing = at.force.dot(n), open = at.stiffness * at.gap;
-  const Vector3d t = (direction - direction.dot(n) * n).normalized(), tangential = at.force - pressing * n;
+  const Vector3d t = (direction - direction.dot(n) * n).normalized(),
+                 tangential = at.force - pressing * n;
   const double along = t.dot(tangential) - at.mu * pressing;
   const Vector3d across = tangential + turning * at.slip;
   return {contact_slip,

@@ -18,10 +18,11 @@ auto key(const Any& pair) {
 
 }  // namespace
 
-// Transfers the forces of earlier pairs, with a share of their last changes, to the pairs at hand, both sorted by kind,
-// first and feature. The force of a pair that is gone goes to the new pair of the same vertex, or of one of its edges,
-// whose normal is most alike: the closest feature has changed; else to the nearest pair. Under the exact law the
-// proximal stiffness of pairs that stall grows.
+// Transfers the forces of earlier pairs, with a share of their last changes, to the pairs at hand,
+// both sorted by kind, first and feature. The force of a pair that is gone goes to the new pair of
+// the same vertex, or of one of its edges, whose normal is most alike: the closest feature has
+// changed; else to the nearest pair. Under the exact law the proximal stiffness of pairs that stall
+// grows.
 void ContactSet::transfer(double share) {
   std::vector<const PairPast*> orphans;
   std::vector<std::size_t> fresh;
@@ -33,9 +34,11 @@ void ContactSet::transfer(double share) {
       pairs_[i].penalty_scale = base_[o].penalty_scale;
       const int mode = base_[o].mode;
       const double last = base_[o].missed, now = violation(pairs_[i].at, mode);
-      if (smoothing == 0.0 && share == 1.0 && mode != contact_open && last > settings_.length_tolerance &&
-          last < settings_.stall_up_to * pairs_[i].scale && now > settings_.stall_ratio * last) {
-        pairs_[i].penalty_scale = std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
+      if (smoothing == 0.0 && share == 1.0 && mode != contact_open &&
+          last > settings_.length_tolerance && last < settings_.stall_up_to * pairs_[i].scale &&
+          now > settings_.stall_ratio * last) {
+        pairs_[i].penalty_scale =
+            std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
       }
       pairs_[i].at.along *= pairs_[i].penalty_scale;
       pairs_[i].at.across *= pairs_[i].penalty_scale;
@@ -53,9 +56,10 @@ void ContactSet::transfer(double share) {
     for (std::size_t i : fresh) {
       const Candidate &a = pairs_[i].who, &b = orphan->who;
       if (a.kind != b.kind) continue;
-      const bool common = a.kind == PairKind::vertex_triangle ? a.first == b.first
-                                                              : a.first == b.first || a.second == b.second ||
-                                                                    a.first == b.second || a.second == b.first;
+      const bool common = a.kind == PairKind::vertex_triangle
+                              ? a.first == b.first
+                              : a.first == b.first || a.second == b.second || a.first == b.second ||
+                                    a.second == b.first;
       if (!common) continue;
       const double alike = pairs_[i].at.normal.dot(orphan->normal);
       if (alike > best) best = alike, match = i;
@@ -71,14 +75,15 @@ void ContactSet::transfer(double share) {
       if (far < best && std::abs(alike) > settings_.match_cosine) best = far, match = i;
     }
     if (match < pairs_.size()) {
-      pairs_[match].at.force += pairs_[match].at.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
+      pairs_[match].at.force +=
+          pairs_[match].at.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
     }
   }
 }
 
-// Merges pairs at nearly the same place, as where a vertex lies on a vertex: their rows differ by rounding only and
-// would contradict each other. The pair that stays has the larger distance to keep, then a force, then the smaller gap;
-// it takes the forces of the others.
+// Merges pairs at nearly the same place, as where a vertex lies on a vertex: their rows differ by
+// rounding only and would contradict each other. The pair that stays has the larger distance to
+// keep, then a force, then the smaller gap; it takes the forces of the others.
 void ContactSet::merge() {
   const std::size_t count = pairs_.size();
   const Vector3d across(0.62, 0.55, 0.56);  // along no edge of a mesh that is aligned with the axes
@@ -88,13 +93,15 @@ void ContactSet::merge() {
   std::vector<std::size_t> place(count), order(count);
   for (std::size_t l = 0; l < count; ++l) place[line[l].second] = l;
   std::iota(order.begin(), order.end(), std::size_t{0});
-  std::vector<std::tuple<bool, bool, double>> rank(count);  // whether it keeps less apart, has no force; its gap
+  std::vector<std::tuple<bool, bool, double>> rank(
+      count);  // whether it keeps less apart, has no force; its gap
   for (std::size_t i = 0; i < count; ++i) {
     const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
-    rank[i] = {pairs_[i].thickness < materials.apart(sheet(0), sheet(3)), pairs_[i].at.force.isZero(0.0),
-               pairs_[i].at.gap};
+    rank[i] = {pairs_[i].thickness < materials.apart(sheet(0), sheet(3)),
+               pairs_[i].at.force.isZero(0.0), pairs_[i].at.gap};
   }
-  std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
+  std::stable_sort(order.begin(), order.end(),
+                   [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
@@ -104,12 +111,15 @@ void ContactSet::merge() {
           (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
         return;
       const Vector3d& force = pairs_[j].at.force;
-      pairs_[i].at.force += pairs_[i].at.normal.dot(pairs_[j].at.normal) > 0.0 ? force : Vector3d(-force);
+      pairs_[i].at.force +=
+          pairs_[i].at.normal.dot(pairs_[j].at.normal) > 0.0 ? force : Vector3d(-force);
       gone[j] = 1;
     };
     const double reach = 1.01 * radius;
-    for (std::size_t l = place[i]; l-- > 0 && line[place[i]].first - line[l].first < reach;) take(line[l].second);
-    for (std::size_t l = place[i] + 1; l < count && line[l].first - line[place[i]].first < reach; ++l)
+    for (std::size_t l = place[i]; l-- > 0 && line[place[i]].first - line[l].first < reach;)
+      take(line[l].second);
+    for (std::size_t l = place[i] + 1; l < count && line[l].first - line[place[i]].first < reach;
+         ++l)
       take(line[l].second);
   }
   std::size_t i = 0;

@@ -9,7 +9,8 @@ namespace {
 
 using Eigen::AlignedBox3d;
 
-AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from, const Buffer<double>& to) {
+AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from,
+                         const Buffer<double>& to) {
   AlignedBox3d out;
   for (int i : surface.vertices) out.extend(at_node(to, i) - at_node(from, i));
   return out;
@@ -25,8 +26,8 @@ double fastest(const Candidate& pair, const std::vector<double>& ways) {
   return std::max(ways[node[0]], ways[node[1]]) + std::max(ways[node[2]], ways[node[3]]);
 }
 
-Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin, const PathSettings& settings,
-                             std::vector<double> farther)
+Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin,
+                             const PathSettings& settings, std::vector<double> farther)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       margin_(margin),
@@ -49,7 +50,8 @@ Leaves Neighbourhood::leaves(const Candidate& pair) const {
 }
 
 // Half of the diagonal of the box of the motions.
-double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to, const Buffer<double>* or_to) const {
+double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to,
+                            const Buffer<double>* or_to) const {
   AlignedBox3d box = box_of_ways(surface, from, to);
   if (or_to) box.extend(box_of_ways(surface, from, *or_to));
   return 0.5 * box.diagonal().norm();
@@ -77,7 +79,8 @@ std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
 }
 
 bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops_max) {
-  if (!reference_.empty() && moved(reference_, from) <= margin_ && moved(reference_, to) <= margin_) {
+  if (!reference_.empty() && moved(reference_, from) <= margin_ &&
+      moved(reference_, to) <= margin_) {
     Buffer<double> capped = to;
     if (cap_near(from, capped)) return true;
     if (moved(reference_, from, &to) <= margin_) {
@@ -93,8 +96,8 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops
       for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
       return out;
     };
-    // From the middle of a hop both of its ends are within the margin, but for a common way. Nodes that are stopped do
-    // not go that: so where there are any, the hop is shorter.
+    // From the middle of a hop both of its ends are within the margin, but for a common way. Nodes
+    // that are stopped do not go that: so where there are any, the hop is shorter.
     double share = std::min(1.0, 2.0 * margin_ / moved(at, to));
     rebuild(part(0.5 * share));
     Buffer<double> wanted = part(share), next = wanted;
@@ -125,7 +128,8 @@ double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<doub
   measure(from, to, way_);
   for (const Candidate& pair : near) {
     if (fastest(pair, way_) <= pair.distance - leaves(pair).of(pair.distance)) continue;
-    least = std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves(pair)));
+    least = std::min(
+        least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves(pair)));
   }
   return least;
 }
@@ -148,7 +152,8 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
       if (fastest(pair, way_) <= distance - leaves(pair).of(distance)) continue;
-      const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]), place(pair.node[3])};
+      const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]),
+                            place(pair.node[3])};
       const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves(pair));
       if (safe == 1.0) continue;
       least = std::min(least, safe);

@@ -12,14 +12,15 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-// Newton's method for a foot ends at changes of its barycentric coordinates that square to below rounding. More
-// iterations than these mean that there is no foot.
+// Newton's method for a foot ends at changes of its barycentric coordinates that square to below
+// rounding. More iterations than these mean that there is no foot.
 constexpr int iterations_max = 12;
 constexpr double converged = 1e-12;
 
 // Rounding of barycentric coordinates: they count as inside from here.
 constexpr double inside = -1e-9;
-// Triangles that a foot may move over in a search, which starts from the nearest: a bound against cycles.
+// Triangles that a foot may move over in a search, which starts from the nearest: a bound against
+// cycles.
 constexpr int hops_max = 100;
 
 }  // namespace
@@ -35,13 +36,15 @@ Vector3d PNPatch::y(const Vector3d& b) const {
 
 Vector3d PNPatch::n(const Vector3d& b) const {
   Vector3d out = Vector3d::Zero();
-  for (int k = 0; k < 3; ++k) out += b[k] * b[k] * normal[k] + 2.0 * b[next(k)] * b[after_next(k)] * bend[k];
+  for (int k = 0; k < 3; ++k)
+    out += b[k] * b[k] * normal[k] + 2.0 * b[next(k)] * b[after_next(k)] * bend[k];
   return out;
 }
 
 Matrix3d PNPatch::dy(const Vector3d& b) const {
   Matrix3d out;
-  for (int k = 0; k < 3; ++k) out.col(k) = 3.0 * b[k] * b[k] * corner[k] + 6.0 * b[next(k)] * b[after_next(k)] * middle;
+  for (int k = 0; k < 3; ++k)
+    out.col(k) = 3.0 * b[k] * b[k] * corner[k] + 6.0 * b[next(k)] * b[after_next(k)] * middle;
   for (int k = 0; k < 3; ++k) {
     const double i = b[next(k)], j = b[after_next(k)];
     out.col(next(k)) += 3.0 * j * (2.0 * i * near[k] + j * far[k]);
@@ -60,7 +63,8 @@ Matrix3d PNPatch::dn(const Vector3d& b) const {
   return out;
 }
 
-// Newton's method for (p - c) . c' = 0 on the cubic c, with the second derivative bounded from below.
+// Newton's method for (p - c) . c' = 0 on the cubic c, with the second derivative bounded from
+// below.
 double PNPatch::closest_on_edge(int k, const Vector3d& p) const {
   const Vector3d &from = corner[next(k)], &to = corner[after_next(k)];
   const Vector3d chord = to - from;
@@ -69,7 +73,8 @@ double PNPatch::closest_on_edge(int k, const Vector3d& p) const {
   for (int n = 0; n < iterations_max; ++n) {
     const double r = 1.0 - s;
     const Vector3d c = r * r * r * from + 3.0 * r * s * (r * near[k] + s * far[k]) + s * s * s * to;
-    const Vector3d d = 3.0 * (r * r * a + 2.0 * r * s * m + s * s * e), dd = 6.0 * (r * (m - a) + s * (e - m));
+    const Vector3d d = 3.0 * (r * r * a + 2.0 * r * s * m + s * s * e),
+                   dd = 6.0 * (r * (m - a) + s * (e - m));
     const double bend = std::max(d.squaredNorm() - (p - c).dot(dd), 0.1 * d.squaredNorm());
     const double moved = std::clamp(s + (p - c).dot(d) / bend, 0.0, 1.0);
     if (std::abs(std::exchange(s, moved) - moved) <= converged) break;
@@ -78,7 +83,8 @@ double PNPatch::closest_on_edge(int k, const Vector3d& p) const {
 }
 
 PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p, const SmoothSettings& settings) {
-  const Vector3d u = patch.corner[1] - patch.corner[0], v = patch.corner[2] - patch.corner[0], w = u.cross(v);
+  const Vector3d u = patch.corner[1] - patch.corner[0], v = patch.corner[2] - patch.corner[0],
+                 w = u.cross(v);
   const Vector3d from = p - patch.corner[0];
   b[1] = from.cross(v).dot(w) / w.squaredNorm();
   b[2] = u.cross(from).dot(w) / w.squaredNorm();
@@ -109,8 +115,8 @@ PNTriangles::PNTriangles(std::vector<std::array<int, 3>> triangles, const Buffer
                          const std::vector<double>& crease, const SmoothSettings& settings)
     : mesh_(std::move(triangles), x, crease), settings_(settings) {}
 
-// Normals of corners, by the edges e and f that leave them: sum of e x f/(|e|^2 |f|^2), which is exact for a closed fan
-// on a sphere [Max 1999, Eq. 2].
+// Normals of corners, by the edges e and f that leave them: sum of e x f/(|e|^2 |f|^2), which is
+// exact for a closed fan on a sphere [Max 1999, Eq. 2].
 PatchShape PNTriangles::shape(const Buffer<double>& x) const {
   PatchShape out{x, std::vector<Vector3d>(mesh_.groups, Vector3d::Zero())};
   for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
@@ -122,14 +128,17 @@ PatchShape PNTriangles::shape(const Buffer<double>& x) const {
     }
   }
   for (Vector3d& normal : out.normals) normal.normalize();
-  // Of the circle that touches at a corner and goes through the next: 2 h/|P_i - P_j|^2, h = N . (P_i - P_j). Handles
-  // are h/3 off the triangle and C is h/2: with the weights of these in the middle, the patch is h/3 off there.
+  // Of the circle that touches at a corner and goes through the next: 2 h/|P_i - P_j|^2, h = N .
+  // (P_i - P_j). Handles are h/3 off the triangle and C is h/2: with the weights of these in the
+  // middle, the patch is h/3 off there.
   out.curvature.assign(mesh_.groups, {0.0, 0.0});
   for (std::size_t t = 0; t < mesh_.triangles.size(); ++t) {
     for (int k = 0; k < 3; ++k) {
       for (int to : {next(k), after_next(k)}) {
-        const Vector3d edge = at_node(x, mesh_.triangles[t][k]) - at_node(x, mesh_.triangles[t][to]);
-        const double h = out.normals[mesh_.group[t][k]].dot(edge), curvature = 2.0 * h / edge.squaredNorm();
+        const Vector3d edge =
+            at_node(x, mesh_.triangles[t][k]) - at_node(x, mesh_.triangles[t][to]);
+        const double h = out.normals[mesh_.group[t][k]].dot(edge),
+                     curvature = 2.0 * h / edge.squaredNorm();
         auto& most = out.curvature[mesh_.group[t][k]];
         most = {std::max(most[0], curvature), std::max(most[1], -curvature)};
         out.bulge = std::max(out.bulge, std::abs(h) / 3.0);
@@ -141,13 +150,16 @@ PatchShape PNTriangles::shape(const Buffer<double>& x) const {
 
 // E_ij of corners `from` and `to` of a triangle.
 Vector3d PNTriangles::edge_handle(const PatchShape& shape, int t, int from, int to) const {
-  const Vector3d p = at_node(shape.x, mesh_.triangles[t][from]), chord = at_node(shape.x, mesh_.triangles[t][to]) - p;
+  const Vector3d p = at_node(shape.x, mesh_.triangles[t][from]),
+                 chord = at_node(shape.x, mesh_.triangles[t][to]) - p;
   const Vector3d& own = shape.normals[mesh_.group[t][from]];
   const int k = 3 - from - to, other = mesh_.across[t][k];
   if (mesh_.sharp[t][k] && other >= 0) {
-    const Vector3d& beyond = shape.normals[mesh_.group[other][mesh_.corner_of(other, mesh_.triangles[t][from])]];
+    const Vector3d& beyond =
+        shape.normals[mesh_.group[other][mesh_.corner_of(other, mesh_.triangles[t][from])]];
     const Vector3d both = own.cross(beyond);
-    if (both.norm() > settings_.same_normal) return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
+    if (both.norm() > settings_.same_normal)
+      return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
   }
   return p + (chord - chord.dot(own) * own) / 3.0;
 }
@@ -174,15 +186,18 @@ PNPatch PNTriangles::patch(const PatchShape& shape, int t) const {
   return out;
 }
 
-std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p, int t, double side) const {
+std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p, int t,
+                                      double side) const {
   int before = -1;
   for (int hop = 0; hop < hops_max; ++hop) {
     const PNRoot root(patch(shape, t), p, settings_);
     int out = 0;
     const double least = root.b.minCoeff(&out);
-    if (root.found && least >= inside) return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
+    if (root.found && least >= inside)
+      return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
     if (!root.found && least >= inside) return std::nullopt;
-    if (mesh_.sharp[t][out] && root.b[next(out)] < inside && !mesh_.sharp[t][next(out)]) out = next(out);
+    if (mesh_.sharp[t][out] && root.b[next(out)] < inside && !mesh_.sharp[t][next(out)])
+      out = next(out);
     if (mesh_.sharp[t][out] && root.b[after_next(out)] < inside && !mesh_.sharp[t][after_next(out)])
       out = after_next(out);
     if (mesh_.sharp[t][out]) return foot_around(shape, p, t, side);
@@ -195,8 +210,10 @@ std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p
   return std::nullopt;
 }
 
-// The closest of all feet in the triangles around one, on their sharp edges and at the ends of these.
-std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p, int t, double side) const {
+// The closest of all feet in the triangles around one, on their sharp edges and at the ends of
+// these.
+std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p, int t,
+                                             double side) const {
   std::vector<int> some;
   for (int node : mesh_.triangles[t]) {
     some.insert(some.end(), mesh_.around.begin() + mesh_.around_begin[node],
@@ -229,7 +246,8 @@ std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vect
   return best;
 }
 
-double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t, const Vector3d& weights) const {
+double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t,
+                            const Vector3d& weights) const {
   const auto& corners = mesh_.triangles[t];
   Vector3d c = Vector3d::Zero(), normal = mesh_.facet_normal(shape.x, t);
   for (int k = 0; k < 3; ++k) c += weights[k] * at_node(shape.x, corners[k]);
@@ -239,8 +257,10 @@ double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t, c
       for (int a = mesh_.around_begin[corners[k]]; a < mesh_.around_begin[corners[k] + 1]; ++a) {
         const auto& others = mesh_.triangles[mesh_.around[a]];
         const int own = mesh_.corner_of(mesh_.around[a], corners[k]);
-        const Vector3d e = at_node(shape.x, others[next(own)]) - c, f = at_node(shape.x, others[after_next(own)]) - c;
-        normal += std::atan2(e.cross(f).norm(), e.dot(f)) * mesh_.facet_normal(shape.x, mesh_.around[a]);
+        const Vector3d e = at_node(shape.x, others[next(own)]) - c,
+                       f = at_node(shape.x, others[after_next(own)]) - c;
+        normal +=
+            std::atan2(e.cross(f).norm(), e.dot(f)) * mesh_.facet_normal(shape.x, mesh_.around[a]);
       }
     } else if (weights[k] == 0.0 && weights.maxCoeff() < 1.0 && mesh_.across[t][k] >= 0) {
       normal += mesh_.facet_normal(shape.x, mesh_.across[t][k]);
@@ -249,7 +269,8 @@ double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t, c
   return normal.dot(p - c) < 0.0 ? -1.0 : 1.0;
 }
 
-double PNTriangles::curvature(const PatchShape& shape, int t, const Vector3d& weights, double side) const {
+double PNTriangles::curvature(const PatchShape& shape, int t, const Vector3d& weights,
+                              double side) const {
   double out = 0.0;
   for (int k = 0; k < 3; ++k) out += weights[k] * shape.curvature[mesh_.group[t][k]][side < 0.0];
   return out;

@@ -14,8 +14,9 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles, const std::vector<int>& sheet_of_node,
-                            int sheets, const std::vector<double>& crease) {
+std::vector<double> creases(const std::vector<std::array<int, 3>>& triangles,
+                            const std::vector<int>& sheet_of_node, int sheets,
+                            const std::vector<double>& crease) {
   std::vector<double> out;
   for (const auto& corners : triangles) out.push_back(crease[sheet_of_node[corners[0]] - sheets]);
   return out;
@@ -31,20 +32,23 @@ bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double dista
 
 }  // namespace
 
-SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
-                             const ContactMaterials& materials, const std::vector<double>& crease,
-                             const Buffer<double>& x, const std::vector<double>& radius, const SmoothSettings& settings)
+SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles,
+                             std::vector<int> sheet_of_node, const ContactMaterials& materials,
+                             const std::vector<double>& crease, const Buffer<double>& x,
+                             const std::vector<double>& radius, const SmoothSettings& settings)
     : sheet_of_node_(std::move(sheet_of_node)),
       radius_(radius),
       free_nodes_(static_cast<int>(radius.size())),
       materials_(materials),
       settings_(settings),
-      patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease), settings),
+      patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease),
+               settings),
       tree_(patches_.triangles(), x),
       track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
       kept_(track_),
       feet_(radius.size()) {
-  for (const auto& corners : triangles) first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
+  for (const auto& corners : triangles)
+    first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
 }
 
 void SmoothContact::restart() {
@@ -61,7 +65,8 @@ void SmoothContact::keep(const std::vector<int>& mode) {
 
 void SmoothContact::take_shapes(const Buffer<double>& start, const Buffer<double>& ends) {
   const auto same = [&](const PatchShape& shape, const Buffer<double>& x) {
-    return shape.x.size() == x.size() && std::equal(x.begin() + 4L * first_, x.end(), shape.x.begin() + 4L * first_);
+    return shape.x.size() == x.size() &&
+           std::equal(x.begin() + 4L * first_, x.end(), shape.x.begin() + 4L * first_);
   };
   if (!same(start_, start)) {
     start_ = same(end_, start) ? end_ : patches_.shape(start);
@@ -70,8 +75,8 @@ void SmoothContact::take_shapes(const Buffer<double>& start, const Buffer<double
   if (!same(end_, ends)) end_ = patches_.shape(ends);
 }
 
-void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess,
-                          const std::vector<Body>& at_start) {
+void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& ends,
+                          const Buffer<double>& guess, const std::vector<Body>& at_start) {
   take_shapes(start, ends);
   // The largest of the box of motions of surfaces: middle and half diagonal.
   Eigen::AlignedBox3d ways;
@@ -80,17 +85,21 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   }
   const Vector3d common = 0.5 * (ways.min() + ways.max());
   const double spread = 0.5 * ways.diagonal().norm();
-  const double thickness = *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
+  const double thickness =
+      *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
   track_ = kept_;
   for (int i = 0; i < free_nodes_; ++i) {
     const Vector3d p = at_node(start, i);
-    const bool came = track_.triangle[i] == left_to_pairs, near = began_near(at_start, p, settings_.body_first);
+    const bool came = track_.triangle[i] == left_to_pairs,
+               near = began_near(at_start, p, settings_.body_first);
     if (near) track_.triangle[i] = left_to_pairs;
     if (near || track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
-    const double kept = thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
-    const double reach = kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
-    const Nearest found =
-        tree_.nearest(p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
+    const double kept =
+        thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
+    const double reach =
+        kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
+    const Nearest found = tree_.nearest(
+        p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
     track_.triangle[i] = found.triangle;
     if (found.triangle < 0) continue;
     track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
@@ -100,7 +109,8 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
 
 std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (track_.triangle[node] < 0) return std::nullopt;
-  const std::optional<Foot> found = patches_.foot(end_, p, track_.triangle[node], track_.side[node]);
+  const std::optional<Foot> found =
+      patches_.foot(end_, p, track_.triangle[node], track_.side[node]);
   if (!found) return std::nullopt;
   if (found->on_patch) track_.triangle[node] = found->triangle;
   feet_[node] = *found;
@@ -112,24 +122,26 @@ std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
 double SmoothContact::apart(const PatchShape& shape, int node, const Foot& foot) const {
   const int sheet = sheet_of_node_[node], surface = surface_of(foot.triangle);
   const double r = radius_[node];
-  const double curvature = patches_.curvature(shape, foot.triangle, foot.weights, track_.side[node]);
+  const double curvature =
+      patches_.curvature(shape, foot.triangle, foot.weights, track_.side[node]);
   const double sinking = 0.5 * r * r * std::min(curvature, settings_.curvature_max / r);
   return std::max(materials_.mean(sheet, surface), materials_.apart(sheet, surface) + sinking);
 }
 
 Vector3d SmoothContact::forced(int node, const Vector3d& before, double allowed) const {
   if (track_.triangle[node] < 0) return Vector3d::Zero();
-  const std::optional<Foot> foot = patches_.foot(start_, before, track_.triangle[node], track_.side[node]);
+  const std::optional<Foot> foot =
+      patches_.foot(start_, before, track_.triangle[node], track_.side[node]);
   const double depth = foot ? apart(start_, node, *foot) - foot->height : 0.0;
   return depth > allowed ? depth * foot->normal : Vector3d::Zero().eval();
 }
 
-// The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was somewhere, while
-// that place was at y0 + Q^T (p - y); Q turns the surface's axes from then to now.
+// The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was
+// somewhere, while that place was at y0 + Q^T (p - y); Q turns the surface's axes from then to now.
 Vector3d SmoothContact::slip(int node, const Vector3d& before, const Vector3d& p) const {
   const Foot& foot = feet_[node];
-  const Matrix3d turn =
-      patches_.axes(end_, foot.triangle, foot.weights) * patches_.axes(start_, foot.triangle, foot.weights).transpose();
+  const Matrix3d turn = patches_.axes(end_, foot.triangle, foot.weights) *
+                        patches_.axes(start_, foot.triangle, foot.weights).transpose();
   return p - foot.point + turn * (patches_.point(start_, foot.triangle, foot.weights) - before);
 }
 
@@ -139,7 +151,8 @@ double SmoothContact::mu(int node) const {
 
 void Norms::count(double force_squared) {
   squared += force_squared;
-  if (!std::isnan(largest) && !(force_squared <= largest * largest)) largest = std::sqrt(force_squared);
+  if (!std::isnan(largest) && !(force_squared <= largest * largest))
+    largest = std::sqrt(force_squared);
 }
 
 ContactState::ContactState(int free_nodes, const ContactSettings& settings)
@@ -178,10 +191,11 @@ void ContactState::penalty(int node, double own, float* out) const {
   }
 }
 
-// With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way out to where all
-// gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two bodies, n_3 = n_1 x n_2 and a_3 = 0. The
-// gap of the fillet is the radius less |w|, and the smallest gap counts. Round faces make corners of less than 66
-// degrees smaller and none below 53, for cloth comes out of the cusp under a box's edge; flat ones below 26 degrees.
+// With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way
+// out to where all gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two
+// bodies, n_3 = n_1 x n_2 and a_3 = 0. The gap of the fillet is the radius less |w|, and the
+// smallest gap counts. Round faces make corners of less than 66 degrees smaller and none below 53,
+// for cloth comes out of the cusp under a box's edge; flat ones below 26 degrees.
 Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p) const {
   Bearing on{{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()}};
   std::array<Bearing, 6> near;  // those whose fillets may reach here, the nearest first
@@ -204,13 +218,16 @@ Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p
     const Gap &one = near[i].gap, &two = near[j].gap, &other = near[k].gap;
     const bool all = k != j;
     const double radius =
-        std::min(radius_of(one, two), all ? std::min(radius_of(one, other), radius_of(two, other)) : fillet_);
+        std::min(radius_of(one, two),
+                 all ? std::min(radius_of(one, other), radius_of(two, other)) : fillet_);
     Matrix3d normals;
     normals << one.normal, two.normal, all ? other.normal : one.normal.cross(two.normal);
     if (!(std::abs(normals.determinant()) > 1e-6)) return;  // parallel
-    const Vector3d lacks(radius - one.distance, radius - two.distance, all ? radius - other.distance : 0.0);
+    const Vector3d lacks(radius - one.distance, radius - two.distance,
+                         all ? radius - other.distance : 0.0);
     const Matrix3d inverse = normals.inverse();
-    const Vector3d way = inverse.transpose() * lacks, parts = inverse * way, share = parts / parts.sum();
+    const Vector3d way = inverse.transpose() * lacks, parts = inverse * way,
+                   share = parts / parts.sum();
     const Gap laid{radius - way.norm(), way.normalized()};
     if (!(parts.head(all ? 3 : 2).minCoeff() > 0.0 && laid.distance < on.gap.distance)) return;
     on = {laid, near[i].body, {near[j].body, all ? near[k].body : -1}, {share[1], share[2]}};
@@ -223,15 +240,18 @@ Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p
   return on;
 }
 
-Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
-                         const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
+Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start,
+                         const Buffer<double>& residual, const std::vector<Body>& at_start,
+                         const std::vector<Body>& at_end) {
   Norms norms;
   const int free_nodes = static_cast<int>(mode.size());
   for (int i = 0; i < free_nodes; ++i) {
     const Vector3d p = at_node(x, i);
     Bearing on = bearing(at_end, p);
     const Vector3d r = at_node(residual, i);
-    const auto bears = [&] { return on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0; };
+    const auto bears = [&] {
+      return on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
+    };
     if (surfaces) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one && one->gap < on.gap.distance)
@@ -250,8 +270,8 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start, c
     touched[i] = on.body;
     const ContactKinematics seen = kinematics(i, on, x, start, residual, at_start, at_end);
     const ContactLinearization row = closed_row(seen, turning_max_);
-    const bool reversed =
-        slipped && row.mode == contact_slip && at_node(direction, i).cast<double>().dot(row.direction) < 0.0;
+    const bool reversed = slipped && row.mode == contact_slip &&
+                          at_node(direction, i).cast<double>().dot(row.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
     write(i, hold_reversed && reversed ? sticking_row(seen) : row);
     norms.count(row.error_squared);
@@ -269,8 +289,9 @@ void ContactState::forget() {
   if (surfaces) surfaces->restart();
 }
 
-bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
-                          const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt) {
+bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start,
+                          const Buffer<double>& residual, const std::vector<Body>& at_start,
+                          const std::vector<Body>& at_end, double dt) {
   if (!(kept_.dt > 0.0)) return false;
   for (std::size_t i = 0; i < mode.size(); ++i) {
     const int node = static_cast<int>(i), body = kept_.touched[i];
@@ -288,22 +309,26 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start, 
     touched[i] = body;
     at_node(normal, node) = on.gap.normal.cast<float>();
     // Friction turns the more easily the further a node slips, and it slips in proportion to dt.
-    write(node, kept_.mode[i] == contact_stick ? sticking_row(seen)
-                                               : slipping_row(seen, at_node(kept_.direction, node).cast<double>(),
-                                                              static_cast<double>(kept_.turning[i]) * kept_.dt / dt));
+    write(node, kept_.mode[i] == contact_stick
+                    ? sticking_row(seen)
+                    : slipping_row(seen, at_node(kept_.direction, node).cast<double>(),
+                                   static_cast<double>(kept_.turning[i]) * kept_.dt / dt));
   }
   return true;
 }
 
 Vector3d ContactState::slip(const Bearing& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
-  const Vector3d u = on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
+  const Vector3d u =
+      on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
 ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Buffer<double>& x,
-                                           const Buffer<double>& start, const Buffer<double>& residual,
-                                           const std::vector<Body>& at_start, const std::vector<Body>& at_end) const {
+                                           const Buffer<double>& start,
+                                           const Buffer<double>& residual,
+                                           const std::vector<Body>& at_start,
+                                           const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
   const Vector3d force = at_node(residual, node);
   if (on.body >= static_cast<int>(at_end.size())) {
@@ -311,7 +336,8 @@ ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Bu
     return {on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
   }
   const double mu_here = on.mean([&](int b) { return at_end[b].mu_of(sheet[node]); });
-  return {on.gap.distance, n, slip(on, before, p, at_start, at_end), force, mu_here, stiffness[node]};
+  return {on.gap.distance, n,       slip(on, before, p, at_start, at_end),
+          force,           mu_here, stiffness[node]};
 }
 
 void ContactState::write(int node, const ContactLinearization& row) {

@@ -1,5 +1,5 @@
-// Contacts of the nodes with bodies and smooth surfaces: modes, rows of Newton's system, and what is kept from step to
-// step.
+// Contacts of the nodes with bodies and smooth surfaces: modes, rows of Newton's system, and what
+// is kept from step to step.
 #pragma once
 
 #include <Eigen/Core>
@@ -27,27 +27,30 @@ struct SmoothTouch {
   int surface;
 };
 
-// Contacts of the cloth's nodes with the smooth surfaces through the vertices of prescribed triangles.
+// Contacts of the cloth's nodes with the smooth surfaces through the vertices of prescribed
+// triangles.
 //
-// A node keeps half of both thicknesses away from the surface and touches it as it touches a body, by one normal and
-// one gap. Where the surface is so curved that the triangles between nodes would cut into it, nodes keep further away:
-// a triangle in a circle of radius r sinks by r^2 kappa/2 below its corners on a surface of curvature kappa. A node
-// stays on the side of the triangles on which it is when a step begins. What nodes do not catch, triangles that poke
-// through between them, is left to pairs of closest points.
+// A node keeps half of both thicknesses away from the surface and touches it as it touches a body,
+// by one normal and one gap. Where the surface is so curved that the triangles between nodes would
+// cut into it, nodes keep further away: a triangle in a circle of radius r sinks by r^2 kappa/2
+// below its corners on a surface of curvature kappa. A node stays on the side of the triangles on
+// which it is when a step begins. What nodes do not catch, triangles that poke through between
+// them, is left to pairs of closest points.
 class SmoothContact {
  public:
-  // `triangles`: nodes; `sheet_of_node`: of cloth, and after them surfaces. `crease`: of each surface, see
-  // CreasedTriangles. x: where the surfaces are. `radius`: of the circle around the largest triangle at each free node,
-  // m.
+  // `triangles`: nodes; `sheet_of_node`: of cloth, and after them surfaces. `crease`: of each
+  // surface, see CreasedTriangles. x: where the surfaces are. `radius`: of the circle around the
+  // largest triangle at each free node, m.
   SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
-                const ContactMaterials& materials, const std::vector<double>& crease, const Buffer<double>& x,
-                const std::vector<double>& radius, const SmoothSettings& settings);
+                const ContactMaterials& materials, const std::vector<double>& crease,
+                const Buffer<double>& x, const std::vector<double>& radius,
+                const SmoothSettings& settings);
 
   // Forgets which triangles are touched.
   void restart();
-  // An attempt at a step begins at `start`; it takes the surfaces to `ends`, and the cloth to about `guess`. Pairs
-  // alone keep from surfaces what begins near a body, and go on until it is out of them: put out at once, it would tear
-  // at the cloth around it.
+  // An attempt at a step begins at `start`; it takes the surfaces to `ends`, and the cloth to about
+  // `guess`. Pairs alone keep from surfaces what begins near a body, and go on until it is out of
+  // them: put out at once, it would tear at the cloth around it.
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess,
              const std::vector<Body>& at_start);
   // A step ended, with these nodes in contact.
@@ -55,10 +58,11 @@ class SmoothContact {
 
   // What a node sees at p, if a surface is near.
   std::optional<SmoothTouch> touch(int node, const Eigen::Vector3d& p);
-  // How far a node that was at `before` when the step began was too near then, if by more than `allowed`, m.
+  // How far a node that was at `before` when the step began was too near then, if by more than
+  // `allowed`, m.
   Eigen::Vector3d forced(int node, const Eigen::Vector3d& before, double allowed) const;
-  // Of what the node saw last: its way over the surface since it was at `before` when the step began, m; friction; and
-  // the foot.
+  // Of what the node saw last: its way over the surface since it was at `before` when the step
+  // began, m; friction; and the foot.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
   double mu(int node) const;
   const Foot& foot(int node) const { return feet_[node]; }
@@ -87,7 +91,8 @@ class SmoothContact {
   std::vector<Foot> feet_;
 };
 
-// How far an iterate is from the solution: the largest force that a node lacks [N], and the sum of their squares.
+// How far an iterate is from the solution: the largest force that a node lacks [N], and the sum of
+// their squares.
 struct Norms {
   double largest = 0.0, squared = 0.0;
   void count(double force_squared);
@@ -113,31 +118,40 @@ class ContactState {
  public:
   explicit ContactState(int free_nodes, const ContactSettings& settings = {});
 
-  std::vector<int> mode, touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
-  std::vector<int> sheet;          // (free nodes): to which they belong
-  std::vector<double> stiffness;   // (free nodes): k of the law, N/m
+  std::vector<int> mode,
+      touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
+  std::vector<int> sheet;         // (free nodes): to which they belong
+  std::vector<double> stiffness;  // (free nodes): k of the law, N/m
   Buffer<float> normal, direction, mu, turning;
-  Buffer<float> force, correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
+  Buffer<float> force,
+      correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
   std::vector<char> whole_skeletons;  // (bodies): those that nodes do not feel; none: all are felt
-  bool by_pairs(std::size_t body) const { return body < whole_skeletons.size() && whole_skeletons[body]; }
+  bool by_pairs(std::size_t body) const {
+    return body < whole_skeletons.size() && whole_skeletons[body];
+  }
   std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
-  // Whether nodes whose friction turns back from one iterate to the next stick in the linear problem. Newton's method
-  // may else go to and fro between the two ways of slipping, where the law has it that they stick.
+  // Whether nodes whose friction turns back from one iterate to the next stick in the linear
+  // problem. Newton's method may else go to and fro between the two ways of slipping, where the law
+  // has it that they stick.
   bool hold_reversed = false;
 
   Bearing bearing(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
-  // Way over the bodies of a node that was at `before` when the step began, in the plane of contact, m.
-  static Eigen::Vector3d slip(const Bearing& on, const Eigen::Vector3d& before, const Eigen::Vector3d& p,
-                              const std::vector<Body>& at_start, const std::vector<Body>& at_end);
+  // Way over the bodies of a node that was at `before` when the step began, in the plane of
+  // contact, m.
+  static Eigen::Vector3d slip(const Bearing& on, const Eigen::Vector3d& before,
+                              const Eigen::Vector3d& p, const std::vector<Body>& at_start,
+                              const std::vector<Body>& at_end);
 
-  // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from contact.
+  // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from
+  // contact.
   Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
              const std::vector<Body>& at_start, const std::vector<Body>& at_end);
 
-  // Puts the nodes that were in contact at the end of the last step back into the mode and direction they had, for the
-  // first linear problem of a step of dt: at a predicted state the law would sort many of them wrongly.
+  // Puts the nodes that were in contact at the end of the last step back into the mode and
+  // direction they had, for the first linear problem of a step of dt: at a predicted state the law
+  // would sort many of them wrongly.
   bool resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
               const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt);
   // Keeps the modes, directions and stiffnesses of a step that ended, for the next; or none.
@@ -146,13 +160,15 @@ class ContactState {
 
   ContactRows rows() const;
 
-  // Contact of a node as a penalty, for factors: xx xy xz yy yz zz, N/m. k n n^T where it slips, and against a turn of
-  // friction; k in all directions where it sticks; k by the node's own stiffness.
+  // Contact of a node as a penalty, for factors: xx xy xz yy yz zz, N/m. k n n^T where it slips,
+  // and against a turn of friction; k in all directions where it sticks; k by the node's own
+  // stiffness.
   void penalty(int node, double own, float* out) const;
 
  private:
-  ContactKinematics kinematics(int node, const Bearing& on, const Buffer<double>& x, const Buffer<double>& start,
-                               const Buffer<double>& residual, const std::vector<Body>& at_start,
+  ContactKinematics kinematics(int node, const Bearing& on, const Buffer<double>& x,
+                               const Buffer<double>& start, const Buffer<double>& residual,
+                               const std::vector<Body>& at_start,
                                const std::vector<Body>& at_end) const;
   void write(int node, const ContactLinearization& row);
 

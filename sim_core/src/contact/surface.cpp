@@ -12,7 +12,8 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
 Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
-  const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]), b = at_node(x, corner[2]) - at_node(x, corner[0]);
+  const Vector3d a = at_node(x, corner[1]) - at_node(x, corner[0]),
+                 b = at_node(x, corner[2]) - at_node(x, corner[0]);
   Matrix3d out;
   out.col(0) = a.normalized();
   out.col(2) = a.cross(b).normalized();
@@ -31,7 +32,8 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       collides(std::move(collides_in)),
       last_collider(collides.rows(), -1) {
   triangles.insert(triangles.end(), bones.triangles.begin(), bones.triangles.end());
-  const int first_bone = bones.points.empty() ? static_cast<int>(sheet_of_node.size()) : bones.points.front();
+  const int first_bone =
+      bones.points.empty() ? static_cast<int>(sheet_of_node.size()) : bones.points.front();
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (sheet_of_node[i] < 0) continue;
     for (Eigen::Index sheet = 0; sheet < collides.rows(); ++sheet) {
@@ -55,13 +57,15 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
       const std::array<int, 2> edge{std::min(i, j), std::max(i, j)};
       own[c] = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
-      const bool counts = i != j && std::find(own.begin(), own.begin() + c, own[c]) == own.begin() + c;
+      const bool counts =
+          i != j && std::find(own.begin(), own.begin() + c, own[c]) == own.begin() + c;
       triangles_of_edge[own[c]] += counts;
     }
     triangle_edges.push_back(own);
   }
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
-    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_bone) vertices.push_back(static_cast<int>(i));
+    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_bone)
+      vertices.push_back(static_cast<int>(i));
     around_begin[i + 1] += around_begin[i];
   }
   around.resize(around_begin.back());
@@ -72,9 +76,11 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       if (c == 0 || corners[c] != corners[c - 1]) around[next[corners[c]]++] = static_cast<int>(t);
     }
   }
-  bone_edges = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
-                                edges.begin());
-  bone_vertices = static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) - vertices.begin());
+  bone_edges = static_cast<int>(
+      std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
+      edges.begin());
+  bone_vertices = static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) -
+                                   vertices.begin());
 }
 
 void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes) {
@@ -95,8 +101,8 @@ const Matrix3d& Turns::of(const Surface& surface, int node) {
   here.turn /= end - begin;
   if (node < free_nodes_) {
     const double angle = std::sqrt(std::max(3.0 - here.turn.trace(), 0.0));
-    here.turn =
-        Matrix3d::Identity() + std::clamp(2.0 - angle / turn_max_, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
+    here.turn = Matrix3d::Identity() +
+                std::clamp(2.0 - angle / turn_max_, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
   }
   return here.turn;
 }

@@ -1,4 +1,5 @@
-// Sheets and surfaces that may touch: thickness and friction, triangles, and how these turn in a step.
+// Sheets and surfaces that may touch: thickness and friction, triangles, and how these turn in a
+// step.
 #pragma once
 
 #include <Eigen/Core>
@@ -23,9 +24,10 @@ struct ContactMaterials {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
   Eigen::MatrixXd mu;             // of each two; negative: they do not touch each other
   int sheets;                     // that come before the surfaces
-  // Shares of the thickness that edges of two sheets, and vertices of the later over triangles of the earlier, keep.
-  // Where sheets lie flat on each other, these pairs are redundant to those of the earlier sheet's vertices: the active
-  // set is not unique and changes all the time. With less than 1 they are active where cloth is curved only.
+  // Shares of the thickness that edges of two sheets, and vertices of the later over triangles of
+  // the earlier, keep. Where sheets lie flat on each other, these pairs are redundant to those of
+  // the earlier sheet's vertices: the active set is not unique and changes all the time. With less
+  // than 1 they are active where cloth is curved only.
   double edge_share = 1.0, second_share = 1.0;
   double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
   double cell = 0.0;            // m: side of a cell, of the coarsest sheet
@@ -38,8 +40,8 @@ struct ContactMaterials {
     return last < 0 ? nullptr : &bones[last];
   }
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
-  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves (contact/state.hpp): pairs only
-  // hold what comes nearer between the nodes.
+  // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
+  // (contact/state.hpp): pairs only hold what comes nearer between the nodes.
   double apart(int a, int b) const {
     if (const Bone* bone = bone_of(a, b)) return bone->radius;
     return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
@@ -47,7 +49,10 @@ struct ContactMaterials {
   // The same by kind of pair; `first` and `second`: sheets of its pieces.
   double apart(PairKind kind, int first, int second) const {
     const bool other = first != second && std::max(first, second) < sheets;
-    const double share = !other ? 1.0 : kind == PairKind::edge_edge ? edge_share : first > second ? second_share : 1.0;
+    const double share = !other                        ? 1.0
+                         : kind == PairKind::edge_edge ? edge_share
+                         : first > second              ? second_share
+                                                       : 1.0;
     return share * apart(first, second);
   }
   // The largest of these without skeletons; without any, the largest thickness of a sheet.
@@ -85,27 +90,31 @@ struct Surface {
   CollisionMask collides;                         // whether two sheets touch each other
   std::vector<int> last_collider;                 // by sheet: the last node that it touches
 
-  Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node, CollisionMask collides,
-          const Bones& bones = {});
-  bool may_touch(int node, int other) const { return collides(sheet_of_node[node], sheet_of_node[other]); }
+  Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
+          CollisionMask collides, const Bones& bones = {});
+  bool may_touch(int node, int other) const {
+    return collides(sheet_of_node[node], sheet_of_node[other]);
+  }
 };
 
-// How a surface turns in a step: a rotation at each node, so that what wanders over the surface is carried by one that
-// changes without a jump from one triangle to the next.
+// How a surface turns in a step: a rotation at each node, so that what wanders over the surface is
+// carried by one that changes without a jump from one triangle to the next.
 //
-// A triangle turns by Q Q0^T, with Q = [a, n x a, n] of its first side and its normal where it was expected, and Q0 the
-// same at the start. A node turns by the mean over the triangles around it. That is no rotation where these turn
-// unlike, but what it carries is as short as cloth is thick, and it is one where the surface moves rigidly.
+// A triangle turns by Q Q0^T, with Q = [a, n x a, n] of its first side and its normal where it was
+// expected, and Q0 the same at the start. A node turns by the mean over the triangles around it.
+// That is no rotation where these turn unlike, but what it carries is as short as cloth is thick,
+// and it is one where the surface moves rigidly.
 //
-// The end of the step is taken as velocities lead there, lest a law that carries by it should have derivatives by all
-// nodes around: what this misses is of the order dt^2, and none of it is left where motion ends. Turns of free nodes
-// that are large fade out.
+// The end of the step is taken as velocities lead there, lest a law that carries by it should have
+// derivatives by all nodes around: what this misses is of the order dt^2, and none of it is left
+// where motion ends. Turns of free nodes that are large fade out.
 class Turns {
  public:
   // `turn_max`: angle up to which the turn of a free node counts, rad; from twice that it does not.
   explicit Turns(double turn_max) : turn_max_(turn_max) {}
 
-  // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones go there surely.
+  // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones
+  // go there surely.
   void begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes);
   const Eigen::Matrix3d& of(const Surface& surface, int node);
 

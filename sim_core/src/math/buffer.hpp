@@ -1,5 +1,5 @@
-// Arrays that begin on a cache line, and nodes in them: four numbers a node, of which the fourth is zero, so that a
-// node is one vector register.
+// Arrays that begin on a cache line, and nodes in them: four numbers a node, of which the fourth is
+// zero, so that a node is one vector register.
 #pragma once
 
 #include <Eigen/Core>
@@ -13,7 +13,8 @@
 
 namespace sim_core {
 
-// Large arrays lie in large pages where the system has them: a factor is read from end to end, over and over.
+// Large arrays lie in large pages where the system has them: a factor is read from end to end, over
+// and over.
 constexpr std::size_t large_page = std::size_t{1} << 21;
 
 template <class T>

@@ -1,17 +1,19 @@
 // Lanes<W>: W doubles that go through the same arithmetic side by side, one rod per lane.
 //
-// Every operation acts on each lane alone and is rounded as IEEE 754 asks, so a lane's bits depend neither on its
-// neighbours, nor on W, nor on the instruction set (no fused multiply-add: see -ffp-contract in CMakeLists.txt).
+// Every operation acts on each lane alone and is rounded as IEEE 754 asks, so a lane's bits depend
+// neither on its neighbours, nor on W, nor on the instruction set (no fused multiply-add: see
+// -ffp-contract in CMakeLists.txt).
 //
-// All names sit in an unnamed namespace on purpose: the kernels include this file once per instruction set, and the
-// linker must never merge a function compiled for AVX-512 with one compiled for the baseline.
+// All names sit in an unnamed namespace on purpose: the kernels include this file once per
+// instruction set, and the linker must never merge a function compiled for AVX-512 with one
+// compiled for the baseline.
 #pragma once
 
 namespace sim_core {
 namespace {
 
-// The compiler's own vectors. Written out for each W: GCC does not take a template's parameter as a vector's size in
-// the parameter of a constructor.
+// The compiler's own vectors. Written out for each W: GCC does not take a template's parameter as a
+// vector's size in the parameter of a constructor.
 template <int W>
 struct VectorOf;
 
@@ -93,11 +95,12 @@ bool any(Mask<W> mask) {
   return bits != 0;
 }
 
-// Rotations: vectors, symmetric 3x3 matrices and unit quaternions over lanes T, and the SO(3) exponential and
-// logarithm.
+// Rotations: vectors, symmetric 3x3 matrices and unit quaternions over lanes T, and the SO(3)
+// exponential and logarithm.
 //
-// Eigen's types are not used here: its inline functions would be compiled once per instruction set and merged by the
-// linker (see above). Unit quaternions turn vectors of the material frame into world vectors.
+// Eigen's types are not used here: its inline functions would be compiled once per instruction set
+// and merged by the linker (see above). Unit quaternions turn vectors of the material frame into
+// world vectors.
 
 template <class T>
 struct Vec3 {
@@ -160,7 +163,9 @@ struct Quat {
   friend Quat operator+(Quat a, Quat b) { return {a.w + b.w, a.v + b.v}; }
   friend Quat operator-(Quat a, Quat b) { return {a.w - b.w, a.v - b.v}; }
   friend Quat operator*(T s, Quat a) { return {s * a.w, s * a.v}; }
-  friend Quat operator*(Quat a, Quat b) { return {a.w * b.w - dot(a.v, b.v), a.w * b.v + b.w * a.v + cross(a.v, b.v)}; }
+  friend Quat operator*(Quat a, Quat b) {
+    return {a.w * b.w - dot(a.v, b.v), a.w * b.v + b.w * a.v + cross(a.v, b.v)};
+  }
 };
 
 template <class M, class T>
@@ -211,30 +216,39 @@ Vec3<T> direction3(Quat<T> q) {
           T(1.0) - T(2.0) * (v.x * v.x + v.y * v.y)};
 }
 
-// (1 - atan(sqrt z) / sqrt z) / z on [0, 1] to 3e-17: Chebyshev interpolation at 20 nodes, in powers of z, evaluated
-// as Estrin's tree because the chain of Horner's rule is three times as long.
+// (1 - atan(sqrt z) / sqrt z) / z on [0, 1] to 3e-17: Chebyshev interpolation at 20 nodes, in
+// powers of z, evaluated as Estrin's tree because the chain of Horner's rule is three times as
+// long.
 template <class T>
 T arctangent_defect(T z) {
   const T z2 = z * z, z4 = z2 * z2, z8 = z4 * z4, z16 = z8 * z8;
-  const auto cubic = [&](double a, double b, double c, double d) { return (T(a) + T(b) * z) + (T(c) + T(d) * z) * z2; };
-  const T p0 = cubic(0x1.5555555555555p-2, -0x1.9999999999620p-3, 0x1.24924924753ecp-3, -0x1.c71c71bb00a6cp-4);
-  const T p1 = cubic(0x1.745d15ee35819p-4, -0x1.3b1399d1dcdc7p-4, 0x1.110fff599e4d2p-4, -0x1.e1d0239d392a6p-5);
-  const T p2 = cubic(0x1.aebbb1647a168p-5, -0x1.841dcf603a209p-5, 0x1.5d02278205cc7p-5, -0x1.3328700bb8169p-5);
-  const T p3 = cubic(0x1.00390504e9f2fp-5, -0x1.843f4bca23369p-6, 0x1.fd0e4de8fed90p-7, -0x1.123baedb61abdp-7);
-  const T p4 = cubic(0x1.ca3677db66678p-9, -0x1.1325b2f8964bep-10, 0x1.a359b96a4eee4p-13, -0x1.2f07811f9f6e9p-16);
+  const auto cubic = [&](double a, double b, double c, double d) {
+    return (T(a) + T(b) * z) + (T(c) + T(d) * z) * z2;
+  };
+  const T p0 = cubic(0x1.5555555555555p-2, -0x1.9999999999620p-3, 0x1.24924924753ecp-3,
+                     -0x1.c71c71bb00a6cp-4);
+  const T p1 = cubic(0x1.745d15ee35819p-4, -0x1.3b1399d1dcdc7p-4, 0x1.110fff599e4d2p-4,
+                     -0x1.e1d0239d392a6p-5);
+  const T p2 = cubic(0x1.aebbb1647a168p-5, -0x1.841dcf603a209p-5, 0x1.5d02278205cc7p-5,
+                     -0x1.3328700bb8169p-5);
+  const T p3 = cubic(0x1.00390504e9f2fp-5, -0x1.843f4bca23369p-6, 0x1.fd0e4de8fed90p-7,
+                     -0x1.123baedb61abdp-7);
+  const T p4 = cubic(0x1.ca3677db66678p-9, -0x1.1325b2f8964bep-10, 0x1.a359b96a4eee4p-13,
+                     -0x1.2f07811f9f6e9p-16);
   return (p0 + p1 * z4) + (p2 + p3 * z4) * z8 + p4 * z16;
 }
 
-// The rotation vector theta of a quaternion with w >= 0, with what the derivatives of the logarithm need:
-// x = |theta|^2,  c = (1 - (|theta|/2) cot(|theta|/2)) / x,  dc = dc/dx.
+// The rotation vector theta of a quaternion with w >= 0, with what the derivatives of the logarithm
+// need: x = |theta|^2,  c = (1 - (|theta|/2) cot(|theta|/2)) / x,  dc = dc/dx.
 template <class T>
 struct Logarithm {
   Vec3<T> theta;
   T x, c, dc;
 };
 
-// With u = tan(|theta|/4) and z = u^2: |theta| = 4 atan(u) = 4 u P, (|theta|/2) cot(|theta|/2) = (1 - z) P, so that
-// with P = 1 - z Q no difference of close numbers is left in c = (1 + Q (1 - z)) / (16 P^2).
+// With u = tan(|theta|/4) and z = u^2: |theta| = 4 atan(u) = 4 u P, (|theta|/2) cot(|theta|/2) = (1
+// - z) P, so that with P = 1 - z Q no difference of close numbers is left in c = (1 + Q (1 - z)) /
+// (16 P^2).
 template <class T>
 Logarithm<T> logarithm(Quat<T> q) {
   const Vec3<T> u = (T(1.0) / (T(1.0) + q.w)) * q.v;
@@ -246,13 +260,15 @@ Logarithm<T> logarithm(Quat<T> q) {
   const T z_floored = max(z, T(1e-10));
   const T inverse = T(0.0625) / (P * P * z_floored);
   const T c = (T(1.0) + Q * (T(1.0) - z)) * (inverse * z_floored);
-  // y = 1 - x c = (|theta|/2) cot(|theta|/2) and dy/dx = y c / 2 - 1/8 give dc/dx = (1/8 - c - y c / 2) / x.
+  // y = 1 - x c = (|theta|/2) cot(|theta|/2) and dy/dx = y c / 2 - 1/8 give dc/dx = (1/8 - c - y c
+  // / 2) / x.
   const T y = (T(1.0) - z) * P;
   const T dc = (T(0.125) - c - T(0.5) * (y * c)) * inverse;
   return {T(4.0) * P * u, x, c, dc};
 }
 
-// exp of a rotation vector of up to about 2.5 rad, by the Taylor series of cos and sin(a)/a at a = |theta|/2.
+// exp of a rotation vector of up to about 2.5 rad, by the Taylor series of cos and sin(a)/a at a =
+// |theta|/2.
 template <class T>
 Quat<T> exponential(Vec3<T> theta) {
   const T a2 = T(0.25) * dot(theta, theta);
@@ -264,8 +280,8 @@ Quat<T> exponential(Vec3<T> theta) {
   return {cosine, T(0.5) * sinc * theta};
 }
 
-// A unit quaternion that agrees with exp(omega) to second order and needs no series: ((1 - p^2), 2 p) / (1 + p^2) with
-// p = omega / 4.
+// A unit quaternion that agrees with exp(omega) to second order and needs no series: ((1 - p^2), 2
+// p) / (1 + p^2) with p = omega / 4.
 template <class T>
 Quat<T> retraction(Vec3<T> omega) {
   const Vec3<T> p = T(0.25) * omega;

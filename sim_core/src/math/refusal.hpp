@@ -7,7 +7,9 @@
 
 namespace sim_core {
 
-[[noreturn]] inline void refuse(const std::string& message) { throw std::invalid_argument(message); }
+[[noreturn]] inline void refuse(const std::string& message) {
+  throw std::invalid_argument(message);
+}
 
 template <class... Parts>
 std::string text(const Parts&... parts) {

@@ -1,12 +1,15 @@
-// The energy of a hanging Kirchhoff rod on a geodesic chain of frames, with its gradient and Hessian.
+// The energy of a hanging Kirchhoff rod on a geodesic chain of frames, with its gradient and
+// Hessian.
 //
-//   E = \int_0^1 1/2 (kappa - kappa_bar)^T K (kappa - kappa_bar) + gamma (1 - s) t . e_z ds   [EI/L]
+//   E = \int_0^1 1/2 (kappa - kappa_bar)^T K (kappa - kappa_bar) + gamma (1 - s) t . e_z ds [EI/L]
 //
-// with K = diag(C, 1, 1), C = GJ/EI, kappa_bar = (phi0, 0, phi1), t the tangent, e_z up [Bertails et al. 2006, Sec. 3].
-// Element e turns frame R_a into R_b with constant strain: kappa = log(R_a^T R_b) / h. The weight is lumped at nodes.
+// with K = diag(C, 1, 1), C = GJ/EI, kappa_bar = (phi0, 0, phi1), t the tangent, e_z up [Bertails
+// et al. 2006, Sec. 3]. Element e turns frame R_a into R_b with constant strain: kappa = log(R_a^T
+// R_b) / h. The weight is lumped at nodes.
 //
-// Unknowns are rotations of the nodes in world axes, R <- exp(omega) R. As both bending stiffnesses are equal,
-// R K R^T = I + (C - 1) t t^T, and an element needs world vectors only, no matrix product.
+// Unknowns are rotations of the nodes in world axes, R <- exp(omega) R. As both bending stiffnesses
+// are equal, R K R^T = I + (C - 1) t t^T, and an element needs world vectors only, no matrix
+// product.
 #pragma once
 
 #include "math/lanes.hpp"
@@ -22,8 +25,8 @@ struct Rod {
   T twist_stiffness;  // C = GJ/EI
 };
 
-// What element i of n is made of: a uniform rod is its own section everywhere. general_rod.hpp overloads this and the
-// other functions of a rod and its sections.
+// What element i of n is made of: a uniform rod is its own section everywhere. general_rod.hpp
+// overloads this and the other functions of a rod and its sections.
 template <class T>
 const Rod<T>& section(const Rod<T>& rod, int, int) {
   return rod;
@@ -38,7 +41,7 @@ T energy_scale(const Rod<T>& rod) {
 template <class T>
 struct Element {
   T energy;
-  Vec3<T> force;      // f = dE/d omega_b = -dE/d omega_a: the moment carried by the element, world axes
+  Vec3<T> force;  // f = dE/d omega_b = -dE/d omega_a: the moment carried by the element, world axes
   Sym3<T> stiffness;  // S: d2E = [S, -S + [f]x/2; ., S] over (omega_a, omega_b)
 };
 
@@ -62,7 +65,8 @@ ElementMoment<T> element_moment(const Rod<T>& rod, Quat<T> a, Quat<T> b, T h, T 
   return {log, t, moment, T(0.5) * h * dot(strain, moment), turn.w};
 }
 
-// J^T v with J = I + [theta]x/2 + c [theta]x^2, the inverse right Jacobian of exp: d theta = J (omega_b - omega_a).
+// J^T v with J = I + [theta]x/2 + c [theta]x^2, the inverse right Jacobian of exp: d theta = J
+// (omega_b - omega_a).
 template <class T>
 Vec3<T> jacobian_transposed(const Logarithm<T>& log, Vec3<T> v) {
   return v + T(0.5) * cross(v, log.theta) + log.c * (dot(log.theta, v) * log.theta - log.x * v);
@@ -76,8 +80,8 @@ Sym3<T> isotropic_stiffness(const ElementMoment<T>& e, T k) {
   const T x = e.log.x, c = e.log.c, tm = dot(theta, e.moment);
   // J^T J = (1 - a x) I + a theta theta^T
   const T a = T(2.0) * c - T(0.25) - c * c * x;
-  const Vec3<T> v =
-      (T(0.25) - c) * e.moment + c * cross(e.moment, theta) + (c * c + T(2.0) * e.log.dc) * (tm * theta - x * e.moment);
+  const Vec3<T> v = (T(0.25) - c) * e.moment + c * cross(e.moment, theta) +
+                    (c * c + T(2.0) * e.log.dc) * (tm * theta - x * e.moment);
   const T identity = k * (T(1.0) - a * x) + tm * (c - T(0.25) - c * c * x);
   return scaled_identity_plus_symmetric_product(identity, theta, v + (k * a + c * c * tm) * theta);
 }
@@ -86,7 +90,8 @@ template <class T>
 Sym3<T> element_stiffness(const Rod<T>& rod, const ElementMoment<T>& e, T inverse_h) {
   const Vec3<T> u = jacobian_transposed(e.log, e.tangent);
   return isotropic_stiffness(e, inverse_h) +
-         scaled_identity_plus_symmetric_product(T(0.0), inverse_h * (rod.twist_stiffness - T(1.0)) * u, u);
+         scaled_identity_plus_symmetric_product(T(0.0),
+                                                inverse_h * (rod.twist_stiffness - T(1.0)) * u, u);
 }
 
 template <class T, class Section>

@@ -1,10 +1,11 @@
-// A rod whose natural curvature varies along it, with three stiffnesses and any clamp: the functions of a rod and its
-// sections that energy.hpp and levels.hpp ask for.
+// A rod whose natural curvature varies along it, with three stiffnesses and any clamp: the
+// functions of a rod and its sections that energy.hpp and levels.hpp ask for.
 //
-//   E = \int_0^1 1/2 (kappa - kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds,  K = diag(K0, K1,
-//   K2)
+//   E = \int_0^1 1/2 (kappa - kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds,
+//   K = diag(K0, K1, K2)
 //
-// An element takes kappa_bar at its middle, which keeps the scheme symmetric and its error even in h.
+// An element takes kappa_bar at its middle, which keeps the scheme symmetric and its error even in
+// h.
 #pragma once
 
 #include "rods/levels.hpp"
@@ -14,14 +15,14 @@ namespace {
 
 template <class T>
 struct GeneralRod {
-  T gamma;                 // weight rho A g L^3 / EI
-  Vec3<T> stiffness;       // twist, bend about d2, bend about d3; EI
-  Quat<T> clamp;           // frame at s = 0
-  int intervals;           // of the grid of `natural` and `start`: twice the elements of the finest level
+  T gamma;            // weight rho A g L^3 / EI
+  Vec3<T> stiffness;  // twist, bend about d2, bend about d3; EI
+  Quat<T> clamp;      // frame at s = 0
+  int intervals;  // of the grid of `natural` and `start`: twice the elements of the finest level
   const Vec3<T>* natural;  // (intervals + 1): kappa_bar at uniform arc length, 1/L
   const Vec3<T>* start;    // (intervals + 1): curvature of the shape that the search starts from
-  const Vec3<T>* slope;    // (intervals / 4 + 1): kappa_bar' at the nodes of the middle level, 1/L^2
-  const Vec3<T>* points;   // kappa_bar at the output points
+  const Vec3<T>* slope;   // (intervals / 4 + 1): kappa_bar' at the nodes of the middle level, 1/L^2
+  const Vec3<T>* points;  // kappa_bar at the output points
 };
 
 // One place of such a rod. The slope is known at nodes of the middle level only.
@@ -52,25 +53,30 @@ T energy_scale(const GeneralRod<T>& rod) {
   T largest(0.0);
   for (int i = 0; i <= rod.intervals; ++i) {
     const Vec3<T> k = rod.natural[i];
-    largest = max(largest, rod.stiffness.x * k.x * k.x + rod.stiffness.y * k.y * k.y + rod.stiffness.z * k.z * k.z);
+    largest = max(largest, rod.stiffness.x * k.x * k.x + rod.stiffness.y * k.y * k.y +
+                               rod.stiffness.z * k.z * k.z);
   }
   return T(1.0) + rod.gamma + largest;
 }
 
 template <class T>
-ElementMoment<T> element_moment(const GeneralSection<T>& here, Quat<T> a, Quat<T> b, T h, T inverse_h) {
+ElementMoment<T> element_moment(const GeneralSection<T>& here, Quat<T> a, Quat<T> b, T h,
+                                T inverse_h) {
   const Quat<T> turn = b * conjugate(a);
   const Logarithm<T> log = logarithm(turn);
-  const Vec3<T> d1 = direction1(b), d2 = direction2(b), d3 = direction3(b), theta = inverse_h * log.theta;
+  const Vec3<T> d1 = direction1(b), d2 = direction2(b), d3 = direction3(b),
+                theta = inverse_h * log.theta;
   const Vec3<T> strain = Vec3<T>{dot(d1, theta), dot(d2, theta), dot(d3, theta)} - here.natural;
-  const Vec3<T> m{here.stiffness.x * strain.x, here.stiffness.y * strain.y, here.stiffness.z * strain.z};
+  const Vec3<T> m{here.stiffness.x * strain.x, here.stiffness.y * strain.y,
+                  here.stiffness.z * strain.z};
   return {log, d1, m.x * d1 + m.y * d2 + m.z * d3, T(0.5) * h * dot(strain, m), turn.w, d2};
 }
 
 // As for a uniform rod, with R K R^T = K2 I + (K0 - K2) d1 d1^T + (K1 - K2) d2 d2^T.
 template <class T>
 Sym3<T> element_stiffness(const GeneralSection<T>& here, const ElementMoment<T>& e, T inverse_h) {
-  const Vec3<T> u1 = jacobian_transposed(e.log, e.tangent), u2 = jacobian_transposed(e.log, e.second);
+  const Vec3<T> u1 = jacobian_transposed(e.log, e.tangent),
+                u2 = jacobian_transposed(e.log, e.second);
   const Vec3<T> K = here.stiffness;
   return isotropic_stiffness(e, inverse_h * K.z) +
          scaled_identity_plus_symmetric_product(T(0.0), inverse_h * (K.x - K.z) * u1, u1) +

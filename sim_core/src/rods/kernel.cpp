@@ -10,9 +10,12 @@ namespace {
 
 // From nodal frames and moments to the output points.
 //
-// The Kirchhoff equations give the derivatives of everything at the nodes [Bertails-Descoubes et al. 2018, Eq. 1-4]:
-//   kappa = kappa_bar + K^{-1} m,   m' = m x kappa - gamma (1 - s) e_x x g,   g' = g x kappa,   r' = t,
-// with g the direction of gravity in the material frame; quintic Hermite interpolation does the rest.
+// The Kirchhoff equations give the derivatives of everything at the nodes [Bertails-Descoubes et
+// al. 2018, Eq. 1-4]:
+//   kappa = kappa_bar + K^{-1} m,   m' = m x kappa - gamma (1 - s) e_x x g,   g' = g x kappa,   r'
+//   = t,
+// with g the direction of gravity in the material frame; quintic Hermite interpolation does the
+// rest.
 
 // A field with its first and second derivatives in s.
 template <class Field>
@@ -38,13 +41,14 @@ NodeJets<T> node_jet(const Section& section, T gamma, double s, Quat<T> q, Vec3<
   const Vec3<T> dm = cross(m, kappa) - load * turned_by_tangent(g);
   const Vec3<T> dkappa = curvature_rate(section, dm);
   const Vec3<T> dg = cross(g, kappa);
-  const Vec3<T> ddm = cross(dm, kappa) + cross(m, dkappa) + gamma * turned_by_tangent(g) - load * turned_by_tangent(dg);
+  const Vec3<T> ddm = cross(dm, kappa) + cross(m, dkappa) + gamma * turned_by_tangent(g) -
+                      load * turned_by_tangent(dg);
   const Quat<T> dq = spin(q, kappa);
   const Quat<T> ddq = spin(dq, kappa) + spin(q, dkappa);
   // t' = R (kappa x e_x), t'' = R (kappa x (kappa x e_x) + kappa' x e_x)
   const Vec3<T> dt = kappa.z * d2 - kappa.y * d3;
-  const Vec3<T> ddt = T(-1.0) * (kappa.y * kappa.y + kappa.z * kappa.z) * d1 + (kappa.x * kappa.y + dkappa.z) * d2 +
-                      (kappa.x * kappa.z - dkappa.y) * d3;
+  const Vec3<T> ddt = T(-1.0) * (kappa.y * kappa.y + kappa.z * kappa.z) * d1 +
+                      (kappa.x * kappa.y + dkappa.z) * d2 + (kappa.x * kappa.z - dkappa.y) * d3;
   return {{m, dm, ddm}, {Vec3<T>{}, d1, dt}, {q, dq, ddq}, ddt};
 }
 
@@ -55,7 +59,8 @@ Field hermite(const SamplePoint& p, const Jet<Field>& a, const Jet<Field>& b) {
 }
 
 template <int W, class AnyRod>
-[[gnu::flatten]] void node_jets(const AnyRod& rod, const Limit<W>& limit, std::vector<NodeJets<Lanes<W>>>& nodes) {
+[[gnu::flatten]] void node_jets(const AnyRod& rod, const Limit<W>& limit,
+                                std::vector<NodeJets<Lanes<W>>>& nodes) {
   using T = Lanes<W>;
   const int n = static_cast<int>(limit.frame.size()) - 1;
   const double h = 1.0 / n;
@@ -71,9 +76,11 @@ template <int W, class AnyRod>
   }
 }
 
-// Write lane l of a vector to out[l * stride ...], for those of the first `count` lanes that the mask names.
+// Write lane l of a vector to out[l * stride ...], for those of the first `count` lanes that the
+// mask names.
 template <int W>
-void scatter(Vec3<Lanes<W>> v, double* out, std::int64_t stride, int step, Mask<W> mask, int count) {
+void scatter(Vec3<Lanes<W>> v, double* out, std::int64_t stride, int step, Mask<W> mask,
+             int count) {
   for (int lane = 0; lane < count; ++lane) {
     if (mask.v[lane] == 0) continue;
     double* to = out + lane * stride;
@@ -86,17 +93,19 @@ void scatter(Vec3<Lanes<W>> v, double* out, std::int64_t stride, int step, Mask<
 // Sample the masked ones of the first `count` lanes into rods begin ... begin + count of the batch.
 template <int W, class AnyRod>
 [[gnu::flatten]] void sample(const AnyRod& rod, const std::vector<NodeJets<Lanes<W>>>& nodes,
-                             const std::vector<SamplePoint>& points, const RodOutput& output, Mask<W> mask,
-                             std::int64_t begin, int count) {
+                             const std::vector<SamplePoint>& points, const RodOutput& output,
+                             Mask<W> mask, std::int64_t begin, int count) {
   using T = Lanes<W>;
   const std::int64_t stride = 3 * static_cast<std::int64_t>(points.size());
   for (std::size_t j = 0; j < points.size(); ++j) {
     const SamplePoint& p = points[j];
     const NodeJets<T>&a = nodes[p.node], &b = nodes[p.node + 1];
     const Quat<T> q = normalized(hermite<T>(p, a.frame, b.frame));
-    const Vec3<T> kappa = curvature(point_section(rod, static_cast<int>(j)), hermite<T>(p, a.moment, b.moment));
+    const Vec3<T> kappa =
+        curvature(point_section(rod, static_cast<int>(j)), hermite<T>(p, a.moment, b.moment));
     const std::int64_t at = begin * stride + 3 * static_cast<std::int64_t>(j);
-    scatter(hermite<T>(p, a.centerline, b.centerline), output.centerline + at, stride, 1, mask, count);
+    scatter(hermite<T>(p, a.centerline, b.centerline), output.centerline + at, stride, 1, mask,
+            count);
     scatter(kappa, output.curvature + at, stride, 1, mask, count);
     double* frame = output.frame + 3 * at;
     scatter(direction1(q), frame, 3 * stride, 3, mask, count);
@@ -109,20 +118,23 @@ template <int W, class AnyRod>
 constexpr double tolerance_start = 1e-4;
 constexpr double tolerance = 1e-6;
 
-// Largest last term of the extrapolation [rad]. Levels that sit in different wells are further apart; levels too coarse
-// for the rod are too.
+// Largest last term of the extrapolation [rad]. Levels that sit in different wells are further
+// apart; levels too coarse for the rod are too.
 constexpr double refinement_max = 0.02;
 
 template <int W>
 Level<W> level_of(int elements) {
-  return {elements, std::vector<Quat<Lanes<W>>>(elements + 1), std::vector<Vec3<Lanes<W>>>(elements + 1)};
+  return {elements, std::vector<Quat<Lanes<W>>>(elements + 1),
+          std::vector<Vec3<Lanes<W>>>(elements + 1)};
 }
 
-// Reads lane l from rod begin + l, each `stride` numbers after the one before; lanes past the end repeat the last rod.
+// Reads lane l from rod begin + l, each `stride` numbers after the one before; lanes past the end
+// repeat the last rod.
 template <int W>
 Lanes<W> gather(const double* from, std::int64_t begin, int count, std::int64_t stride = 1) {
   Lanes<W> lanes;
-  for (int lane = 0; lane < W; ++lane) lanes.v[lane] = from[stride * (begin + (lane < count ? lane : count - 1))];
+  for (int lane = 0; lane < W; ++lane)
+    lanes.v[lane] = from[stride * (begin + (lane < count ? lane : count - 1))];
   return lanes;
 }
 
@@ -140,7 +152,8 @@ struct Solver {
   Mask<W> converged;  // on all levels so far
 
   explicit Solver(int elements)
-      : levels{level_of<W>(elements / 4), level_of<W>(elements / 2), level_of<W>(elements)}, work(elements) {}
+      : levels{level_of<W>(elements / 4), level_of<W>(elements / 2), level_of<W>(elements)},
+        work(elements) {}
 
   template <class AnyRod>
   void relax(const AnyRod& rod, int k, double tolerance) {
@@ -172,23 +185,26 @@ struct Solver {
 // A rod without a solution gets no numbers that could be taken for one.
 void mark_failed(const RodOutput& output, std::int64_t points, std::int64_t i) {
   const double nan = __builtin_nan("");
-  for (std::int64_t j = 3 * points * i; j < 3 * points * (i + 1); ++j) output.centerline[j] = output.curvature[j] = nan;
+  for (std::int64_t j = 3 * points * i; j < 3 * points * (i + 1); ++j)
+    output.centerline[j] = output.curvature[j] = nan;
   for (std::int64_t j = 9 * points * i; j < 9 * points * (i + 1); ++j) output.frame[j] = nan;
   output.energy[i] = output.refinement[i] = output.residual[i] = nan;
 }
 
-// Solve rods begin ... begin + count, count <= W. A rod that fails starts again on a finer level; whether it does
-// depends on itself alone, and rods that are done are not touched.
+// Solve rods begin ... begin + count, count <= W. A rod that fails starts again on a finer level;
+// whether it does depends on itself alone, and rods that are done are not touched.
 template <int W, class AnyRod>
 void solve_pack(const AnyRod& rod, const RodOutput& output, const RodSettings& settings,
-                const std::vector<SamplePoint>& points, Solver<W>& solver, std::int64_t begin, int count) {
+                const std::vector<SamplePoint>& points, Solver<W>& solver, std::int64_t begin,
+                int count) {
   using T = Lanes<W>;
   Mask<W> pending(true);
   solver.sweeps = T(0.0);
   for (int start = settings.start_level; start < 3 && any(pending); ++start) {
     solver.solve(rod, start);
     const Level<W>& fine = solver.levels[2];
-    const Mask<W> converged = solver.converged & less_equal(solver.limit.refinement, T(refinement_max));
+    const Mask<W> converged =
+        solver.converged & less_equal(solver.limit.refinement, T(refinement_max));
     const Mask<W> stable = converged & fine.stable;
     sample(rod, solver.nodes, points, output, pending, begin, count);
     for (int lane = 0; lane < count; ++lane) {
@@ -204,7 +220,8 @@ void solve_pack(const AnyRod& rod, const RodOutput& output, const RodSettings& s
     pending = pending & !converged;
   }
   for (int lane = 0; lane < count; ++lane) {
-    if (pending.v[lane] != 0) mark_failed(output, static_cast<std::int64_t>(points.size()), begin + lane);
+    if (pending.v[lane] != 0)
+      mark_failed(output, static_cast<std::int64_t>(points.size()), begin + lane);
   }
 }
 
@@ -243,31 +260,34 @@ struct GeneralRodReader {
   GeneralRod<T> read(std::int64_t begin, int count) {
     const auto gather_field = [&](const double* from, std::vector<Vec3<T>>& to) {
       const std::int64_t stride = 3 * static_cast<std::int64_t>(to.size());
-      for (std::size_t k = 0; k < to.size(); ++k) to[k] = gather_vector(from + 3 * k, stride, begin, count);
+      for (std::size_t k = 0; k < to.size(); ++k)
+        to[k] = gather_vector(from + 3 * k, stride, begin, count);
     };
     gather_field(batch.natural, natural);
     gather_field(batch.start, start);
     gather_field(batch.slope, slope);
     gather_field(batch.natural_at_points, points);
-    return {gather<W>(batch.gamma, begin, count),
-            gather_vector(batch.stiffness, 3, begin, count),
-            {gather<W>(batch.clamp, begin, count, 4), gather_vector(batch.clamp + 1, 4, begin, count)},
-            intervals,
-            natural.data(),
-            start.data(),
-            slope.data(),
-            points.data()};
+    return {
+        gather<W>(batch.gamma, begin, count),
+        gather_vector(batch.stiffness, 3, begin, count),
+        {gather<W>(batch.clamp, begin, count, 4), gather_vector(batch.clamp + 1, 4, begin, count)},
+        intervals,
+        natural.data(),
+        start.data(),
+        slope.data(),
+        points.data()};
   }
 
-  static Vec3<T> gather_vector(const double* from, std::int64_t stride, std::int64_t begin, int count) {
+  static Vec3<T> gather_vector(const double* from, std::int64_t stride, std::int64_t begin,
+                               int count) {
     return {gather<W>(from, begin, count, stride), gather<W>(from + 1, begin, count, stride),
             gather<W>(from + 2, begin, count, stride)};
   }
 };
 
 template <int W, template <int> class Reader, class Batch>
-void solve_range(const Batch& batch, const RodSettings& settings, const std::vector<SamplePoint>& points,
-                 std::int64_t begin, std::int64_t end) {
+void solve_range(const Batch& batch, const RodSettings& settings,
+                 const std::vector<SamplePoint>& points, std::int64_t begin, std::int64_t end) {
   Solver<W> solver(settings.elements);
   Reader<W> reader(batch, settings, static_cast<int>(points.size()));
   for (std::int64_t i = begin; i < end; i += W) {
@@ -278,6 +298,7 @@ void solve_range(const Batch& batch, const RodSettings& settings, const std::vec
 
 }  // namespace
 
-constinit const RodKernels ROD_KERNELS = {solve_range<ROD_LANES, RodReader>, solve_range<ROD_LANES, GeneralRodReader>};
+constinit const RodKernels ROD_KERNELS = {solve_range<ROD_LANES, RodReader>,
+                                          solve_range<ROD_LANES, GeneralRodReader>};
 
 }  // namespace sim_core

@@ -1,4 +1,7 @@
-"""Checks of runs: each catches a run that is wrong, and names itself; its values are those of the geometry."""
+"""Checks of runs: each catches a run that is wrong, and names itself.
+
+Its values are those of the geometry.
+"""
 
 import math
 
@@ -32,7 +35,9 @@ def sheet(height: float, held: ArrayLike = ()) -> tuple[Cloth, np.ndarray]:
 def gradients(cloth: Cloth) -> Floats:
     """Return the deformation gradients (T, 3, 2)."""
     triangles, rest, at = np.asarray(cloth.mesh.triangles), cloth.mesh.rest, cloth.positions
-    before, after = (np.moveaxis(x[triangles[:, 1:]] - x[triangles[:, :1]], 1, 2) for x in (rest, at))
+    before, after = (
+        np.moveaxis(x[triangles[:, 1:]] - x[triangles[:, :1]], 1, 2) for x in (rest, at)
+    )
     found: Floats = after @ np.linalg.inv(before)
     return found
 
@@ -56,7 +61,10 @@ def test_a_sheet_on_a_floor_passes_all() -> None:
 
 
 def test_stretch_is_the_largest_principal_one() -> None:
-    """The held triangles are stretched by 1.3; those at the free corner, which stays behind, a little more."""
+    """The held triangles are stretched by 1.3.
+
+    Those at the free corner, which stays behind, a little more.
+    """
     cloth, start = sheet(0.0, HELD)
     cloth.step(0.01, held=(start * [1.3, 0.9, 1.0])[:-1])
     largest = np.sort([np.linalg.norm(gradient, 2) for gradient in gradients(cloth)])
@@ -130,7 +138,12 @@ def test_the_reason_is_the_cause_and_not_what_follows() -> None:
     """A holder driven through a floor stretches the cloth, and no step fits its jerks."""
     cloth, _ = sheet(0.0)
     good = dict(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))
-    assert checks.failed({**good, "missed": 0.71, "stretch": 6.4, "penetration": 6.4})[0] == "penetration"
+    assert (
+        checks.failed({**good, "missed": 0.71, "stretch": 6.4, "penetration": 6.4})[0]
+        == "penetration"
+    )
     assert checks.failed({**good, "missed": 1.5, "stretch": 6.4, "passages": 1.0})[0] == "passages"
-    assert checks.failed({**good, "missed": 0.58, "stretch": 2.9, "sharpness": 12.5})[0] == "stretch"
+    assert (
+        checks.failed({**good, "missed": 0.58, "stretch": 2.9, "sharpness": 12.5})[0] == "stretch"
+    )
     assert checks.failed({**good, "missed": 0.58})[0] == "missed"

@@ -22,7 +22,9 @@ TOP = np.flatnonzero(STRIP.rest[:, 1] > 0.1 - 1e-9)
 
 
 def swing(
-    frame_rate: float, preset: SolverSettings = CERTIFIED, grasp: tuple[float, float] = (0.0, np.inf)
+    frame_rate: float,
+    preset: SolverSettings = CERTIFIED,
+    grasp: tuple[float, float] = (0.0, np.inf),
 ) -> ClothRun:
     """A strip swings about its upper edge for 1 s, and is let go at the end of the grasp."""
     down = 0.1 - STRIP.rest[:, 1]
@@ -42,7 +44,9 @@ def swing(
 
 
 def shaken(frame_rate: float) -> ClothRun:
-    """A patch lies on a floor that shakes at 32 Hz, with its frames at the same place of each period."""
+    """A patch lies on a floor that shakes at 32 Hz, with its frames at the same place of each
+    period.
+    """
 
     def bodies(time: float) -> list[Body]:
         return [plane(1.0, origin=(2e-3 * (1.0 - np.cos(64.0 * np.pi * time)), 0.0, 0.0))]
@@ -62,14 +66,19 @@ def shaken(frame_rate: float) -> ClothRun:
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("run", [swing, shaken, lambda rate: swing(rate, replace(CERTIFIED, step_error=None))])
+@pytest.mark.parametrize(
+    "run", [swing, shaken, lambda rate: swing(rate, replace(CERTIFIED, step_error=None))]
+)
 def test_every_frame_rate_films_the_same_run(run: Callable[[float], ClothRun]) -> None:
     reference = run(100)
     for rate in (1, 2, 10, 50):
         filmed = run(rate)
         assert filmed.labels["steps"] == reference.labels["steps"]
         assert filmed.positions.tobytes() == reference.positions[:: 100 // rate].tobytes()
-        assert filmed.record["contact_force"].tobytes() == reference.record["contact_force"][:: 100 // rate].tobytes()
+        assert (
+            filmed.record["contact_force"].tobytes()
+            == reference.record["contact_force"][:: 100 // rate].tobytes()
+        )
 
 
 @pytest.mark.physics
@@ -81,9 +90,15 @@ def test_a_floor_that_shakes_between_frames_moves_the_cloth() -> None:
 
 
 def watched(
-    bodies: Callable[[float], list[Body]], end: float, preset: SolverSettings = CERTIFIED, held: tuple[int, ...] = ()
+    bodies: Callable[[float], list[Body]],
+    end: float,
+    preset: SolverSettings = CERTIFIED,
+    held: tuple[int, ...] = (),
 ) -> tuple[Cloth, Floats]:
-    """A patch lies at rest on bodies that begin to move later; return its mean x at 200 frames a second [m]."""
+    """A patch lies at rest on bodies that begin to move later.
+
+    Return its mean x at 200 frames a second [m].
+    """
     cloth = Cloth(PATCH, MATERIAL, preset, held=held, kernel="baseline")
     start = np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))])
     cloth.set_state(start, bodies=bodies(0.0))
@@ -120,10 +135,14 @@ def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> N
 
 @pytest.mark.physics
 @pytest.mark.parametrize("far", [1.0, 0.01, 0.0006])
-@pytest.mark.parametrize("preset", [CERTIFIED, replace(CERTIFIED, step_error=None)], ids=["steps", "fixed"])
+@pytest.mark.parametrize(
+    "preset", [CERTIFIED, replace(CERTIFIED, step_error=None)], ids=["steps", "fixed"]
+)
 def test_jumps_are_not_valid(far: float, preset: SolverSettings) -> None:
     """A body or a holder that is elsewhere from one instant to the next."""
-    jumps = watched(lambda time: [plane(1.0, origin=(0.0, 0.0, far * (time >= 0.3)))], 0.4, preset)[0]
+    jumps = watched(lambda time: [plane(1.0, origin=(0.0, 0.0, far * (time >= 0.3)))], 0.4, preset)[
+        0
+    ]
     assert checks.failed(checks.values(checks.Seen(jumps, jumps.positions[None], 0)))[0] == "jumps"
 
 
@@ -143,7 +162,8 @@ def test_what_moves_evenly_is_valid() -> None:
 
 @pytest.mark.physics
 def test_between_steps_frames_are_cubic() -> None:
-    """A falling cloth is at rest in its own frame: -g t^2/2, less what implicit Euler adds in steps of dt: -g t dt/2.
+    """A falling cloth is at rest in its own frame: -g t^2/2, less what implicit Euler adds in steps
+    of dt: -g t dt/2.
 
     The cubic with the velocities at both ends is off by 0.1 g dt^2/2 at most [Hermite].
     """

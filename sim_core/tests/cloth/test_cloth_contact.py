@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stickslip_sim_core import Body, Cloth, box, capsule, fabric, isotropic, plane, preset_named, sphere
+from stickslip_sim_core import (
+    Body,
+    Cloth,
+    box,
+    capsule,
+    fabric,
+    isotropic,
+    plane,
+    preset_named,
+    sphere,
+)
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.solver import GRAVITY
@@ -51,14 +61,19 @@ class TestFriction:
     @pytest.mark.parametrize("mu", [0.1, 0.5, 1.5])
     @pytest.mark.parametrize("mesh", [PATCH, SCATTERED], ids=["grid", "unstructured"])
     def test_patch_beyond_it_accelerates(self, mesh: Mesh, mu: float) -> None:
-        """With g (sin a - mu cos a), to 0.5 %; the force that residuals are measured in has to be small beside that."""
+        """With g (sin a - mu cos a), to 0.5 %.
+
+        The force that residuals are measured in has to be small beside that.
+        """
         angle = 1.1 * np.arctan(mu)
         cloth = laid(mesh, force_scale=0.01 * MATERIAL.density * mesh.spacing**2 * GRAVITY)
         cloth.gravity[:] = tilted(angle)
         for _ in range(25):
             cloth.step(0.02, bodies=[plane(mu)])
         speed = np.linalg.norm(cloth.masses @ cloth.velocities) / cloth.masses.sum()
-        assert speed / 0.5 == pytest.approx(GRAVITY * (np.sin(angle) - mu * np.cos(angle)), rel=5e-3)
+        assert speed / 0.5 == pytest.approx(
+            GRAVITY * (np.sin(angle) - mu * np.cos(angle)), rel=5e-3
+        )
         assert cloth.sliding.all()
         assert cloth.total.unconverged == 0
 
@@ -67,7 +82,9 @@ class TestFriction:
         cloth.gravity[:] = tilted(0.3)
         for _ in range(10):
             cloth.step(0.02, bodies=[plane(0.0)])
-        assert np.linalg.norm(cloth.velocities, axis=1) == pytest.approx(0.2 * GRAVITY * np.sin(0.3), rel=1e-3)
+        assert np.linalg.norm(cloth.velocities, axis=1) == pytest.approx(
+            0.2 * GRAVITY * np.sin(0.3), rel=1e-3
+        )
 
     def test_a_tilted_plane_is_tilted_gravity(self) -> None:
         """The same patch, in axes that are turned, comes as far."""
@@ -87,7 +104,9 @@ class TestFriction:
     def test_each_sheet_has_its_own(self) -> None:
         """Two sheets slide on one floor, each as far as its own friction lets it."""
         patch = meshes.grid(0.05, 0.05, 4, 4)
-        cloth = Cloth(meshes.together(patch, patch), [MATERIAL, MATERIAL], preset_named("certified"))
+        cloth = Cloth(
+            meshes.together(patch, patch), [MATERIAL, MATERIAL], preset_named("certified")
+        )
         at = np.column_stack([patch.rest, np.zeros(len(patch.rest))])
         start = np.concatenate([at, at + np.array([0.0, 0.1, 0.0])])
         cloth.set_state(start, np.tile([1.0, 0.0, 0.0], (len(start), 1)))
@@ -98,12 +117,20 @@ class TestFriction:
         assert way[1] == pytest.approx(1.0 / (2.0 * 1.0 * GRAVITY), rel=0.02)
 
     def test_each_body_has_its_own(self) -> None:
-        """A box is pulled from under a patch: a rough one takes it along, a smooth one does not, whatever the floor."""
+        """A box is pulled from under a patch: a rough one takes it along, a smooth one does not,
+        whatever the floor.
+        """
         rough, smooth = laid(meshes.grid(0.05, 0.05, 4, 4)), laid(meshes.grid(0.05, 0.05, 4, 4))
         for step in range(26):
             moved = 0.5 * (0.02 * step) ** 2 * 2.0  # 2 m/s^2
             for cloth, mu in ((rough, 0.5), (smooth, 0.1)):
-                cloth.step(0.02, bodies=[plane(0.9, origin=(0, 0, -1.0)), box(mu, (1, 1, 1), origin=(moved, 0, -0.5))])
+                cloth.step(
+                    0.02,
+                    bodies=[
+                        plane(0.9, origin=(0, 0, -1.0)),
+                        box(mu, (1, 1, 1), origin=(moved, 0, -0.5)),
+                    ],
+                )
                 assert (cloth.contacts == 1).all()
         assert rough.positions[:, 0].mean() == pytest.approx(0.25, abs=2e-5)
         assert smooth.velocities[:, 0].mean() == pytest.approx(0.1 * GRAVITY * 0.5, rel=2e-3)
@@ -142,13 +169,20 @@ class TestBodies:
         limp = Cloth(PATCH, isotropic(0.2, 200.0, 1e-8), CERTIFIED)
         limp.set_state(np.column_stack([PATCH.rest, 0.004 + slope * np.abs(PATCH.rest[:, 0])]))
         for _ in range(60):
-            limp.step(0.02, bodies=[plane(0.2, normal=(side * slope, 0.0, 1.0)) for side in (1.0, -1.0)], damping=5.0)
+            limp.step(
+                0.02,
+                bodies=[plane(0.2, normal=(side * slope, 0.0, 1.0)) for side in (1.0, -1.0)],
+                damping=5.0,
+            )
         assert limp.total.unconverged == 0
         assert limp.reactions[:, 2].sum() == pytest.approx(limp.masses.sum() * GRAVITY, rel=0.01)
         assert 0.99e-3 * (np.hypot(1.0, slope) - 1.0) < limp.positions[:, 2].min() < 1.5e-3
 
     def test_wall_pushes_over_a_floor(self) -> None:
-        """In the corner both bear: the wall's work is its own, and no gain of contact; the floor rubs with mu."""
+        """In the corner both bear: the wall's work is its own, and no gain of contact.
+
+        The floor rubs with mu.
+        """
         cloth = laid()
         gravity = np.tile([0.0, 0.0, -GRAVITY], (len(PATCH.rest), 1))
 
@@ -172,7 +206,9 @@ class TestBodies:
         """Half a turn about x maps a box onto itself."""
         first = self.fall([box(0.5, (0.06, 0.06, 0.1))], 20)
         second = self.fall([box(0.5, (0.06, 0.06, 0.1), rotation=turn(0, np.pi))], 20)
-        assert second.positions == pytest.approx(first.positions, abs=2e-3)  # corners buckle as they like
+        assert second.positions == pytest.approx(
+            first.positions, abs=2e-3
+        )  # corners buckle as they like
 
     def test_nothing_tunnels_at_speed(self) -> None:
         cloth = laid(height=0.5)
@@ -195,7 +231,9 @@ class TestBodies:
 
 class TestBalances:
     def test_momentum(self) -> None:
-        """Forces of floor and holders are M a less the weight, at every vertex to the preset's tolerance."""
+        """Forces of floor and holders are M a less the weight, at every vertex to the preset's
+        tolerance.
+        """
         held = np.array([0, 8])
         cloth = laid(height=0.01, held=held)
         ends = cloth.positions[held]
@@ -207,7 +245,9 @@ class TestBalances:
             pushed = cloth.reactions
             free_floating = (cloth.contacts < 0) & ~np.isin(np.arange(len(pushed)), held)
             assert pushed.sum(axis=0) == pytest.approx(inertia, abs=1e-10)
-            assert np.abs(pushed[free_floating]).max(initial=0.0) <= 1e-3 * cloth.force_scale * 1.001
+            assert (
+                np.abs(pushed[free_floating]).max(initial=0.0) <= 1e-3 * cloth.force_scale * 1.001
+            )
         touching = cloth.contacts == 0
         assert touching.sum() > 10
         along = np.linalg.norm(pushed[touching][:, :2], axis=1)
@@ -221,26 +261,37 @@ class TestBalances:
         for _ in range(20):
             cloth.step(0.01)
         fallen = np.tile([0.0, 0.0, -GRAVITY * 1e-4 * 210], (len(start), 1))
-        assert cloth.positions - start == pytest.approx(fallen, abs=2e-7)  # corrections are of single precision
+        assert cloth.positions - start == pytest.approx(
+            fallen, abs=2e-7
+        )  # corrections are of single precision
         assert cloth.velocities[:, 2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
 
     def test_energy_does_not_grow(self) -> None:
-        """A crumpled cloth that falls on the floor only ever loses; friction and implicit Euler both take."""
+        """A crumpled cloth that falls on the floor only ever loses.
+
+        Friction and implicit Euler both take.
+        """
         mesh = meshes.grid(0.1, 0.1, 8, 8)
         cloth = Cloth(mesh, isotropic(0.2, 100.0, 2e-5), CERTIFIED)
-        at = np.column_stack([mesh.rest[:, 0], 0.01 * np.sin(60.0 * mesh.rest[:, 0]), 0.08 + 0.9 * mesh.rest[:, 1]])
+        at = np.column_stack(
+            [mesh.rest[:, 0], 0.01 * np.sin(60.0 * mesh.rest[:, 0]), 0.08 + 0.9 * mesh.rest[:, 1]]
+        )
         cloth.set_state(at)
 
         def total() -> float:
             membrane, bending, _ = cloth._solver.energies(cloth.positions)
             moving = 0.5 * (cloth.masses @ (cloth.velocities**2).sum(axis=1))
-            return float(membrane + bending + moving + GRAVITY * cloth.masses @ cloth.positions[:, 2])
+            return float(
+                membrane + bending + moving + GRAVITY * cloth.masses @ cloth.positions[:, 2]
+            )
 
         energies = [total()]
         for _ in range(100):
             cloth.step(0.01, bodies=[plane(0.3)])
             energies.append(total())
-        slack = 1e-3 * cloth.force_scale * len(at) * 0.01  # residuals times what a vertex may move in a step
+        slack = (
+            1e-3 * cloth.force_scale * len(at) * 0.01
+        )  # residuals times what a vertex may move in a step
         assert np.diff(energies).max() < slack
         assert energies[-1] < 0.5 * energies[0]
 
@@ -249,7 +300,10 @@ class TestBalances:
             cloth = laid(SCATTERED, 0.02, held=[0])
             ends = cloth.positions[[0]]
             for step in range(40):
-                bodies = [plane(0.3), sphere(0.6, 0.03, origin=(0.0, 0.0, -0.02), rotation=turn(2, 0.05 * step))]
+                bodies = [
+                    plane(0.3),
+                    sphere(0.6, 0.03, origin=(0.0, 0.0, -0.02), rotation=turn(2, 0.05 * step)),
+                ]
                 cloth.step(0.02, held=ends + np.array([0.001 * step, 0.0, 0.0]), bodies=bodies)
             return cloth.positions.tobytes(), cloth.reactions.tobytes()
 
@@ -301,7 +355,10 @@ class TestRefusals:
             box(0.1, (1.0, 0.0, 1.0))
         with pytest.raises(ValueError, match="size: must be three finite lengths > 0"):
             box(0.1, (1.0, 1.0))
-        with pytest.raises(ValueError, match=r"rounding: must be at most half the shortest edge, 0\.01 m, got 0\.02"):
+        with pytest.raises(
+            ValueError,
+            match=r"rounding: must be at most half the shortest edge, 0\.01 m, got 0\.02",
+        ):
             box(0.1, (1.0, 1.0, 0.02), rounding=0.02)
         with pytest.raises(ValueError, match="length: must be finite and > 0, got 0"):
             capsule(0.1, 0.01, 0.0)
@@ -317,12 +374,36 @@ class TestRefusals:
         ("rest", "triangles", "message"),
         [
             ([[0, 0], [1, 0]], [[0, 1, 1]], "rest: must hold at least 3 vertices, got 2"),
-            ([[0, 0], [1, 0], [0, np.nan]], [[0, 1, 2]], "rest: must be finite, and vertex 2 is not"),
-            ([[0, 0], [1, 0], [2, 0]], [[0, 1, 2]], "triangles: must run counter-clockwise and not be slivers"),
-            ([[0, 0], [1, 0], [0, 1]], [[0, 1, -3]], "triangles: must index 3 vertices, got -3 in triangle 0"),
-            ([[0, 0], [1, 0], [0, 1], [5, 5]], [[0, 1, 3], [0, 2, 1]], "triangles: must run counter-clockwise"),
-            ([[0, 0], [1, 0], [0, 1], [5, 5]], [[0, 1, 2]], "rest: every vertex must belong to a triangle, and 3"),
-            ([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]], "triangles: the nodes around edge"),
+            (
+                [[0, 0], [1, 0], [0, np.nan]],
+                [[0, 1, 2]],
+                "rest: must be finite, and vertex 2 is not",
+            ),
+            (
+                [[0, 0], [1, 0], [2, 0]],
+                [[0, 1, 2]],
+                "triangles: must run counter-clockwise and not be slivers",
+            ),
+            (
+                [[0, 0], [1, 0], [0, 1]],
+                [[0, 1, -3]],
+                "triangles: must index 3 vertices, got -3 in triangle 0",
+            ),
+            (
+                [[0, 0], [1, 0], [0, 1], [5, 5]],
+                [[0, 1, 3], [0, 2, 1]],
+                "triangles: must run counter-clockwise",
+            ),
+            (
+                [[0, 0], [1, 0], [0, 1], [5, 5]],
+                [[0, 1, 2]],
+                "rest: every vertex must belong to a triangle, and 3",
+            ),
+            (
+                [[0, 0], [1, 0], [1, 1], [0, 1]],
+                [[0, 1, 2], [0, 2, 3]],
+                "triangles: the nodes around edge",
+            ),
         ],
     )
     def test_mesh(self, rest: object, triangles: object, message: str) -> None:

@@ -42,17 +42,23 @@ def waved(mesh: Mesh) -> Floats:
     """Bent and stretched by a few per cent, with no symmetry."""
     x, y = mesh.rest.T
     noise = np.random.default_rng(0).normal(0.0, 1e-4, (len(x), 3))
-    return np.column_stack([1.03 * x + 0.1 * y, 0.98 * y, 0.01 * np.sin(100.0 * x + 60.0 * y)]) + noise
+    return (
+        np.column_stack([1.03 * x + 0.1 * y, 0.98 * y, 0.01 * np.sin(100.0 * x + 60.0 * y)]) + noise
+    )
 
 
 def folded(mesh: Mesh) -> Floats:
-    """Folded back over a cylinder whose radius is less than a cell: nearly 180 degrees over one edge."""
+    """Folded back over a cylinder whose radius is less than a cell: nearly 180 degrees over one
+    edge.
+    """
     x, y = mesh.rest.T
     radius = 0.002
     angle = np.clip(y / radius, 0.0, np.pi)
     beyond = np.maximum(y - np.pi * radius, 0.0)
     noise = np.random.default_rng(1).normal(0.0, 1e-4, (len(x), 3))
-    at = np.column_stack([x, np.minimum(y, 0.0) + radius * np.sin(angle) - beyond, radius * (1.0 - np.cos(angle))])
+    at = np.column_stack(
+        [x, np.minimum(y, 0.0) + radius * np.sin(angle) - beyond, radius * (1.0 - np.cos(angle))]
+    )
     return at + noise
 
 
@@ -63,7 +69,9 @@ STATES: dict[str, Callable[[Mesh], Floats]] = {"flat": flat, "waved": waved, "fo
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("name", MESHES)
 def test_gradient(name: str, state: str, material: str) -> None:
-    """Of the table's law, too, whose third derivative jumps at no strain: differences are small there."""
+    """Of the table's law, too, whose third derivative jumps at no strain: differences are small
+    there.
+    """
     mesh = MESHES[name]
     cloth = cloth_of(mesh, SHEET if material == "isotropic" else fabric(material))
     at = STATES[state](mesh)
@@ -75,16 +83,23 @@ def test_gradient(name: str, state: str, material: str) -> None:
         ends = [total(cloth, at + sign * h * direction) for sign in (2.0, 1.0, -1.0, -2.0)]
         difference = (-ends[0] + 8.0 * ends[1] - 8.0 * ends[2] + ends[3]) / (12.0 * h)
         scale = float(np.linalg.norm(gradient)) + 1e-6
-        assert float((gradient * direction).sum()) == pytest.approx(difference, abs=2e-6 * scale, rel=2e-6)
+        assert float((gradient * direction).sum()) == pytest.approx(
+            difference, abs=2e-6 * scale, rel=2e-6
+        )
 
 
 @pytest.mark.parametrize(
     ("material", "state"),
-    [("isotropic", "flat"), *((m, s) for m in ("isotropic", "navy-sparkle-sweat") for s in ("waved", "folded"))],
+    [
+        ("isotropic", "flat"),
+        *((m, s) for m in ("isotropic", "navy-sparkle-sweat") for s in ("waved", "folded")),
+    ],
 )
 @pytest.mark.parametrize("name", MESHES)
 def test_matrix(name: str, state: str, material: str) -> None:
-    """The matrix, in single precision, is the gradient's derivative and symmetric, folded by 180 degrees, too."""
+    """The matrix, in single precision, is the gradient's derivative and symmetric, folded by 180
+    degrees, too.
+    """
     mesh = MESHES[name]
     of = SHEET if material == "isotropic" else fabric(material)
     cloth = cloth_of(mesh, of)
@@ -154,7 +169,9 @@ def test_pure_bending(poisson: float) -> None:
     at = flat(mesh)
     at[:, 2] = 0.5 * mesh.rest[:, 1] ** 2
     bending = energy(cloth, at)[1] / (0.02 * 0.1 * 0.5 * 1e-5)
-    assert (1.0 - poisson**2) * 0.9 < bending < 1.0 + 1e-9  # triangles at the ends are free to lie flat
+    assert (
+        (1.0 - poisson**2) * 0.9 < bending < 1.0 + 1e-9
+    )  # triangles at the ends are free to lie flat
 
 
 @pytest.mark.parametrize("kind", [*DIAGONALS[:2], 0, 1])
@@ -162,7 +179,12 @@ def test_linear_plate(kind: MeshKind) -> None:
     """The tip of a horizontal cantilever, nu = 0, sags by rho g L^4 / 8D: to 0.08 %."""
     clamped = strip(0.02, 50, kind)
     density, rigidity, g = 0.2, 1e-5, 9.81
-    cloth = Cloth(clamped.mesh, isotropic(density, 500.0, rigidity), preset_named("certified"), held=clamped.held)
+    cloth = Cloth(
+        clamped.mesh,
+        isotropic(density, 500.0, rigidity),
+        preset_named("certified"),
+        held=clamped.held,
+    )
     at = flat(clamped.mesh)
     free = np.setdiff1d(np.arange(len(at)), clamped.held)
     K = np.empty((len(free), len(free)))
@@ -172,4 +194,6 @@ def test_linear_plate(kind: MeshKind) -> None:
         K[:, column] = energy(cloth, moved)[2][free, 2] / 1e-7
     sag = np.zeros(len(at))
     sag[free] = np.linalg.solve(K, cloth.masses[free] * g)
-    assert sag[clamped.tip].mean() == pytest.approx(density * g * LENGTH**4 / (8.0 * rigidity), rel=8e-4)
+    assert sag[clamped.tip].mean() == pytest.approx(
+        density * g * LENGTH**4 / (8.0 * rigidity), rel=8e-4
+    )

@@ -13,7 +13,9 @@ CERTIFIED = PRESETS["certified"]
 
 
 def mesh_of(rest: list[tuple[float, float]], triangles: list[tuple[int, int, int]]) -> meshes.Mesh:
-    return meshes.Mesh(np.array(rest, float).reshape(-1, 2), np.array(triangles, np.int32).reshape(-1, 3))
+    return meshes.Mesh(
+        np.array(rest, float).reshape(-1, 2), np.array(triangles, np.int32).reshape(-1, 3)
+    )
 
 
 SQUARE = [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, 0.1)]
@@ -25,9 +27,18 @@ SQUARE = [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, 0.1)]
         (mesh_of(SQUARE, [(0, 2, 1), (0, 3, 2)]), "triangles: must run counter-clockwise"),
         (mesh_of(SQUARE, [(0, 1, 4)]), "triangles: must index 4 vertices, got 4"),
         (mesh_of(SQUARE, []), "triangles: must not be empty"),
-        (mesh_of([*SQUARE, (0.05, 1e-6)], [(0, 1, 4), (0, 1, 2), (0, 2, 3)]), "triangles: .*slivers"),
-        (mesh_of([*SQUARE, (0.5, 0.5)], [(0, 1, 2), (0, 2, 3)]), "rest: every vertex must belong to a triangle, and 4"),
-        (mesh_of([*SQUARE[:3], (math.nan, 0.0)], [(0, 1, 2), (0, 2, 3)]), "rest: must be finite, and vertex 3 is not"),
+        (
+            mesh_of([*SQUARE, (0.05, 1e-6)], [(0, 1, 4), (0, 1, 2), (0, 2, 3)]),
+            "triangles: .*slivers",
+        ),
+        (
+            mesh_of([*SQUARE, (0.5, 0.5)], [(0, 1, 2), (0, 2, 3)]),
+            "rest: every vertex must belong to a triangle, and 4",
+        ),
+        (
+            mesh_of([*SQUARE[:3], (math.nan, 0.0)], [(0, 1, 2), (0, 2, 3)]),
+            "rest: must be finite, and vertex 3 is not",
+        ),
         (
             mesh_of([*SQUARE, (0.2, 0.0)], [(0, 1, 2), (0, 2, 3), (0, 4, 2)]),
             r"triangles: edge \(.*\) must belong to at most",
@@ -63,12 +74,16 @@ def test_nan_is_refused() -> None:
 
 
 def test_lost_state_is_counted_and_does_not_crash() -> None:
-    """A solver that is cut off after one iteration, without smaller steps, loses a cloth that is torn to pieces."""
+    """A solver that is cut off after one iteration, without smaller steps, loses a cloth that is
+    torn to pieces.
+    """
     mesh = meshes.grid(0.1, 0.1, 6, 6)
     hopeless = dataclasses.replace(CERTIFIED, newton_max=1, halvings_max=0)
     cloth = Cloth(mesh, fabric("gray-interlock"), hopeless)
     at = np.random.default_rng(0).normal(size=(len(mesh.rest), 3))
-    floor = plane(0.5, origin=(0.0, 0.0, at[:, 2].min() - 0.1))  # a state that begins in a body would be refused
+    floor = plane(
+        0.5, origin=(0.0, 0.0, at[:, 2].min() - 0.1)
+    )  # a state that begins in a body would be refused
     cloth.set_state(at, 1e160 * at)
     for _ in range(3):
         cloth.step(0.1, bodies=[floor])

@@ -1,4 +1,6 @@
-"""Closest points, candidates and step bounds: finite differences, brute force, and ipctk as an oracle."""
+"""Closest points, candidates and step bounds: finite differences, brute force, and ipctk as an
+oracle.
+"""
 
 import math
 
@@ -153,14 +155,20 @@ def crumpled(seed: int, size: float = 0.03) -> tuple[Floats, NDArray[np.int32]]:
 def apart() -> dict[tuple[int, ...], float]:
     """The distance of each pair of a crumpled sheet: (0, vertex, triangle), then (1, edge, edge)."""
     x, triangles = crumpled(5)
-    edges = np.unique(np.sort(np.concatenate([triangles[:, p] for p in ([0, 1], [1, 2], [2, 0])]), axis=1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([triangles[:, p] for p in ([0, 1], [1, 2], [2, 0])]), axis=1), axis=0
+    )
     pairs = [(0, vertex, *corners) for vertex in range(len(x)) for corners in triangles.tolist()]
     pairs += [(1, *a, *b) for i, a in enumerate(edges.tolist()) for b in edges[i + 1 :].tolist()]
-    return {pair: distance(pair[0] == 1, x[[*pair[1:]]]) for pair in pairs if len(set(pair[1:])) == 4}
+    return {
+        pair: distance(pair[0] == 1, x[[*pair[1:]]]) for pair in pairs if len(set(pair[1:])) == 4
+    }
 
 
 @pytest.mark.parametrize("reach", [1e-3, 5e-3, 0.02])
-def test_candidates_are_those_of_brute_force(apart: dict[tuple[int, ...], float], reach: float) -> None:
+def test_candidates_are_those_of_brute_force(
+    apart: dict[tuple[int, ...], float], reach: float
+) -> None:
     x, triangles = crumpled(5)
     found = [tuple(pair) for pair in core.contact_candidates(triangles, x, reach)]
     assert len(found) > 10
@@ -186,7 +194,9 @@ def test_nothing_crosses_on_a_capped_way(seed: int, way: float) -> None:
             np.column_stack([b.rest, np.full(len(b.rest), 0.006)]),
         ]
     )
-    towards = np.where(np.arange(len(x)) < len(a.rest), 1.0, -1.0)[:, None] * np.array([0.0, 0.0, way])
+    towards = np.where(np.arange(len(x)) < len(a.rest), 1.0, -1.0)[:, None] * np.array(
+        [0.0, 0.0, way]
+    )
     to = x + towards + way * rng.normal(size=x.shape) + 3.0 * way
     assert self_intersections(to, triangles) > 0
     end = core.cap_motion(triangles, x, to, 5e-4, 0.002)

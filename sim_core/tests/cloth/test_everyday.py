@@ -7,7 +7,8 @@ pytestmark = pytest.mark.physics
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "squeezed" else ()) for name in EVERYDAY]
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "squeezed" else ()) for name in EVERYDAY],
 )
 def test_everyday_scene(name: str) -> None:
     scene, allowed = EVERYDAY[name]

@@ -5,7 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stickslip_sim_core import PRESETS, Cloth, custom_fabric, fabric, fabric_names, isotropic, preset_named
+from stickslip_sim_core import (
+    PRESETS,
+    Cloth,
+    custom_fabric,
+    fabric,
+    fabric_names,
+    isotropic,
+    preset_named,
+)
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
 
@@ -17,7 +25,9 @@ def test_ten_fabrics() -> None:
 
 @pytest.mark.parametrize("name", fabric_names())
 def test_fabric_is_stable(name: str) -> None:
-    """Its energies are positive: a quadratic form in (G00, G11) at every strain of the table, and in the curvature."""
+    """Its energies are positive: a quadratic form in (G00, G11) at every strain of the table, and
+    in the curvature.
+    """
     one = fabric(name)
     assert one.name == name
     assert 0.05 < one.density < 1.0
@@ -34,7 +44,10 @@ def test_fabric_is_stable(name: str) -> None:
 
 
 def test_isotropic() -> None:
-    """Pulled along one axis, free along the other, it has Young's modulus; curvatures couple by Poisson's ratio."""
+    """Pulled along one axis, free along the other, it has Young's modulus.
+
+    Curvatures couple by Poisson's ratio.
+    """
     cloth = isotropic(0.2, 100.0, 1e-5, 0.3)
     k0, k1, k2, k3 = cloth.stretching[0]
     assert k0 == k2
@@ -67,9 +80,18 @@ def test_unknown_names() -> None:
 
 
 def test_presets() -> None:
-    assert set(PRESETS) == {"certified", "fast", "fine", "thesis-high", "thesis-low-small-dt", "thesis-low-big-dt"}
+    assert set(PRESETS) == {
+        "certified",
+        "fast",
+        "fine",
+        "thesis-high",
+        "thesis-low-small-dt",
+        "thesis-low-big-dt",
+    }
     assert all(preset_named(name).name == name for name in PRESETS)
-    assert [PRESETS[f"thesis-{name}"].time_step for name in ("high", "low-small-dt", "low-big-dt")] == [
+    assert [
+        PRESETS[f"thesis-{name}"].time_step for name in ("high", "low-small-dt", "low-big-dt")
+    ] == [
         5e-4,
         5e-4,
         1e-3,
@@ -82,18 +104,25 @@ class TestOwnFabric:
     TABLE = np.tile([100.0, 10.0, 80.0, 20.0], (6, 1))
 
     def test_table(self) -> None:
-        own = custom_fabric("own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1)
+        own = custom_fabric(
+            "own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1
+        )
         assert (own.stretching == self.TABLE).all()
         assert (own.rigidity == np.diag([2e-5, 1e-5, 5e-6])).all()
         assert own.damping == 0.1
-        assert (custom_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity == own.rigidity).all()
+        assert (
+            custom_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity
+            == own.rigidity
+        ).all()
 
     def test_young(self) -> None:
         """A plate of E, nu, h: Y = E h and D = E h^3 / (12 (1 - nu^2))."""
         own = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
         assert own.stretching[0, 0] == pytest.approx(1e6 * 4e-4 / (1.0 - 0.09))
         assert own.rigidity[0, 0] == pytest.approx(1e6 * 4e-4**3 / 12.0 / (1.0 - 0.09))
-        softer = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7))
+        softer = custom_fabric(
+            "own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7)
+        )
         assert softer.rigidity[0, 0] == 1e-6
 
     def test_scaled(self) -> None:
@@ -109,14 +138,22 @@ class TestOwnFabric:
         """The same numbers give the same motion, whether by name or not."""
         named = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=4).run()
         own = cloth_drag.scene(fabric("gray-interlock").scaled(), 0.5, mesh=7, frames=4).run()
-        heavy = cloth_drag.scene(fabric("gray-interlock").scaled(density=2.0), 0.5, mesh=7, frames=4).run()
+        heavy = cloth_drag.scene(
+            fabric("gray-interlock").scaled(density=2.0), 0.5, mesh=7, frames=4
+        ).run()
         assert own.positions.tobytes() == named.positions.tobytes()
-        assert heavy.record["holder_force"][0, 2] == pytest.approx(2.0 * named.record["holder_force"][0, 2])
+        assert heavy.record["holder_force"][0, 2] == pytest.approx(
+            2.0 * named.record["holder_force"][0, 2]
+        )
 
     def test_damping_slows_a_fall(self) -> None:
         """By v = (g/c)(1 - exp(-c t)), to first order in the step."""
         mesh = meshes.grid(0.1, 0.1, 4, 4)
-        cloth = Cloth(mesh, dataclasses.replace(fabric("gray-interlock"), damping=5.0), preset_named("certified"))
+        cloth = Cloth(
+            mesh,
+            dataclasses.replace(fabric("gray-interlock"), damping=5.0),
+            preset_named("certified"),
+        )
         cloth.set_state(np.column_stack([mesh.rest, np.ones(25)]))
         for _ in range(200):
             cloth.step(1e-3)
@@ -127,22 +164,42 @@ class TestOwnFabric:
         [
             ({"density": 0.0}, r"density: must be in \[0.001, 100\], got 0"),
             ({"density": float("nan")}, r"density: must be in \[0.001, 100\], got nan"),
-            ({"stretching": np.ones((5, 4))}, r"stretching: must be \(6, 4\) numbers of 0 ... 1e\+07 N/m"),
+            (
+                {"stretching": np.ones((5, 4))},
+                r"stretching: must be \(6, 4\) numbers of 0 ... 1e\+07 N/m",
+            ),
             ({"stretching": -TABLE}, r"stretching: must be \(6, 4\) numbers of 0"),
-            ({"stretching": np.ones((6, 4))}, r"stretching: must have k1\^2 < k0 k2 in every row, and row 0"),
-            ({"bending": (1e-5, -1e-5, 1e-5)}, r"rigidity, an eigenvalue: must be in \[1e-12, 10\], got -1e-05"),
+            (
+                {"stretching": np.ones((6, 4))},
+                r"stretching: must have k1\^2 < k0 k2 in every row, and row 0",
+            ),
+            (
+                {"bending": (1e-5, -1e-5, 1e-5)},
+                r"rigidity, an eigenvalue: must be in \[1e-12, 10\], got -1e-05",
+            ),
             ({"bending": (1e-5, 1e-5)}, r"rigidity: must be a symmetric \(3, 3\)"),
             ({"bending": None}, "bending: must be given with stretching"),
             ({"damping": -1.0}, r"damping: must be in \[0, 1000\], got -1"),
             ({"young": 1e6}, "stretching, young: must be one of both, got both"),
             ({"stretching": None}, "stretching, young: must be one of both, got neither"),
             ({"stretching": None, "young": 1e6}, "thickness: must be given with young"),
-            ({"stretching": None, "young": 1e6, "thickness": -1.0}, r"thickness: must be in \[1e-06, 0.1\], got -1"),
-            ({"stretching": None, "young": 1e6, "thickness": 1e-3, "poisson": 0.6}, r"poisson: must be in \[0, 0.5\]"),
+            (
+                {"stretching": None, "young": 1e6, "thickness": -1.0},
+                r"thickness: must be in \[1e-06, 0.1\], got -1",
+            ),
+            (
+                {"stretching": None, "young": 1e6, "thickness": 1e-3, "poisson": 0.6},
+                r"poisson: must be in \[0, 0.5\]",
+            ),
         ],
     )
     def test_refusals(self, numbers: dict[str, object], message: str) -> None:
-        good = {"name": "own", "density": 0.2, "stretching": self.TABLE, "bending": (1e-5, 1e-5, 1e-5)}
+        good = {
+            "name": "own",
+            "density": 0.2,
+            "stretching": self.TABLE,
+            "bending": (1e-5, 1e-5, 1e-5),
+        }
         with pytest.raises(ValueError, match=message):
             custom_fabric(**{**good, **numbers})  # type: ignore[arg-type]
 

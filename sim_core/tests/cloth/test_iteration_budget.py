@@ -1,8 +1,9 @@
 """How many iterations Newton's method takes where friction turns and follows the normal force.
 
-The counts are of the portable kernels, and repeat exactly. Without the share of friction in Newton's matrix, the
-sphere takes ten times as many. Without its share in what contact prescribes, the shaken floor takes a fifth more.
-Results stay right in both cases; only the cost grows. So they do where cloth slides over cloth.
+The counts are of the portable kernels, and repeat exactly. Without the share of friction in
+Newton's matrix, the sphere takes ten times as many. Without its share in what contact prescribes,
+the shaken floor takes a fifth more. Results stay right in both cases; only the cost grows. So they
+do where cloth slides over cloth.
 """
 
 import numpy as np
@@ -19,7 +20,9 @@ pytestmark = pytest.mark.physics
 def _cloth(cells: int, height: float, held: bool = False, kernel: str | None = "baseline") -> Cloth:
     mesh = meshes.grid(0.2, 0.2, cells, cells)
     edge = np.flatnonzero(mesh.rest[:, 0] < -0.0999) if held else np.array([], dtype=int)
-    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=edge, kernel=kernel)
+    cloth = Cloth(
+        mesh, fabric("gray-interlock"), preset_named("certified"), held=edge, kernel=kernel
+    )
     cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), height)]))
     return cloth
 
@@ -30,7 +33,12 @@ def test_on_a_sphere_that_turns() -> None:
     for step in range(60):
         angle = 0.05 * max(step - 25, 0)
         c, s = np.cos(angle), np.sin(angle)
-        ball = sphere(1.0, 0.05, origin=(0.0, 0.0, 0.05), rotation=[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        ball = sphere(
+            1.0,
+            0.05,
+            origin=(0.0, 0.0, 0.05),
+            rotation=[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
+        )
         cloth.step(0.02, bodies=[plane(1.0), ball])
     assert cloth.total.unconverged == 0
     assert cloth.total.newton < 3000
@@ -68,7 +76,10 @@ def test_with_a_factor_of_half_precision() -> None:
 
 
 def test_over_a_curved_cloth() -> None:
-    """Measured: 5.1 a step; where edges of both bear, too: 13.3; with pairs as stiff along normals as across: 11.3."""
+    """Measured: 5.1 a step.
+
+    Where edges of both bear, too: 13.3; with pairs as stiff along normals as across: 11.3.
+    """
     strip = OverCloth(0.5, 0.05, preset_named("certified"), 120)
     strip.draw()
     assert strip.cloth.total.unconverged == 0
@@ -79,7 +90,9 @@ def test_over_a_flat_cloth() -> None:
     """Measured: 30 in 30 steps; where vertices of both bear: 62; where edges do, too: 98."""
     sheet, below = meshes.grid(0.1, 0.1, 10, 10), meshes.grid(0.16, 0.12, 14, 11)
     held = np.flatnonzero(sheet.rest[:, 0] > 0.0499)
-    rim = len(sheet.rest) + np.flatnonzero((np.abs(below.rest) > np.abs(below.rest).max(axis=0) - 1e-9).any(axis=1))
+    rim = len(sheet.rest) + np.flatnonzero(
+        (np.abs(below.rest) > np.abs(below.rest).max(axis=0) - 1e-9).any(axis=1)
+    )
     cloth = Cloth(
         meshes.together(sheet, below),
         fabric("gray-interlock"),
@@ -89,7 +102,10 @@ def test_over_a_flat_cloth() -> None:
         kernel="baseline",
     )
     start = np.concatenate(
-        [np.column_stack([sheet.rest, np.full(len(sheet.rest), THICKNESS)]), np.pad(below.rest, ((0, 0), (0, 1)))]
+        [
+            np.column_stack([sheet.rest, np.full(len(sheet.rest), THICKNESS)]),
+            np.pad(below.rest, ((0, 0), (0, 1))),
+        ]
     )
     cloth.set_state(start)
     for step in range(1, 41):

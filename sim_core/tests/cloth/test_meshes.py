@@ -59,7 +59,9 @@ def test_grid_is_numbered_row_by_row() -> None:
 
 
 def test_diagonals_differ() -> None:
-    patterns = [MESHES[name].triangles.tolist() for name in ("alternating", "left", "right", "random")]
+    patterns = [
+        MESHES[name].triangles.tolist() for name in ("alternating", "left", "right", "random")
+    ]
     assert all(patterns[i] != patterns[j] for i in range(4) for j in range(i))
 
 
@@ -79,7 +81,9 @@ def test_unstructured_is_delaunay() -> None:
         a, b, c = mesh.rest[triangle]
         centre = np.linalg.solve(2.0 * np.stack([b - a, c - a]), [b @ b - a @ a, c @ c - a @ a])
         others = np.delete(np.arange(len(mesh.rest)), triangle)
-        assert np.linalg.norm(mesh.rest[others] - centre, axis=1).min() > np.linalg.norm(a - centre) * (1.0 - 1e-6)
+        assert np.linalg.norm(mesh.rest[others] - centre, axis=1).min() > np.linalg.norm(
+            a - centre
+        ) * (1.0 - 1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
@@ -97,7 +101,9 @@ def test_bad_counts_and_patterns() -> None:
         meshes.grid(1.0, 1.0, 0, 2)
     with pytest.raises(ValueError, match="rows: must be finite and > 0, got -1"):
         meshes.grid(1.0, 1.0, 2, -1)
-    with pytest.raises(ValueError, match="diagonals: must be alternating, left, right or random, got 'up'"):
+    with pytest.raises(
+        ValueError, match="diagonals: must be alternating, left, right or random, got 'up'"
+    ):
         meshes.grid(1.0, 1.0, 2, 2, "up")  # type: ignore[arg-type]
 
 

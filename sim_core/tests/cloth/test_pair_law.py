@@ -27,7 +27,9 @@ def law(
     proximal: tuple[float, float] = (KAPPA, LAMBDA),
     smoothing: float = 0.0,
 ) -> tuple[int, Floats, Floats, Floats, float]:
-    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(gap, n, slip, force, mu, K, *proximal, smoothing)
+    found: tuple[int, Floats, Floats, Floats, float] = core.pair_law(
+        gap, n, slip, force, mu, K, *proximal, smoothing
+    )
     return found
 
 
@@ -35,7 +37,11 @@ def law(
 def test_roots(seed: int) -> None:
     n, t, _ = frame(seed)
     zero = np.zeros(3)
-    roots = [(OPEN, 0.1, zero, zero), (STICK, 0.0, zero, 2.0 * n + 0.9 * t), (SLIP, 0.0, -0.3 * t, 2.0 * n + 1.0 * t)]
+    roots = [
+        (OPEN, 0.1, zero, zero),
+        (STICK, 0.0, zero, 2.0 * n + 0.9 * t),
+        (SLIP, 0.0, -0.3 * t, 2.0 * n + 1.0 * t),
+    ]
     for mode, gap, slip, force in roots:
         found = law(gap, n, slip, force, 0.5)
         assert found[0] == mode
@@ -91,7 +97,9 @@ def test_sticking_row() -> None:
     gap, slip = -0.01, 0.02 * t - 0.01 * s
     mode, stiffness, symmetric, force, _ = law(gap, n, slip, 2.0 * n, 0.5)
     assert mode == STICK
-    assert stiffness == pytest.approx(KAPPA * np.outer(n, n) + LAMBDA * (np.outer(t, t) + np.outer(s, s)))
+    assert stiffness == pytest.approx(
+        KAPPA * np.outer(n, n) + LAMBDA * (np.outer(t, t) + np.outer(s, s))
+    )
     assert symmetric == pytest.approx(stiffness)
     assert force == pytest.approx(-KAPPA * gap * n - LAMBDA * slip)
 
@@ -119,18 +127,26 @@ def test_slipping_row_is_newtons(seed: int) -> None:
     derivative = np.zeros(2)
     for direction, of_force in ((dr, True), (v - (v @ n) * n, False)):
         plus = missed(force + step * direction * of_force, slip + step * direction * (not of_force))
-        minus = missed(force - step * direction * of_force, slip - step * direction * (not of_force))
+        minus = missed(
+            force - step * direction * of_force, slip - step * direction * (not of_force)
+        )
         derivative += (plus - minus) / (2.0 * step)
     assert missed(force, slip) + derivative == pytest.approx(np.zeros(2), abs=1e-8)
     assert symmetric == pytest.approx(symmetric.T)
     unsymmetric = stiffness - symmetric
     assert np.linalg.matrix_rank(unsymmetric) == 1
     assert unsymmetric @ n == pytest.approx(
-        mu * KAPPA * (across @ (force - K * slip)) @ across / np.linalg.norm(across @ (force - K * slip))
+        mu
+        * KAPPA
+        * (across @ (force - K * slip))
+        @ across
+        / np.linalg.norm(across @ (force - K * slip))
     )
 
 
-def smoothed_missed(gap: float, n: Floats, slip: Floats, force: Floats, mu: float, epsilon: float) -> Floats:
+def smoothed_missed(
+    gap: float, n: Floats, slip: Floats, force: Floats, mu: float, epsilon: float
+) -> Floats:
     """By what a force misses the smoothed law, with rho by bisection."""
     pressing = force @ n
     z = pressing - K * gap
@@ -162,7 +178,9 @@ def test_smoothed_roots(epsilon: float) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_smoothed_row_is_newtons(seed: int) -> None:
-    """Without the proximal term, dr = force - stiffness v solves the linearised smoothed law, by finite differences."""
+    """Without the proximal term, dr = force - stiffness v solves the linearised smoothed law, by
+    finite differences.
+    """
     rng = np.random.default_rng(seed)
     n, t, s = frame(seed)
     mu, epsilon, gap = 0.4, 10.0 ** rng.uniform(-4.0, -1.0), 0.1 * rng.normal()
@@ -173,8 +191,12 @@ def test_smoothed_row_is_newtons(seed: int) -> None:
     assert error == pytest.approx(at @ at)
     v = 0.01 * rng.normal(size=3)
     dr, across, step = rhs - stiffness @ v, v - (v @ n) * n, 1e-7
-    plus = smoothed_missed(gap + step * float(v @ n), n, slip + step * across, force + step * dr, mu, epsilon)
-    minus = smoothed_missed(gap - step * float(v @ n), n, slip - step * across, force - step * dr, mu, epsilon)
+    plus = smoothed_missed(
+        gap + step * float(v @ n), n, slip + step * across, force + step * dr, mu, epsilon
+    )
+    minus = smoothed_missed(
+        gap - step * float(v @ n), n, slip - step * across, force - step * dr, mu, epsilon
+    )
     assert at + (plus - minus) / (2.0 * step) == pytest.approx(np.zeros(3), abs=1e-6)
     assert symmetric == pytest.approx(symmetric.T)
     assert np.linalg.eigvalsh(symmetric).min() >= 0.0
@@ -184,5 +206,8 @@ def test_smoothing_tends_to_the_law() -> None:
     n, t, s = frame(6)
     force, slip = 2.0 * n + 0.3 * t + 0.5 * s, -0.9 * t + 0.4 * s
     exact = law(0.0, n, slip, force, 0.4)
-    off = [abs(law(0.0, n, slip, force, 0.4, smoothing=epsilon)[4] - exact[4]) for epsilon in (1e-4, 1e-6, 1e-8)]
+    off = [
+        abs(law(0.0, n, slip, force, 0.4, smoothing=epsilon)[4] - exact[4])
+        for epsilon in (1e-4, 1e-6, 1e-8)
+    ]
     assert off[0] > 10.0 * off[1] > 100.0 * off[2] > 0.0

@@ -1,8 +1,9 @@
-"""Pairs of closest points from iterate to iterate: forces that pass on, slips, and which pairs bear.
+"""Pairs of closest points from iterate to iterate: forces that pass on, slips, and which pairs
+bear.
 
-The lowest corner of an upright sheet, which is held, presses on a corner of a level sheet, which is free and lies below
-it. All other vertices are held. Most tests let a step end after one iteration, by wide tolerances: the forces then show
-what the solver assumes before it iterates.
+The lowest corner of an upright sheet, which is held, presses on a corner of a level sheet, which is
+free and lies below it. All other vertices are held. Most tests let a step end after one iteration,
+by wide tolerances: the forces then show what the solver assumes before it iterates.
 """
 
 from dataclasses import replace
@@ -20,7 +21,11 @@ CERTIFIED = preset_named("certified")
 ONE_ITERATION = replace(
     CERTIFIED,
     name="one-iteration",
-    constants={"contact.length_tolerance": 1.0, "newton.linear_share": 1e-12, "newton.cuts_max": 1.0},
+    constants={
+        "contact.length_tolerance": 1.0,
+        "newton.linear_share": 1e-12,
+        "newton.cuts_max": 1.0,
+    },
 )
 H = 1e-3
 """Thickness [m]."""
@@ -30,17 +35,23 @@ MESH = meshes.together(SHEET, SHEET)
 CORNER = int(np.argmin(SHEET.rest.sum(axis=1)))
 HELD = np.delete(np.arange(len(MESH.rest)), CORNER)
 FROM_CORNER = SHEET.rest - SHEET.rest[CORNER]
-INWARD, ACROSS, UP = np.array([[0.5**0.5, 0.5**0.5, 0.0], [0.5**0.5, -(0.5**0.5), 0.0], [0.0, 0.0, 1.0]])
+INWARD, ACROSS, UP = np.array(
+    [[0.5**0.5, 0.5**0.5, 0.0], [0.5**0.5, -(0.5**0.5), 0.0], [0.0, 0.0, 1.0]]
+)
 LEVEL = FROM_CORNER @ np.eye(3)[:2]
 UPRIGHT = FROM_CORNER @ np.stack([ACROSS + UP, UP - ACROSS]) / np.sqrt(2.0)
 
 
 def places(inward: float, height: float) -> Floats:
-    """Return the vertices of both sheets [m], the upper corner this far from the lower one [thicknesses]."""
+    """Return the vertices of both sheets [m], the upper corner this far from the lower one
+    [thicknesses].
+    """
     return np.concatenate([LEVEL, UPRIGHT + H * (inward * INWARD + height * UP)])
 
 
-def corners(inward: float, height: float, mu: float = 0.0, preset: SolverSettings = ONE_ITERATION) -> Cloth:
+def corners(
+    inward: float, height: float, mu: float = 0.0, preset: SolverSettings = ONE_ITERATION
+) -> Cloth:
     cloth = Cloth(
         MESH,
         isotropic(0.2, 100.0, 1e-6),

@@ -1,11 +1,24 @@
-"""Bodies that are small against a cell: they carry cloth, nothing jumps over them, and friction on them is right."""
+"""Bodies that are small against a cell: they carry cloth, nothing jumps over them, and friction on
+them is right.
+"""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
-from stickslip_sim_core import Body, Cloth, SelfContact, box, capsule, cylinder, fabric, plane, preset_named, sphere
+from stickslip_sim_core import (
+    Body,
+    Cloth,
+    SelfContact,
+    box,
+    capsule,
+    cylinder,
+    fabric,
+    plane,
+    preset_named,
+    sphere,
+)
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks, meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
@@ -20,10 +33,13 @@ def body_forces(cloth: Cloth) -> np.ndarray:
     """Return the forces of the two bodies on the cloth in the last step (2, 3) [N]."""
     pairs, contacts, reactions = cloth.pair_forces, cloth.contacts, cloth.reactions
     free = np.setdiff1d(np.arange(len(contacts)), cloth.held)
-    on_cloth = (pairs.weights * (pairs.vertices < len(contacts))).sum(axis=1)[:, None] * pairs.forces
+    on_cloth = (pairs.weights * (pairs.vertices < len(contacts))).sum(axis=1)[
+        :, None
+    ] * pairs.forces
     return np.stack(
         [
-            reactions[free][contacts[free] == body].sum(axis=0) + on_cloth[pairs.body == body].sum(axis=0)
+            reactions[free][contacts[free] == body].sum(axis=0)
+            + on_cloth[pairs.body == body].sum(axis=0)
             for body in (0, 1)
         ]
     )
@@ -57,7 +73,9 @@ class TestCarries:
         ],
         ids=["rod", "ball", "pillar"],
     )
-    def test_what_is_small_against_a_cell(self, body: Callable[[float], Body], cells: float) -> None:
+    def test_what_is_small_against_a_cell(
+        self, body: Callable[[float], Body], cells: float
+    ) -> None:
         bodies = [FLOOR, body(cells * CELL)]
         cloth = started(cells * CELL + 0.002, bodies)
         force = 0.0
@@ -65,7 +83,9 @@ class TestCarries:
             cloth.step(0.01, bodies=bodies, damping=5.0 if step < 59 else 0.0)
             force += float(body_forces(cloth)[1, 2]) / 10.0 if step >= 50 else 0.0
         assert force == pytest.approx(weight(cloth), rel=0.1)
-        assert cloth.contact_force() == pytest.approx(body_forces(cloth).sum(axis=0), abs=2e-3 * weight(cloth))
+        assert cloth.contact_force() == pytest.approx(
+            body_forces(cloth).sum(axis=0), abs=2e-3 * weight(cloth)
+        )
         assert cloth.positions[:, 2].max() == pytest.approx(cells * CELL, abs=0.4 * CELL)
         assert cloth.total.sharpest == pytest.approx(cells, rel=1e-3)
         assert cloth.total.unconverged <= 1
@@ -90,14 +110,18 @@ class TestCarries:
 @pytest.mark.physics
 @pytest.mark.parametrize("cells", [0.6, 1.9])
 def test_a_turning_rod_does_the_work_that_cloth_gets(cells: float) -> None:
-    """Its axis rests, but its face rubs: with the work on the axis alone, up to 20 % of the flow was a gain."""
+    """Its axis rests, but its face rubs: with the work on the axis alone, up to 20 % of the flow
+    was a gain.
+    """
     mesh, radius = SHEET, cells * CELL
     held = np.flatnonzero(mesh.rest[:, 0] < -0.0499)
     cloth = Cloth(mesh, FABRIC, preset_named("certified"), held=held)
     start = np.column_stack([mesh.rest, np.full(len(mesh.rest), radius + 1e-4)])
 
     def bodies(time: float) -> list[Body]:
-        return [cylinder(1.0, radius, rotation=turned(30.0 * time) @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]])]
+        return [
+            cylinder(1.0, radius, rotation=turned(30.0 * time) @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+        ]
 
     cloth.set_state(start, bodies=bodies(0.0))
     cloth.advance(0.6, lambda time: (cloth.gravity, start[held], bodies(time)))
@@ -114,7 +138,11 @@ class TestSweeps:
 
         def at(time: float) -> list[Body]:
             origin = (0.001, 0.002, -0.032 + 10.0 * time)
-            return [sphere(0.5, 0.03, origin=origin) if body == "ball" else box(0.5, (0.06,) * 3, origin=origin)]
+            return [
+                sphere(0.5, 0.03, origin=origin)
+                if body == "ball"
+                else box(0.5, (0.06,) * 3, origin=origin)
+            ]
 
         cloth = started(0.0, at(0.0))
         for step in range(1, 3):
@@ -138,7 +166,9 @@ class TestSweeps:
         assert cloth.positions[middle, 2] > top - 0.1 * CELL
 
     def test_a_paddle(self) -> None:
-        """A plate 0.4 cells thick turns upward at 20 rad/s: all that it sweeps stays on its upper side."""
+        """A plate 0.4 cells thick turns upward at 20 rad/s: all that it sweeps stays on its upper
+        side.
+        """
 
         def paddle(time: float) -> list[Body]:
             turn = turned(-20.0 * time)
@@ -155,12 +185,16 @@ class TestSweeps:
 
 
 EDGE = {0.02: 1.085, 0.01: 1.048, 0.005: 1.015, 0.002: 1.014}
-"""By radius of the edge [m]: the mean force that pulls a strip over it, over its weight, with cells of 1.25 mm."""
+"""By radius of the edge [m]: the mean force that pulls a strip over it, over its weight, with cells
+of 1.25 mm.
+"""
 
 
 def pulled(radius: float, cell: float) -> tuple[float, float]:
-    """Pull a strip that hangs over a table's edge by its upper end; return the mean force over its weight, and the
-    radius of the edge in cells."""
+    """Pull a strip that hangs over a table's edge by its upper end.
+
+    Return the mean force over its weight, and the radius of the edge in cells.
+    """
     mu, upper, speed, dt = 0.3, 0.1, 0.03, 0.01
     mesh = meshes.grid(0.02, 0.3, round(0.02 / cell), round(0.3 / cell))
     along, high = mesh.rest[:, 1] + 0.15 - (upper - radius), radius + 1e-4
@@ -208,8 +242,8 @@ def test_strip_over_an_edge(radius: float, cell: float) -> None:
 @pytest.mark.physics
 class TestFriction:
     def test_a_turning_rod_drags_by_its_surface(self) -> None:
-        """A strip over a rod that turns is pulled by the capstan's forces, the other way with the other turn. Its
-        upper side goes to -y where it turns about x."""
+        """A strip over a rod that turns is pulled by the capstan's forces, the other way with the
+        other turn. Its upper side goes to -y where it turns about x."""
         mesh = meshes.grid(0.02, 0.16, 2, 16)
         ends = np.flatnonzero(np.abs(mesh.rest[:, 1]) > 0.08 - 1e-9)
         mu, radius = 0.2, 0.8 * CELL
@@ -219,9 +253,13 @@ class TestFriction:
             def rod(time: float, speed: float = speed) -> list[Body]:
                 return [cylinder(mu, radius, rotation=_about_x(speed * time) @ turned(np.pi / 2))]
 
-            cloth = Cloth(mesh, FABRIC, preset_named("certified"), held=ends, self_contact=SelfContact(0.3))
+            cloth = Cloth(
+                mesh, FABRIC, preset_named("certified"), held=ends, self_contact=SelfContact(0.3)
+            )
             angle = np.arctan2(0.04, 0.06)
-            at = np.column_stack([mesh.rest[:, 0], mesh.rest[:, 1], np.full(len(mesh.rest), radius + 1e-4)])
+            at = np.column_stack(
+                [mesh.rest[:, 0], mesh.rest[:, 1], np.full(len(mesh.rest), radius + 1e-4)]
+            )
             cloth.set_state(at, bodies=rod(0.0))
             down = at[ends].copy()
             for step in range(1, 121):
@@ -230,7 +268,9 @@ class TestFriction:
                 down[:, 1] = np.sign(at[ends, 1]) * 0.082 * np.cos(way)
                 down[:, 2] = radius - 0.082 * np.sin(way)
                 cloth.step(0.01, held=down, bodies=rod(0.01 * step), damping=2.0)
-            along = np.stack([np.cos(angle) * np.sign(at[ends, 1]), -np.sin(angle) * np.ones(len(ends))], axis=1)
+            along = np.stack(
+                [np.cos(angle) * np.sign(at[ends, 1]), -np.sin(angle) * np.ones(len(ends))], axis=1
+            )
             tension = (cloth.reactions[ends][:, 1:] * along).sum(axis=1)
             pulls.append([tension[at[ends, 1] > 0].sum(), tension[at[ends, 1] < 0].sum()])
         first, second = np.array(pulls)
@@ -238,11 +278,20 @@ class TestFriction:
         assert second[0] / second[1] == pytest.approx(np.exp(-2.0 * mu * angle), rel=0.1)
 
     def test_a_rolling_ball_does_not_slip(self) -> None:
-        """A ball that rolls under a patch at twice the speed of its middle takes it along without sliding."""
+        """A ball that rolls under a patch at twice the speed of its middle takes it along without
+        sliding.
+        """
         radius, speed = 1.5 * CELL, 0.02
 
         def ball(time: float) -> list[Body]:
-            return [sphere(1.0, radius, origin=(speed * time, 0.0, 0.0), rotation=turned(speed * time / radius))]
+            return [
+                sphere(
+                    1.0,
+                    radius,
+                    origin=(speed * time, 0.0, 0.0),
+                    rotation=turned(speed * time / radius),
+                )
+            ]
 
         mesh = meshes.grid(0.06, 0.06, 6, 6)
         cloth = started(radius + 1e-4, ball(0.0), mesh)
@@ -263,5 +312,7 @@ def _about_x(angle: float) -> Floats:
 
 def test_bodies_keep_their_shapes() -> None:
     cloth = started(0.1, [sphere(0.5, 0.01)])
-    with pytest.raises(ValueError, match="bodies: must keep their shapes and friction, and body 0 does not"):
+    with pytest.raises(
+        ValueError, match="bodies: must keep their shapes and friction, and body 0 does not"
+    ):
         cloth.step(0.01, bodies=[sphere(0.5, 0.02)])

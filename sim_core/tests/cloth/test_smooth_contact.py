@@ -1,4 +1,6 @@
-"""Smooth surfaces through prescribed triangles: feet of points, and cloth that touches them vertex by vertex."""
+"""Smooth surfaces through prescribed triangles: feet of points, and cloth that touches them vertex
+by vertex.
+"""
 
 from collections.abc import Callable
 
@@ -7,7 +9,15 @@ import pytest
 from numpy.typing import NDArray
 from stickslip_testing.spheres import icosphere
 
-from stickslip_sim_core import Cloth, Surface, isotropic, plane, preset_named, self_intersections, sphere
+from stickslip_sim_core import (
+    Cloth,
+    Surface,
+    isotropic,
+    plane,
+    preset_named,
+    self_intersections,
+    sphere,
+)
 from stickslip_sim_core import _testing as core
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import CREASE, THICKNESS
@@ -57,10 +67,14 @@ class TestFeet:
         ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         x = np.concatenate([ring - np.eye(3)[2], ring + np.eye(3)[2]])
         i, j = np.arange(facets), (np.arange(facets) + 1) % facets
-        triangles = np.concatenate([np.stack([i, j, facets + i], 1), np.stack([j, facets + j, facets + i], 1)])
+        triangles = np.concatenate(
+            [np.stack([i, j, facets + i], 1), np.stack([j, facets + j, facets + i], 1)]
+        )
         at = np.random.default_rng(1).uniform([0.0, -0.9], [6.3, 0.9], (500, 2))
         out = np.stack([np.cos(at[:, 0]), np.sin(at[:, 0]), 0.0 * at[:, 0]], axis=1)
-        found, normal, *_ = core.feet(triangles.astype(np.int32), x, CREASE, 1.01 * out + at[:, 1:] * [0.0, 0.0, 1.0])
+        found, normal, *_ = core.feet(
+            triangles.astype(np.int32), x, CREASE, 1.01 * out + at[:, 1:] * [0.0, 0.0, 1.0]
+        )
         assert np.abs(found - 0.01).max() < 0.03 * (2.0 * np.pi / facets) ** 4
         assert np.linalg.norm(normal - out, axis=1).max() < 0.05 * (2.0 * np.pi / facets) ** 3
 
@@ -70,7 +84,11 @@ class TestFeet:
             x, triangles = bumpy(subdivisions)
             p = d * (np.linalg.norm(core.feet(triangles, x, CREASE, d)[2], axis=1) + 0.02)[:, None]
             _, normal, *_ = core.feet(triangles, x, CREASE, p)
-            height = [core.feet(triangles, x, CREASE, p + s * step * e)[0] for e in np.eye(3) for s in (1.0, -1.0)]
+            height = [
+                core.feet(triangles, x, CREASE, p + s * step * e)[0]
+                for e in np.eye(3)
+                for s in (1.0, -1.0)
+            ]
             gradient = (np.array(height[::2]) - np.array(height[1::2])).T / (2.0 * step)
             worst.append(np.linalg.norm(gradient - normal, axis=1).max())
         assert worst[0] < 0.05
@@ -97,7 +115,9 @@ class TestFeet:
         """To a cube, whose triangles turn this way and that, from outside."""
         x = np.array([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
         quads = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
-        triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, d, c))], dtype=np.int32)
+        triangles = np.array(
+            [t for a, b, c, d in quads for t in ((a, b, c), (a, d, c))], dtype=np.int32
+        )
         p = np.random.default_rng(4).uniform(-1.3, 1.3, (2000, 3))
         p = p[np.abs(p).max(axis=1) > 1.0]
         away = p - np.clip(p, -1.0, 1.0)
@@ -108,7 +128,10 @@ class TestFeet:
         assert sign * normal == pytest.approx(away / distance[:, None], abs=1e-9)
 
     def test_distance_beyond_a_border(self) -> None:
-        x, triangles = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+        x, triangles = (
+            np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
+            np.array([[0, 1, 2], [0, 2, 3]]),
+        )
         p = np.random.default_rng(5).uniform(-0.5, 1.5, (1000, 3)) * [1.0, 1.0, 0.3]
         nearest = np.clip(p, [0.0, 0.0, 0.0], [1.0, 1.0, 0.0])
         found, *_ = core.feet(triangles.astype(np.int32), x, CREASE, p)
@@ -122,7 +145,9 @@ class TestFeet:
         found, normal, *_ = core.feet(triangles, x, 0.0, p)
         for i in range(0, 500, 25):
             pairs = [np.vstack([p[i], x[corners]]) for corners in triangles]
-            closest = min(np.linalg.norm(core.closest_weights(False, four) @ four) for four in pairs)
+            closest = min(
+                np.linalg.norm(core.closest_weights(False, four) @ four) for four in pairs
+            )
             assert found[i] == pytest.approx(closest, abs=1e-12)
         assert np.linalg.norm(normal, axis=1) == pytest.approx(1.0)
 
@@ -137,7 +162,9 @@ def turn(angle: float) -> Floats:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def over(surface: Surface, height: float, mesh: meshes.Mesh = SHEET, fabric: object = STIFF) -> Cloth:
+def over(
+    surface: Surface, height: float, mesh: meshes.Mesh = SHEET, fabric: object = STIFF
+) -> Cloth:
     """A flat sheet at a height."""
     cloth = Cloth(mesh, fabric, CERTIFIED, surfaces=[surface])  # type: ignore[arg-type]
     cloth.set_state(np.column_stack([mesh.rest, np.full(len(mesh.rest), height)]))
@@ -148,14 +175,18 @@ def crossings(cloth: Cloth) -> int:
     """Of the cloth and the surface."""
     surface = cloth.surfaces[0]
     at = np.concatenate([cloth.positions, surface.at(cloth.time)])
-    every = np.concatenate([cloth.mesh.triangles, np.asarray(surface.triangles) + len(cloth.mesh.rest)])
+    every = np.concatenate(
+        [cloth.mesh.triangles, np.asarray(surface.triangles) + len(cloth.mesh.rest)]
+    )
     return self_intersections(at, every) - self_intersections(cloth.positions, cloth.mesh.triangles)
 
 
 class TestCloth:
     R = 0.2
 
-    def settled(self, mu: float, motion: Callable[[float], Floats] | None = None, subdivisions: int = 4) -> Cloth:
+    def settled(
+        self, mu: float, motion: Callable[[float], Floats] | None = None, subdivisions: int = 4
+    ) -> Cloth:
         """A sheet at rest on top of a sphere."""
         x, triangles = ball(self.R, subdivisions)
         at = x if motion is None else lambda time: x @ motion(time).T
@@ -199,7 +230,9 @@ class TestCloth:
         cloth = self.settled(0.5)
         assert (cloth.contacts >= 0).any()
         on_cloth = cloth.reactions.sum(axis=0)
-        assert cloth.surface_forces[0].sum(axis=0) == pytest.approx(-on_cloth, abs=1e-12 * np.abs(on_cloth).max())
+        assert cloth.surface_forces[0].sum(axis=0) == pytest.approx(
+            -on_cloth, abs=1e-12 * np.abs(on_cloth).max()
+        )
         assert cloth.contact_force() == pytest.approx(on_cloth, abs=1e-12 * np.abs(on_cloth).max())
 
     def test_does_not_creep_within_the_cone(self) -> None:
@@ -233,7 +266,11 @@ class TestCloth:
             return np.column_stack([at, height])
 
         soft = isotropic(0.2, 20.0, 1e-6)
-        cloth = over(Surface(ground.triangles, lambda time: wave(time, ground.rest), 1.0), THICKNESS, fabric=soft)
+        cloth = over(
+            Surface(ground.triangles, lambda time: wave(time, ground.rest), 1.0),
+            THICKNESS,
+            fabric=soft,
+        )
         for _ in range(60):
             cloth.step(0.02)
         assert cloth.total.unconverged == 0
@@ -245,7 +282,9 @@ class TestCloth:
     def test_hangs_below(self) -> None:
         """Of an open surface the other side is felt as well."""
         ground = meshes.unstructured(0.1, 0.1, 0.02, 1)
-        surface = Surface(ground.triangles, np.column_stack([ground.rest, 0.0 * ground.rest[:, 0]]), 0.3)
+        surface = Surface(
+            ground.triangles, np.column_stack([ground.rest, 0.0 * ground.rest[:, 0]]), 0.3
+        )
         cloth = over(surface, -1.5 * THICKNESS)
         cloth.gravity[:] = [0.0, 0.0, GRAVITY]
         for _ in range(20):
@@ -254,7 +293,9 @@ class TestCloth:
         assert cloth.total.unconverged == 0
 
     def test_coarse_cloth_keeps_off_what_is_curved(self) -> None:
-        """So that its triangles do not cut into it: no pair bears, and nodes are as far off as they need to be."""
+        """So that its triangles do not cut into it: no pair bears, and nodes are as far off as they
+        need to be.
+        """
         x, triangles = ball(0.04, 3)
         soft = isotropic(0.2, 200.0, 2e-6)
         cloth = over(Surface(triangles, x, 0.5), 0.042, meshes.grid(0.06, 0.06, 4, 4), soft)
@@ -269,7 +310,9 @@ class TestCloth:
         assert not len(cloth.pair_forces.forces)
 
     def test_coarse_cloth_rests_alike_on_coarse_and_fine_triangles(self) -> None:
-        """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: nodes must find them."""
+        """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: nodes
+        must find them.
+        """
         soft, found = isotropic(0.2, 200.0, 2e-6), []
         for subdivisions in (1, 3):
             x, triangles = ball(0.1, subdivisions)
@@ -281,9 +324,16 @@ class TestCloth:
         assert found[0] == pytest.approx(found[1], abs=1e-3)
 
     def test_what_starts_nearer_than_it_may_be_is_not_thrown_off(self) -> None:
-        """A coarse sheet 1 mm over a ball has to be 5 mm off: it gets there, and falls on as freely as without."""
+        """A coarse sheet 1 mm over a ball has to be 5 mm off: it gets there, and falls on as freely
+        as without.
+        """
         x, triangles = ball(0.1, 3)
-        cloth = over(Surface(triangles, x, 0.5), 0.101, meshes.grid(0.36, 0.36, 8, 8), isotropic(0.2, 200.0, 2e-6))
+        cloth = over(
+            Surface(triangles, x, 0.5),
+            0.101,
+            meshes.grid(0.36, 0.36, 8, 8),
+            isotropic(0.2, 200.0, 2e-6),
+        )
         cloth.step(0.005)
         assert cloth.positions[:, 2].max() > 0.105
         assert np.linalg.norm(cloth.velocities, axis=1).max() < 1.01 * 0.005 * GRAVITY
@@ -291,7 +341,9 @@ class TestCloth:
     def test_corner_of_a_floor_and_a_surface(self) -> None:
         """A wall that pushes a sheet over the floor: vertices bear on both."""
         wall = np.array([[0.0, -0.1, -0.01], [0.0, 0.1, -0.01], [0.0, 0.1, 0.1], [0.0, -0.1, 0.1]])
-        pushing = Surface([[0, 1, 2], [0, 2, 3]], lambda time: wall - [0.032 - 0.02 * time, 0.0, 0.0], 0.5)
+        pushing = Surface(
+            [[0, 1, 2], [0, 2, 3]], lambda time: wall - [0.032 - 0.02 * time, 0.0, 0.0], 0.5
+        )
         cloth = over(pushing, 1e-4)
         for _ in range(40):
             cloth.step(0.02, bodies=[plane(0.3)])
@@ -302,13 +354,18 @@ class TestCloth:
         assert (cloth.contacts == 0).any()
 
     def test_what_leaves_a_floor_beside_a_surface_is_not_thrown_off(self) -> None:
-        """A sheet slides over a floor to a post of flat sides, 3 mm inside its round surface, and is then lifted."""
+        """A sheet slides over a floor to a post of flat sides, 3 mm inside its round surface, and
+        is then lifted.
+        """
         angle = np.pi / 6.0 * (np.arange(12) + 0.5)
         ring = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         i, j = np.arange(12), (np.arange(12) + 1) % 12
         sides = np.concatenate([np.stack([i, j, 12 + i], 1), np.stack([j, 12 + j, 12 + i], 1)])
         cloth = over(
-            Surface(sides, np.concatenate([np.add(ring, [0, 0, -0.05]), np.add(ring, [0, 0, 0.2])]), 0.2), 1e-4
+            Surface(
+                sides, np.concatenate([np.add(ring, [0, 0, -0.05]), np.add(ring, [0, 0, 0.2])]), 0.2
+            ),
+            1e-4,
         )
         cloth.set_state(np.add(cloth.positions, [0.135, 0.0, 0.0]))
         for gravity in ([-5.0, 0.0, -GRAVITY], [0.0, 0.0, GRAVITY]):
@@ -317,15 +374,26 @@ class TestCloth:
                 cloth.step(0.01, bodies=[plane(0.1)])
                 speed = np.append(speed, np.linalg.norm(cloth.velocities, axis=1).max())
             if gravity[2] < 0.0:
-                assert cloth.positions[:, 0].min() == pytest.approx(0.1 * np.cos(np.pi / 12.0), abs=2e-4)
+                assert cloth.positions[:, 0].min() == pytest.approx(
+                    0.1 * np.cos(np.pi / 12.0), abs=2e-4
+                )
         assert speed == pytest.approx(0.01 * GRAVITY * np.arange(1, 41), rel=0.05)
 
     def test_what_pokes_through_between_vertices_is_felt(self) -> None:
-        """A spike below the middle of a triangle, and the edge of a thin plate along a column of cells."""
-        spike = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * [0.002, 0.002, -0.02] + [0.003, 0.004, 0.0]
+        """A spike below the middle of a triangle, and the edge of a thin plate along a column of
+        cells.
+        """
+        spike = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * [0.002, 0.002, -0.02] + [
+            0.003,
+            0.004,
+            0.0,
+        ]
         faces = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], dtype=np.int32)
         plate = np.array([[-0.02, -0.05, 0.0], [-0.02, 0.05, 0.0], [-0.02, 0.0, -0.05]])
-        x, triangles = np.concatenate([spike, plate]), np.concatenate([faces, [[4, 5, 6]]]).astype(np.int32)
+        x, triangles = (
+            np.concatenate([spike, plate]),
+            np.concatenate([faces, [[4, 5, 6]]]).astype(np.int32),
+        )
         cloth = over(Surface(triangles, x, 0.5), 2.0 * THICKNESS)
         for _ in range(40):
             cloth.step(0.01, damping=2.0)
@@ -333,7 +401,9 @@ class TestCloth:
         assert (cloth.pair_forces.vertices >= len(SHEET.rest)).any()
         assert cloth.total.least_distance > 0.2 * THICKNESS
 
-    @pytest.mark.parametrize("seed", [1, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2))])
+    @pytest.mark.parametrize(
+        "seed", [1, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 2))]
+    )
     def test_nothing_crosses(self, seed: int) -> None:
         """Soft cloth that is thrown at a lumpy mesh that moves and turns at random."""
         rng = np.random.default_rng(seed)
@@ -341,9 +411,13 @@ class TestCloth:
         x = 0.03 * x * rng.uniform(0.6, 1.4, 3)
         way, spin = rng.normal(size=3) * [0.3, 0.3, 0.2], rng.normal() * 10.0
         surface = Surface(
-            triangles, lambda time: x @ turn(spin * time).T + way * np.sin(9.0 * time), rng.uniform(0.0, 1.0)
+            triangles,
+            lambda time: x @ turn(spin * time).T + way * np.sin(9.0 * time),
+            rng.uniform(0.0, 1.0),
         )
-        cloth = over(surface, 0.06, meshes.unstructured(0.1, 0.1, 0.012, seed), isotropic(0.2, 100.0, 1e-6))
+        cloth = over(
+            surface, 0.06, meshes.unstructured(0.1, 0.1, 0.012, seed), isotropic(0.2, 100.0, 1e-6)
+        )
         cloth.set_state(cloth.positions, np.tile([0.0, 0.0, -2.0], (len(cloth.mesh.rest), 1)))
         for _ in range(50):
             cloth.step(0.01)

@@ -1,10 +1,23 @@
-"""Cloth that starts inside a body is refused; what a body forces out of itself gets no velocity by that."""
+"""Cloth that starts inside a body is refused.
+
+What a body forces out of itself gets no velocity by that.
+"""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stickslip_sim_core import Body, Cloth, box, capsule, cylinder, fabric, plane, preset_named, sphere
+from stickslip_sim_core import (
+    Body,
+    Cloth,
+    box,
+    capsule,
+    cylinder,
+    fabric,
+    plane,
+    preset_named,
+    sphere,
+)
 from stickslip_sim_core.cloth import meshes
 
 PATCH = meshes.grid(0.06, 0.06, 6, 6)
@@ -12,9 +25,9 @@ PATCH = meshes.grid(0.06, 0.06, 6, 6)
 
 def cloth(height: float, held: list[int] | None = None) -> tuple[Cloth, np.ndarray]:
     """A patch at a height [m]."""
-    return Cloth(PATCH, fabric("gray-interlock"), preset_named("certified"), held=held or []), np.column_stack(
-        [PATCH.rest, np.full(len(PATCH.rest), height)]
-    )
+    return Cloth(
+        PATCH, fabric("gray-interlock"), preset_named("certified"), held=held or []
+    ), np.column_stack([PATCH.rest, np.full(len(PATCH.rest), height)])
 
 
 @pytest.mark.parametrize(
@@ -28,7 +41,9 @@ def cloth(height: float, held: list[int] | None = None) -> tuple[Cloth, np.ndarr
 )
 def test_starts_inside_a_body_are_refused(height: float, body: Body, depth: str) -> None:
     """They would be thrown out within one step: 1 mm deep at 1 m/s."""
-    message = rf"positions: must not start inside a body, and vertex \d+ is {depth} mm inside body 1"
+    message = (
+        rf"positions: must not start inside a body, and vertex \d+ is {depth} mm inside body 1"
+    )
     sheet, start = cloth(height)
     bodies = [plane(0.5, origin=(0.0, 0.0, -1.0)), body]
     with pytest.raises(ValueError, match=message):
@@ -85,7 +100,9 @@ def test_starts_on_a_body_are_not(body: Body) -> None:
 
 
 def test_what_is_let_go_inside_a_body_gets_no_velocity_by_that() -> None:
-    """A holder pushes a corner 1 mm into the floor and lets go: it comes out at once, and stays on the floor."""
+    """A holder pushes a corner 1 mm into the floor and lets go: it comes out at once, and stays on
+    the floor.
+    """
     sheet, start = cloth(0.0, held=[0])
     sheet.set_state(start, bodies=[plane(0.5)])
     for step in range(1, 11):
@@ -101,7 +118,10 @@ def test_what_is_let_go_inside_a_body_gets_no_velocity_by_that() -> None:
     ("change", "message"),
     [
         ({"origin": (0.0, np.nan, 0.0)}, "origin: must be three finite numbers"),
-        ({"rotation": 2.0 * np.eye(3)}, r"rotation: must be orthonormal \(3, 3\) with determinant \+1"),
+        (
+            {"rotation": 2.0 * np.eye(3)},
+            r"rotation: must be orthonormal \(3, 3\) with determinant \+1",
+        ),
         ({"rotation": np.diag([1.0, 1.0, -1.0])}, "rotation: must be orthonormal"),
         ({"rotation": np.full((3, 3), np.nan)}, "rotation: must be orthonormal"),
         ({"rotation": np.eye(2)}, "rotation: must be orthonormal"),

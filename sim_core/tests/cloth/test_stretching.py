@@ -26,14 +26,21 @@ class Sheet:
         """Energy per area and second Piola-Kirchhoff stress (2, 2) [N/m] at Green's strain (2, 2)."""
         values, axes = np.linalg.eigh(np.eye(2) + 2.0 * strain)
         gradient = axes @ np.diag(np.sqrt(values)) @ axes.T
-        energy, _, forces = self.cloth._solver.energies(np.pad(MESH.rest @ gradient, ((0, 0), (0, 1))))
-        return energy / SIDE**2, np.linalg.solve(gradient, np.asarray(forces)[:, :2].T @ MESH.rest / SIDE**2)
+        energy, _, forces = self.cloth._solver.energies(
+            np.pad(MESH.rest @ gradient, ((0, 0), (0, 1)))
+        )
+        return energy / SIDE**2, np.linalg.solve(
+            gradient, np.asarray(forces)[:, :2].T @ MESH.rest / SIDE**2
+        )
 
 
 @pytest.mark.parametrize("size", [0.02, 0.1])
 @pytest.mark.parametrize("name", fabric_names())
 def test_a_closed_loop_of_strain_takes_no_work(name: str, size: float) -> None:
-    """Asked: 1e-4 of the peak; with a table that is read once a step it was 0.07 to 0.78. Simpson's rule over arcs."""
+    """Asked: 1e-4 of the peak; with a table that is read once a step it was 0.07 to 0.78.
+
+    Simpson's rule over arcs.
+    """
     sheet, count = Sheet(name), 300
     angle = np.linspace(0.0, 2.0 * np.pi, 2 * count + 1)
     # Through none, tension along both axes, shear of both signs, and compression.
@@ -59,10 +66,11 @@ def test_a_closed_loop_of_strain_takes_no_work(name: str, size: float) -> None:
 @pytest.mark.parametrize("size", [0.02, 0.05, 0.1])
 @pytest.mark.parametrize("name", fabric_names())
 def test_stress_is_that_of_the_table(name: str, size: float) -> None:
-    """Pulled along each direction of the table, to 0.1 % where the width is held, and to 5 % where it is free.
+    """Pulled along each direction of the table, to 0.1 % where the width is held, and to 5 % where
+    it is free.
 
-    Measured with a free width: 2.6 % at most, but for navy-sparkle-sweat, whose 5.1 % at 45 degrees and 10 % are the
-    worst. A table that is not read misses its stress by up to 30 times.
+    Measured with a free width: 2.6 % at most, but for navy-sparkle-sweat, whose 5.1 % at 45 degrees
+    and 10 % are the worst. A table that is not read misses its stress by up to 30 times.
     """
     sheet, table = Sheet(name), fabric(name).stretching
     pulled = 0.5 * ((1.0 + size) ** 2 - 1.0)
@@ -74,16 +82,26 @@ def test_stress_is_that_of_the_table(name: str, size: float) -> None:
         def law(strain: Floats, k: Floats = k) -> Floats:
             shear = k[3] * strain[0, 1]
             return np.array(
-                [[k[0] * strain[0, 0] + k[1] * strain[1, 1], shear], [shear, k[1] * strain[0, 0] + k[2] * strain[1, 1]]]
+                [
+                    [k[0] * strain[0, 0] + k[1] * strain[1, 1], shear],
+                    [shear, k[1] * strain[0, 0] + k[2] * strain[1, 1]],
+                ]
             )
 
         def strained(width: float, along: Floats = along, across: Floats = across) -> Floats:
             return pulled * (np.outer(along, along) + width * np.outer(across, across))
 
         def free(stress: Callable[[Floats], Floats], across: Floats = across) -> float:
-            return float(newton(lambda width: float(across @ stress(strained(width)) @ across), 0.0, x1=-0.05))
+            return float(
+                newton(
+                    lambda width: float(across @ stress(strained(width)) @ across), 0.0, x1=-0.05
+                )
+            )
 
         held = along @ law(strained(0.0)) @ along
         assert along @ sheet.at(strained(0.0))[1] @ along == pytest.approx(held, rel=1e-3)
-        ours, tables = (along @ stress(strained(free(stress))) @ along for stress in (lambda G: sheet.at(G)[1], law))
+        ours, tables = (
+            along @ stress(strained(free(stress))) @ along
+            for stress in (lambda G: sheet.at(G)[1], law)
+        )
         assert ours == pytest.approx(tables, rel=0.055 if name == "navy-sparkle-sweat" else 0.05)

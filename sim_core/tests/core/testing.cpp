@@ -1,4 +1,5 @@
-// What tests ask of the core that nobody else does: geometry and law of contact, and the derivatives of a rod's energy.
+// What tests ask of the core that nobody else does: geometry and law of contact, and the
+// derivatives of a rod's energy.
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/array.h>
@@ -39,7 +40,8 @@ std::vector<std::array<int, 3>> triples_of(const Triangles& triangles) {
 }
 
 Surface surface_of(const Triangles& triangles, const Points3& x) {
-  return {triples_of(triangles), std::vector<int>(x.rows(), 0), CollisionMask::Constant(1, 1, true)};
+  return {triples_of(triangles), std::vector<int>(x.rows(), 0),
+          CollisionMask::Constant(1, 1, true)};
 }
 
 Buffer<double> buffer_of(const Points3& x) {
@@ -50,8 +52,10 @@ Buffer<double> buffer_of(const Points3& x) {
 
 using T = Lanes<1>;
 
-std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0, double phi1,
-                                                                     double twist_stiffness, const Rows4& quaternions) {
+std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamma, double phi0,
+                                                                     double phi1,
+                                                                     double twist_stiffness,
+                                                                     const Rows4& quaternions) {
   const int n = static_cast<int>(quaternions.rows()) - 1;
   const double h = 1.0 / n;
   const Rod<T> rod{gamma, phi0, phi1, twist_stiffness};
@@ -90,11 +94,14 @@ std::tuple<double, Eigen::VectorXd, Eigen::MatrixXd> rod_derivatives(double gamm
 NB_MODULE(_testing, m) {
   using namespace sim_core;
   m.doc() = "For tests of stickslip_sim_core, in editable installs only.";
-  m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a, "quaternions"_a,
-        "Energy [EI/L], gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions (w, x, y, z), by world "
+  m.def("rod_derivatives", &rod_derivatives, "gamma"_a, "phi0"_a, "phi1"_a, "twist_stiffness"_a,
+        "quaternions"_a,
+        "Energy [EI/L], gradient (3N) and Hessian (3N, 3N) of a chain of N + 1 unit quaternions "
+        "(w, x, y, z), by world "
         "rotations of nodes 1 ... N.");
   m.def(
-      "closest_weights", [](bool edges, const Four& x) { return closest_weights(kind_of(edges), four(x)); }, "edges"_a,
+      "closest_weights",
+      [](bool edges, const Four& x) { return closest_weights(kind_of(edges), four(x)); }, "edges"_a,
       "x"_a, "See contact/closest.hpp.");
   m.def(
       "safe_share",
@@ -104,13 +111,14 @@ NB_MODULE(_testing, m) {
       "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "See contact/closest.hpp.");
   m.def(
       "stiffness_times",
-      [](const Points2& rest, const Triangles& triangles, double density, const StretchTable& stretching,
-         const Eigen::Matrix3d& rigidity, const Points3& x, const Points3& v) {
+      [](const Points2& rest, const Triangles& triangles, double density,
+         const StretchTable& stretching, const Eigen::Matrix3d& rigidity, const Points3& x,
+         const Points3& v) {
         const ClothMesh mesh(rest, triangles);
         FactorSettings exact;  // no fold is too small, and none is old
         exact.fold_smallest = exact.stiffening_change = 0.0;
-        Assembly assembly(kernel_level("").cloth, mesh, Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0,
-                          exact);
+        Assembly assembly(kernel_level("").cloth, mesh,
+                          Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0, exact);
         const std::vector<int>& node = assembly.numbering.node;
         Buffer<double> at(4 * x.rows());
         Buffer<float> in(4 * x.rows()), out(4 * x.rows());
@@ -121,7 +129,8 @@ NB_MODULE(_testing, m) {
         assembly.evaluate(at, true);
         assembly.kernel.apply(assembly.matrix, in.data(), out.data());
         Points3 result(x.rows(), 3);
-        for (int i = 0; i < x.rows(); ++i) result.row(i) = at_node(out, node[i]).cast<double>().transpose();
+        for (int i = 0; i < x.rows(); ++i)
+          result.row(i) = at_node(out, node[i]).cast<double>().transpose();
         return result;
       },
       "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "x"_a, "v"_a,
@@ -131,14 +140,17 @@ NB_MODULE(_testing, m) {
       [](const Triangles& triangles, const Points3& x, double reach) {
         std::vector<std::array<int, 5>> out;
         for (const Candidate& pair : candidates(surface_of(triangles, x), buffer_of(x), reach)) {
-          out.push_back({static_cast<int>(pair.kind), pair.node[0], pair.node[1], pair.node[2], pair.node[3]});
+          out.push_back({static_cast<int>(pair.kind), pair.node[0], pair.node[1], pair.node[2],
+                         pair.node[3]});
         }
         return out;
       },
-      "triangles"_a, "x"_a, "reach"_a, "kind (0: vertex and triangle, 1: edges) and vertices of near pairs.");
+      "triangles"_a, "x"_a, "reach"_a,
+      "kind (0: vertex and triangle, 1: edges) and vertices of near pairs.");
   m.def(
       "cap_motion",
-      [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness, double margin) {
+      [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness,
+         double margin) {
         Buffer<double> end = buffer_of(to);
         Neighbourhood near(surface_of(triangles, from), thickness, margin);
         near.cap(buffer_of(from), end);
@@ -151,10 +163,12 @@ NB_MODULE(_testing, m) {
       "feet",
       [](const Triangles& triangles, const Points3& x, double crease, const Points3& points) {
         const Buffer<double> at = buffer_of(x);
-        const PNTriangles patches(triples_of(triangles), at, std::vector<double>(triangles.rows(), crease));
+        const PNTriangles patches(triples_of(triangles), at,
+                                  std::vector<double>(triangles.rows(), crease));
         const TriangleTree tree(patches.triangles(), at);
         const PatchShape shape = patches.shape(at);
-        Eigen::VectorXd height = Eigen::VectorXd::Constant(points.rows(), std::numeric_limits<double>::quiet_NaN());
+        Eigen::VectorXd height =
+            Eigen::VectorXd::Constant(points.rows(), std::numeric_limits<double>::quiet_NaN());
         Points3 normal(points.rows(), 3), point(points.rows(), 3);
         std::vector<std::int32_t> triangle(points.rows(), -1);
         for (Eigen::Index i = 0; i < points.rows(); ++i) {
@@ -175,12 +189,15 @@ NB_MODULE(_testing, m) {
       "contact/pn_triangles.hpp.");
   m.def(
       "pair_law",
-      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip, const Eigen::Vector3d& force,
-         double mu, double stiffness, double along, double across, double smoothing) {
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,
+         const Eigen::Vector3d& force, double mu, double stiffness, double along, double across,
+         double smoothing) {
         const PairKinematics at{gap, normal, slip, force, mu, stiffness, along, across, smoothing};
         const PairLinearization row = linearize(at);
-        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force, pair_error_squared(at));
+        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force,
+                               pair_error_squared(at));
       },
-      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a, "smoothing"_a = 0.0,
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a,
+      "smoothing"_a = 0.0,
       "mode, stiffness, its symmetric part, force and squared error; see contact/law.hpp.");
 }

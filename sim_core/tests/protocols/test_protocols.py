@@ -11,14 +11,22 @@ import pytest
 from stickslip_sim_core import _sim_core, build_info, protocols, solve_rods
 from stickslip_sim_core.protocols import Curve, ProtocolResult, rods
 from stickslip_sim_core.protocols.result import dense_master
-from stickslip_sim_core.protocols.rods import extrapolated, loss_of_stability, planar_frames, round_rod, tip
+from stickslip_sim_core.protocols.rods import (
+    extrapolated,
+    loss_of_stability,
+    planar_frames,
+    round_rod,
+    tip,
+)
 from stickslip_sim_core.reference import master_curves
 
 pytestmark = pytest.mark.physics
 
 
 class TestBendTwist:
-    @pytest.mark.parametrize("phi", [(10.0, 25 * np.pi), pytest.param((6.0,), marks=pytest.mark.slow)])
+    @pytest.mark.parametrize(
+        "phi", [(10.0, 25 * np.pi), pytest.param((6.0,), marks=pytest.mark.slow)]
+    )
     def test_passes(self, phi: tuple[float, ...]) -> None:
         """Near the onset it takes twice as long as at the other two together."""
         result = protocols.run("bend-twist", phi=phi)
@@ -27,7 +35,9 @@ class TestBendTwist:
         assert [curve.parameters["poisson"] for curve in result.curves] == [0.0, 0.3, 0.5]
 
     def test_rod_that_is_always_planar(self) -> None:
-        """At poisson = 0 a rod of phi = 6 is below the onset: solver and master curve agree that there is nothing."""
+        """At poisson = 0 a rod of phi = 6 is below the onset: solver and master curve agree that
+        there is nothing.
+        """
         result = protocols.run("bend-twist", phi=(6.0,), poisson=(0.0,), elements=128)
         assert math.isnan(result.curves[0].measured[0])
         assert math.isnan(result.curves[0].master[0])
@@ -40,11 +50,15 @@ class TestBendTwist:
 
     def test_lower_boundary_meets_the_upper_at_the_onset(self) -> None:
         def lower_boundary(phi: float, poisson: float, elements: int) -> float:
-            """Return the weight at which the chain, followed upwards from its natural shape, loses stability."""
+            """Return the weight at which the chain, followed upwards from its natural shape, loses
+            stability.
+            """
             relax = round_rod(phi, poisson)
             start = relax(1e-2, planar_frames(phi * np.linspace(0.0, 1.0, elements + 1)))
             assert start.stable
-            return loss_of_stability(relax, start, 1e-2 * 1.05 ** np.arange(1, np.ceil(np.log(phi**3 / 1e-2) / 0.0488)))
+            return loss_of_stability(
+                relax, start, 1e-2 * 1.05 ** np.arange(1, np.ceil(np.log(phi**3 / 1e-2) / 0.0488))
+            )
 
         upper, lower = (f(5.57, 0.5, 256) for f in (rods.upper_boundary, lower_boundary))
         assert 0.75 * upper < lower < upper
@@ -88,7 +102,10 @@ class TestCertification:
         json.dumps(dict(certification.numbers()), allow_nan=False)
 
     def test_rods_take_no_notice_of_a_preset(self) -> None:
-        first, second = (protocols.run("rod-cantilever", preset, gamma=(1.0,), elements=64) for preset in (None, "x"))
+        first, second = (
+            protocols.run("rod-cantilever", preset, gamma=(1.0,), elements=64)
+            for preset in (None, "x")
+        )
         assert first == second
 
     def test_others_are_given_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +117,10 @@ class TestCertification:
                 return self.settings
 
         monkeypatch.setattr(protocols, "PROTOCOLS", {"pretended": Pretended})
-        results: list[Any] = [protocols.run("pretended"), protocols.run("pretended", "fast", cells=7)]
+        results: list[Any] = [
+            protocols.run("pretended"),
+            protocols.run("pretended", "fast", cells=7),
+        ]
         assert results == [("certified", 50), ("fast", 7)]
 
 
@@ -153,12 +173,18 @@ class TestResult:
         assert not protocols.run("rod-cantilever", gamma=()).passed
 
     def test_json(self) -> None:
-        text = json.dumps(protocols.run("rod-cantilever", gamma=(1.0,), elements=64).as_dict(), allow_nan=False)
+        text = json.dumps(
+            protocols.run("rod-cantilever", gamma=(1.0,), elements=64).as_dict(), allow_nan=False
+        )
         assert json.loads(text)["build_hash"] == build_info().build_hash
-        assert json.loads(json.dumps(self.RESULT.as_dict(), allow_nan=False))["curves"][0]["measured"] == [1.1, None]
+        assert json.loads(json.dumps(self.RESULT.as_dict(), allow_nan=False))["curves"][0][
+            "measured"
+        ] == [1.1, None]
 
     def test_unknown_names_and_settings(self) -> None:
-        with pytest.raises(ValueError, match=r"protocol: must be one of bend-twist, .* got 'stick'"):
+        with pytest.raises(
+            ValueError, match=r"protocol: must be one of bend-twist, .* got 'stick'"
+        ):
             protocols.run("stick")
         with pytest.raises(TypeError):
             protocols.run("rod-cantilever", speed=1)
@@ -183,4 +209,7 @@ class TestDenseCurves:
         assert (x[0], x[-1]) == pytest.approx((0.02, 0.1))
         assert (y[0], y[-1]) == pytest.approx((13.0, 14.0))
         assert (np.diff(y) > 0).all()
-        assert [len(part) for part in dense_master("lateral-buckling", Curve({}, (1.0,), (1.0,), (2.0,)))] == [1, 1]
+        assert [
+            len(part)
+            for part in dense_master("lateral-buckling", Curve({}, (1.0,), (1.0,), (2.0,)))
+        ] == [1, 1]

@@ -1,4 +1,7 @@
-"""The cloth solver on the physical protocols, with small settings; the full ones are those of certificates."""
+"""The cloth solver on the physical protocols, with small settings.
+
+The full ones are those of certificates.
+"""
 
 import json
 import math
@@ -10,7 +13,14 @@ import pytest
 from stickslip_sim_core import PRESETS, preset_named, protocols
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.protocols import Curve, ProtocolResult, cantilever, inclined_plane, lateral_buckling, stick_slip
+from stickslip_sim_core.protocols import (
+    Curve,
+    ProtocolResult,
+    cantilever,
+    inclined_plane,
+    lateral_buckling,
+    stick_slip,
+)
 from stickslip_sim_core.protocols.protocol import LENGTH, strip
 from stickslip_sim_core.protocols.result import Refinement
 from stickslip_sim_core.reference import master_curves
@@ -22,7 +32,9 @@ CERTIFIED = preset_named("certified")
 
 @pytest.fixture(scope="module")
 def pressed() -> ProtocolResult:
-    return protocols.run("stick-slip", friction=(0.1, 0.3), cells=(8, 12, 30), structured=1, unstructured=0)
+    return protocols.run(
+        "stick-slip", friction=(0.1, 0.3), cells=(8, 12, 30), structured=1, unstructured=0
+    )
 
 
 class TestStickSlip:
@@ -34,7 +46,9 @@ class TestStickSlip:
         assert static < 2e-3
 
     def test_phases(self, pressed: ProtocolResult) -> None:
-        """Every point of the diagram is where the master curve says, but for those on its very line."""
+        """Every point of the diagram is where the master curve says, but for those on its very
+        line.
+        """
         columns = [pressed.settings[f"phase_{name}"] for name in ("mu", "strain", "regime")]
         mu, strain, regime = (np.array(column) for column in columns)
         strain_c, mu_c = master_curves.stick_slip_triple_point()
@@ -42,7 +56,9 @@ class TestStickSlip:
             threshold = float(master_curves.stick_slip_strain(m)) if m < mu_c else strain_c
             beyond = stick_slip.SLIP if m < mu_c else stick_slip.EXTENDED
             clear = (mu == m) & (np.abs(strain - threshold) > 0.012)
-            assert (regime[clear] == np.where(strain[clear] > threshold, beyond, stick_slip.STICK)).all()
+            assert (
+                regime[clear] == np.where(strain[clear] > threshold, beyond, stick_slip.STICK)
+            ).all()
         assert set(regime) == {stick_slip.STICK, stick_slip.SLIP, stick_slip.EXTENDED}
 
     def test_friction_beyond_the_triple_point_is_refused(self) -> None:
@@ -62,7 +78,9 @@ class TestCantilever:
 
     @pytest.mark.slow
     def test_locking_is_seen(self) -> None:
-        """Ten times as stiff against stretching as it should be, an unstructured mesh is not passed at a sharp bend."""
+        """Ten times as stiff against stretching as it should be, an unstructured mesh is not passed
+        at a sharp bend.
+        """
         loose = strip(0.02, 25, 0)
         good, bad = (cantilever.hang(loose, 300.0, CERTIFIED, Y)[0] for Y in (3e3, 1e6))
         exact = float(master_curves.cantilever(300.0))
@@ -77,15 +95,21 @@ class TestCantilever:
 
 class TestLateralBuckling:
     def test_passes(self) -> None:
-        result = protocols.run("lateral-buckling", aspect=(0.2,), cells=(8, 14, 28), structured=1, unstructured=1)
+        result = protocols.run(
+            "lateral-buckling", aspect=(0.2,), cells=(8, 14, 28), structured=1, unstructured=1
+        )
         assert result.error < 1e-2
 
     @pytest.mark.parametrize(("share", "falls"), [(0.97, False), (1.03, True)])
     def test_it_is_where_the_solver_buckles(self, share: float, falls: bool) -> None:
-        """A sideways push of 1e-5 g turns a strip 3 % heavier than the threshold, and leaves one 3 % lighter."""
+        """A sideways push of 1e-5 g turns a strip 3 % heavier than the threshold, and leaves one 3
+        % lighter.
+        """
         clamped = strip(0.02, 20, "alternating")
         gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)
-        cloth, flat = lateral_buckling.loaded(clamped, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED)
+        cloth, flat = lateral_buckling.loaded(
+            clamped, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED
+        )
         cloth.gravity[:, 2] = 1e-5 * GRAVITY
         for _ in range(1000):
             cloth.step(0.02, held=flat[clamped.held], damping=5.0)
@@ -96,13 +120,19 @@ class TestLateralBuckling:
 class TestLimits:
     def test_of_a_power(self) -> None:
         sizes = ((0.1,), (0.06,), (0.03,))
-        found = Refinement.of(((10.0,), (17.0,), (33.0,)), sizes, tuple((3.0 + 2.0 * h**1.7,) for (h,) in sizes))
+        found = Refinement.of(
+            ((10.0,), (17.0,), (33.0,)), sizes, tuple((3.0 + 2.0 * h**1.7,) for (h,) in sizes)
+        )
         assert found.limit[0] == pytest.approx(3.0)
         assert found.order[0] == pytest.approx(1.7)
 
     def test_without_an_order(self) -> None:
-        """Values that go to and fro: the order is that of theory, and the certificate gives the one of theory."""
-        found = Refinement.of(((10.0,), (20.0,), (40.0,)), ((0.4,), (0.2,), (0.1,)), ((1.0,), (1.3,), (1.2,)))
+        """Values that go to and fro: the order is that of theory, and the certificate gives the one
+        of theory.
+        """
+        found = Refinement.of(
+            ((10.0,), (20.0,), (40.0,)), ((0.4,), (0.2,), (0.1,)), ((1.0,), (1.3,), (1.2,))
+        )
         assert math.isnan(found.order[0])
         assert found.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)
 
@@ -136,10 +166,15 @@ class TestInclinedPlane:
         assert math.isnan(inclined_plane.patch(mesh, 0.5, CERTIFIED).slip_slope())
 
     def test_slips_late_by_the_tolerance(self) -> None:
-        """A residual that is as good as zero for the solver is friction beyond mu: tolerance over mu at most."""
+        """A residual that is as good as zero for the solver is friction beyond mu: tolerance over
+        mu at most.
+        """
         mesh = meshes.grid(0.1, 0.1, 4, 4)
         loose = replace(CERTIFIED, tolerance=1e-2)
-        late = [inclined_plane.patch(mesh, 0.5, preset).slip_slope() / 0.5 - 1.0 for preset in (loose, CERTIFIED)]
+        late = [
+            inclined_plane.patch(mesh, 0.5, preset).slip_slope() / 0.5 - 1.0
+            for preset in (loose, CERTIFIED)
+        ]
         assert 0.0 < late[1] < late[0] < 1e-2 / 0.5 * 1.5
 
 
@@ -149,14 +184,23 @@ class TestPresets:
         certification = protocols.CERTIFICATION[preset]
         always = {"stick-slip", "cantilever", "lateral-buckling", "inclined-plane"}
         contact = {"capstan", "heavy-fold", "stacked-incline", "pull-out"}
-        assert set(certification.protocols) == (always if preset.startswith("thesis-") else always | contact)
+        assert set(certification.protocols) == (
+            always if preset.startswith("thesis-") else always | contact
+        )
         assert certification.numbers()["time_step"] == PRESETS[preset].time_step
 
-    @pytest.mark.parametrize("preset", ["thesis-high", "thesis-low-small-dt", "thesis-low-big-dt", "fast"])
+    @pytest.mark.parametrize(
+        "preset", ["thesis-high", "thesis-low-small-dt", "thesis-low-big-dt", "fast"]
+    )
     def test_every_preset_is_run(self, preset: str) -> None:
         """With whatever outcome, and in JSON's types."""
         result = protocols.run(
-            "lateral-buckling", preset, aspect=(0.2,), poisson=(0.0,), cells=(8, 12, 18), unstructured=0
+            "lateral-buckling",
+            preset,
+            aspect=(0.2,),
+            poisson=(0.0,),
+            cells=(8, 12, 18),
+            unstructured=0,
         )
         assert result.settings["preset"] == preset
         json.dumps(result.as_dict(), allow_nan=False)

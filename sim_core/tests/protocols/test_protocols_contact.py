@@ -26,7 +26,10 @@ class TestCapstan:
     def test_facets_are_not_felt(self, facets: int) -> None:
         strip = OverTriangles(0.3, 0.05, preset_named("certified"), facets)
         heavy, wrap = strip.draw()
-        measured, expected = np.log(heavy.mean() / capstan.LIGHT), np.log(master_curves.capstan(0.3, wrap, 0.05))
+        measured, expected = (
+            np.log(heavy.mean() / capstan.LIGHT),
+            np.log(master_curves.capstan(0.3, wrap, 0.05)),
+        )
         assert measured == pytest.approx(expected, rel=3e-3)
         assert np.ptp(heavy) < 0.01 * heavy.mean()
         assert strip.cloth.total.newton <= 10 * strip.cloth.total.steps
@@ -45,13 +48,23 @@ class TestHeavyFold:
         assert result.settings["unconverged_steps"] == 0
         assert result.settings["least_distance_over_thickness"] > 0.9  # type: ignore[operator]
 
-    def test_an_upper_layer_that_slips_too_soon_is_seen(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(heavy_fold, "SelfContact", lambda mu, thickness: SelfContact(0.97 * mu, thickness))
+    def test_an_upper_layer_that_slips_too_soon_is_seen(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(
+            heavy_fold, "SelfContact", lambda mu, thickness: SelfContact(0.97 * mu, thickness)
+        )
         result = protocols.run("heavy-fold", friction=(0.5,), cells=80)
         assert not result.passed
-        assert [max(map(abs, curve.errors)) < result.tolerance for curve in result.curves] == [True, True, False]
+        assert [max(map(abs, curve.errors)) < result.tolerance for curve in result.curves] == [
+            True,
+            True,
+            False,
+        ]
 
-    def test_one_that_does_not_come_to_rest_has_no_shape(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_one_that_does_not_come_to_rest_has_no_shape(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(heavy_fold, "STEPS_MAX", 3)
         monkeypatch.setattr(heavy_fold, "HOLD_TIME", 0.0)
         assert not protocols.run("heavy-fold", friction=(0.5,), cells=40).passed
@@ -67,4 +80,6 @@ class TestPullOut:
         monkeypatch.setattr(pull_out, "ROUGH", 0.0)
         monkeypatch.setattr(pull_out, "SLIDING", 0.2)
         monkeypatch.setattr(pull_out, "MEASURED", 0.1)
-        assert not protocols.run("pull-out", friction=(0.3,), loads=(1.0,), cells=3, unstructured=0).passed
+        assert not protocols.run(
+            "pull-out", friction=(0.3,), loads=(1.0,), cells=3, unstructured=0
+        ).passed

@@ -26,9 +26,13 @@ class TestCantilever:
 
         def shoot(log_tip: float) -> Floats:
             start = [np.exp(log_tip), 0, 0, 0]
-            return np.asarray(solve_ivp(rate, (0, 1), start, method="DOP853", rtol=1e-12, atol=1e-15).y[:, -1])
+            return np.asarray(
+                solve_ivp(rate, (0, 1), start, method="DOP853", rtol=1e-12, atol=1e-15).y[:, -1]
+            )
 
-        tip = brentq(lambda tip: shoot(tip)[0] - np.pi / 2, -np.sqrt(gamma), np.log(np.pi / 2), xtol=1e-14)
+        tip = brentq(
+            lambda tip: shoot(tip)[0] - np.pi / 2, -np.sqrt(gamma), np.log(np.pi / 2), xtol=1e-14
+        )
         _, _, drop, reach = shoot(tip)
         assert master_curves.cantilever(gamma) == pytest.approx(drop / reach, rel=1e-8)
 
@@ -41,7 +45,9 @@ class TestCantilever:
         np.testing.assert_allclose(ratio - 1, [-0.046, -0.0045], rtol=0.02)
 
     def test_refined(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A hundred times the tolerance changes nothing above 1e-8: the remaining error is far below."""
+        """A hundred times the tolerance changes nothing above 1e-8: the remaining error is far
+        below.
+        """
         gamma = 10.0 ** np.arange(-3.0, 5.1)
         fine = master_curves.cantilever(gamma)
         monkeypatch.setattr(master_curves, "TOLERANCE", 1e-7)
@@ -83,9 +89,13 @@ class TestStickSlip:
 
         def miss(p: Floats) -> Floats:
             def rate(_: float, y: Floats) -> Floats:
-                return np.array([y[1], p[0] * np.cos(y[0]) + p[1] * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])])
+                return np.array(
+                    [y[1], p[0] * np.cos(y[0]) + p[1] * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])]
+                )
 
-            y = solve_ivp(rate, (0, 1), [np.pi / 2, p[2], 0, 0], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+            y = solve_ivp(
+                rate, (0, 1), [np.pi / 2, p[2], 0, 0], method="DOP853", rtol=1e-13, atol=1e-14
+            ).y[:, -1]
             return np.array([y[1], y[2], y[3] - 1 + strain])
 
         load = 20.19
@@ -95,7 +105,9 @@ class TestStickSlip:
 
     def test_small_strains(self) -> None:
         strain = np.array([1e-14, 1e-8, 1e-6])
-        np.testing.assert_allclose(master_curves.stick_slip(strain), 0.445096317 * np.sqrt(strain), rtol=1e-6)
+        np.testing.assert_allclose(
+            master_curves.stick_slip(strain), 0.445096317 * np.sqrt(strain), rtol=1e-6
+        )
 
     def test_triple_point(self) -> None:
         strain, friction = master_curves.stick_slip_triple_point()
@@ -124,7 +136,8 @@ class TestStickSlip:
 def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Floats]:
     """Shoot from the free end: (eta, in-plane field) along the planar rod, from free end to clamp.
 
-    Written in the arc length from the Kirchhoff equations of the design, not in the scaled form of master_curves.
+    Written in the arc length from the Kirchhoff equations of the design, not in the scaled form of
+    master_curves.
     """
     C = 1 / (1 + poisson)
 
@@ -141,9 +154,12 @@ def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Flo
 
     def shoot(tip: float, rtol: float = 3e-14) -> Any:
         start = [tip, 0, 0, 0, 1, 1, 0]
-        return solve_ivp(rate, (0, 1), start, method="DOP853", rtol=rtol, atol=3 * rtol, dense_output=True)
+        return solve_ivp(
+            rate, (0, 1), start, method="DOP853", rtol=rtol, atol=3 * rtol, dense_output=True
+        )
 
-    # The branch from large weights: the angle at the free end is the least that brings the clamp upright.
+    # The branch from large weights: the angle at the free end is the least that brings the clamp
+    # upright.
     ends = ((tip, shoot(tip, 1e-6).y[0, -1]) for tip in np.linspace(0.5, 5.0, 46))
     low, high = next((a[0], b[0]) for a, b in pairwise(ends) if a[1] < 0 < b[1])
     found = shoot(brentq(lambda tip: shoot(tip).y[0, -1], low, high, xtol=1e-15, rtol=1e-15))
@@ -155,7 +171,9 @@ def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Flo
 class TestBendTwist:
     @pytest.mark.parametrize(("phi", "poisson"), [(6.5, 0.0), (6.0, 0.3), (6.0, 0.5)])
     def test_definition(self, phi: float, poisson: float) -> None:
-        """Jacobi's field out of the plane has its first zero at the clamp, the one in the plane none."""
+        """Jacobi's field out of the plane has its first zero at the clamp, the one in the plane
+        none.
+        """
         gamma = float(master_curves.bend_twist(phi, poisson))
         for change, sign in ((1e-8, 1), (-1e-8, -1)):
             eta, in_plane = jacobi_fields(gamma * (1 + change), phi, poisson)
@@ -219,14 +237,22 @@ class TestHeavyFold:
 
         whole = np.linspace(0.0, fold.loop_length, 20_001)
         theta, kappa, x, y = solve_ivp(
-            rate, (0.0, fold.loop_length), np.zeros(4), method="DOP853", t_eval=whole, rtol=1e-13, atol=1e-13
+            rate,
+            (0.0, fold.loop_length),
+            np.zeros(4),
+            method="DOP853",
+            t_eval=whole,
+            rtol=1e-13,
+            atol=1e-13,
         ).y
         assert (theta[-1], kappa[-1], y[-1]) == pytest.approx((np.pi, 0.0, gap), abs=1e-6)
         assert theta.max() > np.pi
         assert fold.tension == pytest.approx(0.5 * gap, abs=1e-8)
         assert fold.height == pytest.approx(y.max(), rel=1e-7)
         assert fold.nose_to_landing == pytest.approx(x.max() - x[-1], rel=1e-6)
-        assert fold.pull(0.3, 2.0) == pytest.approx(0.3 * (2.0 + fold.landing_force) + 0.5 * gap, rel=1e-7)
+        assert fold.pull(0.3, 2.0) == pytest.approx(
+            0.3 * (2.0 + fold.landing_force) + 0.5 * gap, rel=1e-7
+        )
 
     def test_arguments(self) -> None:
         with pytest.raises(ValueError, match=r"gap: must be in \(0, 0\.5\], got 0\.0"):
@@ -241,13 +267,19 @@ class TestCapstan:
     @pytest.mark.parametrize("bending", [0.01, 0.2])
     @pytest.mark.parametrize("mu", [0.1, 0.7])
     def test_tension_along_the_cylinder(self, mu: float, bending: float) -> None:
-        """In the strip where it lies, T' = mu (T - B) and the pressure per width is (T - B) / R, from end to end."""
+        """In the strip where it lies, T' = mu (T - B) and the pressure per width is (T - B) / R,
+        from end to end.
+        """
         light, wrap = 1.0, 2.5
         heavy = float(master_curves.capstan(mu, wrap, bending))
         begin, end = (np.arccos(1.0 - bending / tension) for tension in (light, heavy))
         on_cylinder = light + mu * np.sqrt(2.0 * light * bending - bending**2)
         lying = solve_ivp(
-            lambda _, tension: mu * (tension - bending), (begin, wrap - end), [on_cylinder], rtol=1e-11, atol=1e-12
+            lambda _, tension: mu * (tension - bending),
+            (begin, wrap - end),
+            [on_cylinder],
+            rtol=1e-11,
+            atol=1e-12,
         )
         leaving = float(lying.y[0, -1]) + mu * np.sqrt(2.0 * heavy * bending - bending**2)
         assert leaving == pytest.approx(heavy, rel=1e-9)

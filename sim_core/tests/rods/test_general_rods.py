@@ -1,4 +1,6 @@
-"""Rods beyond three numbers: against the uniform solver, closed forms, finer chains, and the mechanics' symmetries."""
+"""Rods beyond three numbers: against the uniform solver, closed forms, finer chains, and the
+mechanics' symmetries.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +9,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from stickslip_sim_core import RodSolution, _sim_core, solve_general_rods, solve_rods
-from stickslip_sim_core.rods.solve import CLAMP_FRAME, bspline_matrix, clamp_quaternions, interpolation_matrix
+from stickslip_sim_core.rods.solve import (
+    CLAMP_FRAME,
+    bspline_matrix,
+    clamp_quaternions,
+    interpolation_matrix,
+)
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +35,9 @@ def largest_distance(a: RodSolution, b: RodSolution) -> Floats:
 
 
 @pytest.mark.parametrize("samples", [1, 2, 7, 150])
-def test_constant_natural_curvature_is_the_uniform_rod(thesis_rods: Floats, solved: RodSolution, samples: int) -> None:
+def test_constant_natural_curvature_is_the_uniform_rod(
+    thesis_rods: Floats, solved: RodSolution, samples: int
+) -> None:
     gamma, phi0, phi1 = thesis_rods.T
     natural = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None] * np.ones((1, samples, 1))
     general = solve_general_rods(natural, gamma)
@@ -55,7 +64,8 @@ def test_accuracy(anisotropic: bool, clamped: bool) -> None:
     finer = solve_general_rods(natural, gamma, stiffness=K, clamp_frame=clamp, elements=512)
     assert rods.stable.all()
     np.testing.assert_allclose(rods.frame[:, 0], np.broadcast_to(clamp, (60, 3, 3)), atol=1e-14)
-    # A clamp that points anywhere makes boundary layers; hanging ones come to 2e-7 at the 95th percentile.
+    # A clamp that points anywhere makes boundary layers; hanging ones come to 2e-7 at the 95th
+    # percentile.
     error = largest_distance(rods, finer)
     assert np.quantile(error, 0.95) <= (6e-5 if clamped else 6e-7)
 
@@ -70,7 +80,10 @@ def test_without_weight_it_is_the_natural_shape() -> None:
 def test_stiffnesses_scale_against_the_weight() -> None:
     natural, gamma = varying(5, seed=6)
     K = np.array([0.5, 0.8, 1.2])
-    one, two = solve_general_rods(natural, gamma, stiffness=K), solve_general_rods(natural, 2 * gamma, stiffness=2 * K)
+    one, two = (
+        solve_general_rods(natural, gamma, stiffness=K),
+        solve_general_rods(natural, 2 * gamma, stiffness=2 * K),
+    )
     np.testing.assert_allclose(one.centerline, two.centerline, atol=1e-12)
 
 
@@ -78,7 +91,9 @@ def test_turn_about_the_vertical_turns_the_rod() -> None:
     natural, gamma = varying(5, seed=7)
     turn = Rotation.from_euler("z", 0.7).as_matrix()
     turned = solve_general_rods(natural, gamma, clamp_frame=turn @ CLAMP_FRAME)
-    np.testing.assert_allclose(turned.centerline, solve_general_rods(natural, gamma).centerline @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(
+        turned.centerline, solve_general_rods(natural, gamma).centerline @ turn.T, atol=1e-9
+    )
 
 
 def test_roll_of_the_frame_is_a_roll_of_stiffness_and_curvature() -> None:
@@ -86,7 +101,9 @@ def test_roll_of_the_frame_is_a_roll_of_stiffness_and_curvature() -> None:
     natural, gamma = varying(5, seed=8)
     one = solve_general_rods(natural, gamma, stiffness=(0.6, 0.8, 1.3))
     quarter = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # new d2 = d3, new d3 = -d2
-    other = solve_general_rods(natural @ quarter, gamma, stiffness=(0.6, 1.3, 0.8), clamp_frame=CLAMP_FRAME @ quarter)
+    other = solve_general_rods(
+        natural @ quarter, gamma, stiffness=(0.6, 1.3, 0.8), clamp_frame=CLAMP_FRAME @ quarter
+    )
     np.testing.assert_allclose(other.centerline, one.centerline, atol=1e-9)
 
 
@@ -109,12 +126,17 @@ def test_every_kernel_gives_the_same_bits() -> None:
     natural, gamma = varying(11, seed=10)
     n, N, P = 11, 64, 20
     grid, nodes, points = (np.linspace(0, 1, k) for k in (2 * N + 1, N // 2 + 1, P))
-    on_grid, slope = interpolation_matrix(150, grid) @ natural, interpolation_matrix(150, nodes, 1) @ natural
+    on_grid, slope = (
+        interpolation_matrix(150, grid) @ natural,
+        interpolation_matrix(150, nodes, 1) @ natural,
+    )
     at_points = interpolation_matrix(150, points) @ natural
     clamp = np.ascontiguousarray(np.broadcast_to([0.5, 0.5, 0.5, -0.5], (n, 4)))
     K = np.ascontiguousarray(np.broadcast_to([0.5, 0.8, 1.2], (n, 3)))
     results = [
-        _sim_core.solve_general_rods(gamma, K, clamp, on_grid, on_grid, slope, at_points, N, 30.0, kernel=kernel)
+        _sim_core.solve_general_rods(
+            gamma, K, clamp, on_grid, on_grid, slope, at_points, N, 30.0, kernel=kernel
+        )
         for kernel in _sim_core.kernels()
     ]
     for result in results[1:]:
@@ -136,7 +158,9 @@ def test_quaternions_of_clamps() -> None:
 def test_spline_is_scipys(samples: int, derivative: int) -> None:
     values, s = np.random.default_rng(samples).normal(size=samples), np.linspace(0, 1, 77)
     expected = CubicSpline(np.linspace(0, 1, samples), values)(s, derivative)
-    np.testing.assert_allclose(interpolation_matrix(samples, s, derivative) @ values, expected, atol=1e-9)
+    np.testing.assert_allclose(
+        interpolation_matrix(samples, s, derivative) @ values, expected, atol=1e-9
+    )
 
 
 def test_splines_add_up_to_one() -> None:
@@ -155,16 +179,32 @@ def test_no_rods() -> None:
             [[1.0, 2.0, 3.0]],
             r"natural_curvature: must have shape \(any, any, 3\), got shape \(1, 3\)",
         ),
-        ("natural_curvature", np.empty((1, 0, 3)), r"natural_curvature: must have at least one sample"),
+        (
+            "natural_curvature",
+            np.empty((1, 0, 3)),
+            r"natural_curvature: must have at least one sample",
+        ),
         ("gamma", [1.0, 2.0], r"gamma: must have shape \(1\), got shape \(2,\)"),
         ("gamma", [-1.0], r"gamma: must be >= 0, got -1.0"),
         ("stiffness", (1.0, 0.0, 1.0), r"stiffness: must be > 0, got 0.0"),
         ("stiffness", (1.0, 1.0), r"stiffness: must have shape \(1, 3\), got shape \(2,\)"),
         ("clamp_frame", -np.eye(3), r"clamp_frame: must be a rotation, got .* det -1"),
-        ("clamp_frame", 2 * np.eye(3), r"clamp_frame: must be a rotation, got R\^T R - 1 = 3.0e\+00"),
-        ("start_curvature", [[[np.nan, 0, 0]]], r"start_curvature: must be finite, got nan at index 0, 0, 0"),
+        (
+            "clamp_frame",
+            2 * np.eye(3),
+            r"clamp_frame: must be a rotation, got R\^T R - 1 = 3.0e\+00",
+        ),
+        (
+            "start_curvature",
+            [[[np.nan, 0, 0]]],
+            r"start_curvature: must be finite, got nan at index 0, 0, 0",
+        ),
         ("elements", 50, r"elements: must be a multiple of 4"),
-        ("start_curvature", [[[0, 0, 500.0]]], r"elements: must be at least .* \|natural curvature\| = 500"),
+        (
+            "start_curvature",
+            [[[0, 0, 500.0]]],
+            r"elements: must be at least .* \|natural curvature\| = 500",
+        ),
     ],
 )
 def test_bad_argument(field: str, value: object, message: str) -> None:

@@ -55,7 +55,9 @@ def test_negative_weight() -> None:
 
 
 def test_too_few_elements_for_the_natural_turns() -> None:
-    with pytest.raises(ValueError, match=r"elements: must be at least .*, got 48 for \|natural curvature\| = 50"):
+    with pytest.raises(
+        ValueError, match=r"elements: must be at least .*, got 48 for \|natural curvature\| = 50"
+    ):
         solve_rods([100.0], [30.0], [40.0], elements=48)
     assert solve_rods([100.0], [30.0], [40.0], elements=80).stable.all()
 

@@ -18,7 +18,9 @@ def chain(elements: int, turn: float, seed: int) -> Rotation:
     frames = [CLAMP]
     for _ in range(elements):
         axis = rng.normal(size=3)
-        frames.append(frames[-1] * Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(0.0, turn)))
+        frames.append(
+            frames[-1] * Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(0.0, turn))
+        )
     return Rotation.concatenate(frames)
 
 
@@ -49,7 +51,8 @@ def test_gradient_is_derivative_of_energy(turn: float) -> None:
     _, gradient, _ = derivatives(frames, ROD, np.zeros(18))
     step = 1e-5
     differences = [
-        (derivatives(frames, ROD, step * e)[0] - derivatives(frames, ROD, -step * e)[0]) / (2 * step)
+        (derivatives(frames, ROD, step * e)[0] - derivatives(frames, ROD, -step * e)[0])
+        / (2 * step)
         for e in np.eye(18)
     ]
     # Rounding of energies of 1e3 over 2e-5, and step^2 times a third derivative.
@@ -81,8 +84,12 @@ def test_hessian_is_symmetric_and_banded() -> None:
 
 def test_natural_shape_has_no_elastic_energy() -> None:
     n = 20
-    natural = CLAMP * Rotation.from_rotvec(np.linspace(0, 1, n + 1)[:, None] * np.array([3.0, 0.0, 12.0]))
-    energy, gradient, _ = _testing.rod_derivatives(0.0, 3.0, 12.0, 2.0 / 3.0, continuous_quaternions(natural))
+    natural = CLAMP * Rotation.from_rotvec(
+        np.linspace(0, 1, n + 1)[:, None] * np.array([3.0, 0.0, 12.0])
+    )
+    energy, gradient, _ = _testing.rod_derivatives(
+        0.0, 3.0, 12.0, 2.0 / 3.0, continuous_quaternions(natural)
+    )
     assert energy == pytest.approx(0.0, abs=1e-26)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-12)
 

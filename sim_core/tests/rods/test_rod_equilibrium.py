@@ -1,4 +1,6 @@
-"""The rods against results from other methods: closed forms, scipy's boundary value solver, the inverse."""
+"""The rods against results from other methods: closed forms, scipy's boundary value solver, the
+inverse.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ def moment_rate(s: Floats, m: Floats, kappa: Floats, g: Floats, gamma: float) ->
     return np.asarray(np.cross(m, kappa) - gamma * (1 - s)[..., None] * tangent_cross_g)
 
 
-@pytest.mark.parametrize(("phi0", "phi1"), [(3.0, 12.0), (12.0, 20.0), (-2.0, 6.0), (0.0, 9.0), (7.0, 0.0)])
+@pytest.mark.parametrize(
+    ("phi0", "phi1"), [(3.0, 12.0), (12.0, 20.0), (-2.0, 6.0), (0.0, 9.0), (7.0, 0.0)]
+)
 def test_without_weight_it_is_the_helix(phi0: float, phi1: float) -> None:
     rod = solve_rods([0.0], [phi0], [phi1])
     s = np.linspace(0, 1, 150)[:, None]
@@ -30,7 +34,11 @@ def test_without_weight_it_is_the_helix(phi0: float, phi1: float) -> None:
     clamp = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     # Integral of Rodrigues' formula.
     along = axis * axis[0]
-    body = s * along + np.sin(rate * s) / rate * (e_x - along) + (1 - np.cos(rate * s)) / rate * np.cross(axis, e_x)
+    body = (
+        s * along
+        + np.sin(rate * s) / rate * (e_x - along)
+        + (1 - np.cos(rate * s)) / rate * np.cross(axis, e_x)
+    )
     np.testing.assert_allclose(rod.centerline[0], body @ clamp.T, atol=1e-8)
     frames = clamp @ Rotation.from_rotvec(rate * s * axis).as_matrix()
     np.testing.assert_allclose(rod.frame[0], frames, atol=1e-8)
@@ -50,7 +58,13 @@ def test_straight_rod_hangs_straight(gamma: float) -> None:
 
 @pytest.mark.parametrize(
     ("gamma", "phi0", "phi1"),
-    [(100.0, 0.2, 6.0), (400.0, 3.0, 12.0), (1300.0, 12.0, 20.0), (1300.0, 0.2, 20.0), (20.0, 0.0, 3.0)],
+    [
+        (100.0, 0.2, 6.0),
+        (400.0, 3.0, 12.0),
+        (1300.0, 12.0, 20.0),
+        (1300.0, 0.2, 20.0),
+        (20.0, 0.0, 3.0),
+    ],
 )
 @pytest.mark.physics
 def test_strong_form_by_collocation(gamma: float, phi0: float, phi1: float) -> None:
@@ -78,7 +92,10 @@ def test_strong_form_by_collocation(gamma: float, phi0: float, phi1: float) -> N
 
 @pytest.mark.parametrize(("gamma", "tolerance"), [(100.0, 1e-4), (500.0, 1e-3), (1300.0, 3e-2)])
 def test_inverse_recovers_the_natural_curvature(gamma: float, tolerance: float) -> None:
-    """Eq. 5.1 backwards from m(1) = 0 [Bertails-Descoubes et al. 2018]; it is ill-conditioned for large gamma."""
+    """Eq. 5.1 backwards from m(1) = 0 [Bertails-Descoubes et al. 2018].
+
+    It is ill-conditioned for large gamma.
+    """
     phi0, phi1 = 4.0, 11.0
     rod = solve_rods([gamma], [phi0], [phi1], points=1201)
     s = np.linspace(0, 1, 1201)
@@ -93,15 +110,22 @@ def test_inverse_recovers_the_natural_curvature(gamma: float, tolerance: float) 
 
 
 def test_energy_is_the_integral(thesis_rods: Floats) -> None:
-    """E = int 1/2 (kappa - kappa_bar)^T K (kappa - kappa_bar) + gamma z ds, by Boole's rule on the output."""
+    """E = int 1/2 (kappa - kappa_bar)^T K (kappa - kappa_bar) + gamma z ds, by Boole's rule on the
+    output.
+    """
     gamma, phi0, phi1 = thesis_rods[::10].T
     rods = solve_rods(gamma, phi0, phi1, points=1201)
     natural = np.stack([phi0, 0 * phi0, phi1], axis=1)[:, None]
-    density = 0.5 * ((rods.curvature - natural) ** 2 * STIFFNESS).sum(axis=2) + gamma[:, None] * rods.centerline[..., 2]
+    density = (
+        0.5 * ((rods.curvature - natural) ** 2 * STIFFNESS).sum(axis=2)
+        + gamma[:, None] * rods.centerline[..., 2]
+    )
     weights = np.tile([14.0, 32.0, 12.0, 32.0], 300)
     weights = np.append(weights, 7.0)
     weights[0] = 7.0
-    np.testing.assert_allclose(density @ weights * (2 / 45 / 1200), rods.energy, atol=1e-3, rtol=1e-6)
+    np.testing.assert_allclose(
+        density @ weights * (2 / 45 / 1200), rods.energy, atol=1e-3, rtol=1e-6
+    )
 
 
 def test_lowest_point_is_below_the_clamp(solved: RodSolution) -> None:

@@ -1,4 +1,6 @@
-"""Fits to centrelines: exact derivatives, exact data, noise, rods outside the family, bad arguments."""
+"""Fits to centrelines: exact derivatives, exact data, noise, rods outside the family, bad
+arguments.
+"""
 
 import numpy as np
 import pytest
@@ -39,7 +41,12 @@ def outside() -> tuple[Floats, Floats, RodSolution]:
     rng = np.random.default_rng(3)
     natural = rng.uniform([0.2, 0, 6], [12, 0, 20], (6, 3))[:, None] * np.ones((1, 150, 1))
     for k in (1, 2, 3):
-        natural += rng.normal(size=(6, 1, 3)) * np.array([2.0, 2.0, 3.0]) / k * np.cos(np.pi * k * S)[:, None]
+        natural += (
+            rng.normal(size=(6, 1, 3))
+            * np.array([2.0, 2.0, 3.0])
+            / k
+            * np.cos(np.pi * k * S)[:, None]
+        )
     gamma = rng.uniform(100, 1300, 6)
     return natural, gamma, solve_general_rods(natural, gamma)
 
@@ -82,7 +89,9 @@ class TestModel:
         with pytest.raises(ValueError, match=r"quaternions: must have 5 rows, got 1"):
             _sim_core.relax_chain(1.0, np.ones(3), natural, clamp)
         with pytest.raises(ValueError, match=r"basis: must have 4 rows, got 3"):
-            _sim_core.chain_jacobian(1.0, np.ones(3), natural, np.tile(clamp, (5, 1)), np.ones((3, 1)), 1)
+            _sim_core.chain_jacobian(
+                1.0, np.ones(3), natural, np.tile(clamp, (5, 1)), np.ones((3, 1)), 1
+            )
 
     def test_a_step_out_of_reach_is_no_state(self) -> None:
         model, state, _ = self.hung(20)
@@ -98,7 +107,10 @@ class TestParameters:
 
     def test_noise(self, thesis_rods: Floats, solved: RodSolution) -> None:
         fits = [fit_parameters(r) for r in noisy(solved)[:40]]
-        errors = [bending_error(f.solution.curvature[0], k) for f, k in zip(fits, solved.curvature[:40], strict=True)]
+        errors = [
+            bending_error(f.solution.curvature[0], k)
+            for f, k in zip(fits, solved.curvature[:40], strict=True)
+        ]
         assert np.median(errors) < 0.015  # 0.5 % over 50 rods; an earlier study's: 1.1 %
         found = np.array([(f.gamma, f.phi0, f.phi1) for f in fits])
         pulls = (found - thesis_rods[:40]) / np.array([f.standard_error for f in fits])
@@ -114,7 +126,9 @@ class TestParameters:
 
 class TestNaturalCurvature:
     @pytest.mark.slow
-    def test_round_trip_outside_the_family(self, outside: tuple[Floats, Floats, RodSolution]) -> None:
+    def test_round_trip_outside_the_family(
+        self, outside: tuple[Floats, Floats, RodSolution]
+    ) -> None:
         """Noisy centreline, fit, hung again: to the true centreline and curvature."""
         natural, gamma, rods = outside
         fits = [fit_natural_curvature(r, gamma=g) for r, g in zip(noisy(rods), gamma, strict=True)]
@@ -122,22 +136,34 @@ class TestNaturalCurvature:
             assert np.linalg.norm(fit.solution.centerline[0] - truth, axis=1).max() < 2.5 * NOISE
             assert fit.noise == pytest.approx(NOISE, rel=0.1)
             assert fit.solution.stable.all()
-        hanging = [bending_error(f.solution.curvature[0], k) for f, k in zip(fits, rods.curvature, strict=True)]
+        hanging = [
+            bending_error(f.solution.curvature[0], k)
+            for f, k in zip(fits, rods.curvature, strict=True)
+        ]
         rest = [bending_error(f.natural_curvature, k) for f, k in zip(fits, natural, strict=True)]
         assert np.median(hanging) < 0.06
         assert np.median(rest) < 0.06
         uniform = [fit_parameters(r, gamma=g) for r, g in zip(noisy(rods), gamma, strict=True)]
-        coarse = [bending_error(f.solution.curvature[0], k) for f, k in zip(uniform, rods.curvature, strict=True)]
+        coarse = [
+            bending_error(f.solution.curvature[0], k)
+            for f, k in zip(uniform, rods.curvature, strict=True)
+        ]
         assert np.median(hanging) < 0.5 * np.median(coarse)
 
-    def test_in_the_family_it_is_the_uniform_rod(self, thesis_rods: Floats, solved: RodSolution) -> None:
+    def test_in_the_family_it_is_the_uniform_rod(
+        self, thesis_rods: Floats, solved: RodSolution
+    ) -> None:
         errors = [
             bending_error(fit_natural_curvature(r, gamma=g).solution.curvature[0], k)
-            for r, g, k in zip(noisy(solved)[:5], thesis_rods[:5, 0], solved.curvature[:5], strict=True)
+            for r, g, k in zip(
+                noisy(solved)[:5], thesis_rods[:5, 0], solved.curvature[:5], strict=True
+            )
         ]
         assert np.median(errors) < 0.02
 
-    def test_known_noise_sets_the_residual(self, outside: tuple[Floats, Floats, RodSolution]) -> None:
+    def test_known_noise_sets_the_residual(
+        self, outside: tuple[Floats, Floats, RodSolution]
+    ) -> None:
         _, gamma, rods = outside
         fit = fit_natural_curvature(noisy(rods)[0], gamma=gamma[0], noise=NOISE)
         assert fit.noise == pytest.approx(NOISE, rel=0.1)
@@ -151,15 +177,23 @@ class TestNaturalCurvature:
         """Rolling the clamp is rolling the natural curvature: what is fitted hangs alike."""
         natural = np.array([[[4.0, 3.0, 9.0]]])
         rods = solve_general_rods(natural, [400.0], stiffness=(0.9, 1.0, 1.0))
-        fit = fit_natural_curvature(rods.centerline[0], gamma=400.0, stiffness=(0.9, 1.0, 1.0), noise=1e-4)
-        np.testing.assert_allclose(fit.natural_curvature, np.broadcast_to(natural[0], (150, 3)), atol=0.05)
+        fit = fit_natural_curvature(
+            rods.centerline[0], gamma=400.0, stiffness=(0.9, 1.0, 1.0), noise=1e-4
+        )
+        np.testing.assert_allclose(
+            fit.natural_curvature, np.broadcast_to(natural[0], (150, 3)), atol=0.05
+        )
 
 
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
         ("centerline", np.zeros((5, 3)), r"centerline: must have at least 8 points, got 5"),
-        ("centerline", np.zeros((20, 2)), r"centerline: must have shape \(any, 3\), got shape \(20, 2\)"),
+        (
+            "centerline",
+            np.zeros((20, 2)),
+            r"centerline: must have shape \(any, 3\), got shape \(20, 2\)",
+        ),
         ("gamma", 0.0, r"gamma: must be > 0, got 0.0"),
         ("noise", 0.0, r"noise: must be > 0, got 0.0"),
         ("stiffness", (1.0, 1.0), r"stiffness: must have shape"),

@@ -8,17 +8,33 @@ from stickslip_sim_core import RodSolution, _sim_core, solve_rods
 
 Floats = NDArray[np.float64]
 
-FIELDS = ("centerline", "curvature", "frame", "energy", "stable", "converged", "iterations", "residual", "refinement")
+FIELDS = (
+    "centerline",
+    "curvature",
+    "frame",
+    "energy",
+    "stable",
+    "converged",
+    "iterations",
+    "residual",
+    "refinement",
+)
 
 
 def solve_on(kernel: str, rods: Floats, elements: int) -> RodSolution:
     gamma, phi0, phi1 = np.ascontiguousarray(rods.T)
-    return RodSolution(*_sim_core.solve_rods(gamma, phi0, phi1, 1 / 1.5, elements, 150, kernel=kernel))
+    return RodSolution(
+        *_sim_core.solve_rods(gamma, phi0, phi1, 1 / 1.5, elements, 150, kernel=kernel)
+    )
 
 
-def assert_same_bits(a: RodSolution, b: RodSolution, of_a: slice | NDArray[np.int64] = slice(None)) -> None:
+def assert_same_bits(
+    a: RodSolution, b: RodSolution, of_a: slice | NDArray[np.int64] = slice(None)
+) -> None:
     for name in FIELDS:
-        assert np.ascontiguousarray(getattr(a, name)[of_a]).tobytes() == getattr(b, name).tobytes(), name
+        assert (
+            np.ascontiguousarray(getattr(a, name)[of_a]).tobytes() == getattr(b, name).tobytes()
+        ), name
 
 
 @pytest.fixture(params=[48, 128])
@@ -37,12 +53,16 @@ def rods(thesis_rods: Floats, elements: int) -> Floats:
 def test_alone_as_in_company(rods: Floats, elements: int) -> None:
     together = solve_rods(*rods.T, elements=elements)
     for i in range(len(rods)):
-        assert_same_bits(together, solve_rods(*rods[i : i + 1].T, elements=elements), slice(i, i + 1))
+        assert_same_bits(
+            together, solve_rods(*rods[i : i + 1].T, elements=elements), slice(i, i + 1)
+        )
 
 
 def test_any_order(rods: Floats, elements: int) -> None:
     order = np.random.default_rng(0).permutation(len(rods))
-    assert_same_bits(solve_rods(*rods.T, elements=elements), solve_rods(*rods[order].T, elements=elements), order)
+    assert_same_bits(
+        solve_rods(*rods.T, elements=elements), solve_rods(*rods[order].T, elements=elements), order
+    )
 
 
 def test_twice(rods: Floats, elements: int) -> None:

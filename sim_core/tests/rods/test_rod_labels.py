@@ -1,4 +1,7 @@
-"""Distance to itself and reach of curves for which both are known; minima of rods known to have two."""
+"""Distance to itself and reach of curves for which both are known.
+
+Minima of rods known to have two.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +26,9 @@ def test_tight_helix_is_a_pitch_away_from_itself() -> None:
     radius, pitch = 0.1, 0.02
     expected = pitch * 2 * np.pi * radius / np.hypot(2 * np.pi * radius, pitch)
     # The chords of 400 points sag by 1e-4.
-    np.testing.assert_allclose(self_contact_distance(helix(radius, pitch, 4.0)[None]), expected, rtol=5e-3)
+    np.testing.assert_allclose(
+        self_contact_distance(helix(radius, pitch, 4.0)[None]), expected, rtol=5e-3
+    )
 
 
 def test_crossing_strands() -> None:
@@ -52,7 +57,9 @@ def test_thesis_rods_are_clear_of_themselves(solved: RodSolution) -> None:
 
 
 def test_bad_centerline() -> None:
-    with pytest.raises(ValueError, match=r"centerline: must have shape \(any, any, 3\), got shape \(5, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"centerline: must have shape \(any, any, 3\), got shape \(5, 3\)"
+    ):
         reach(np.zeros((5, 3)))
 
 
@@ -69,7 +76,9 @@ class TestOtherMinima:
         """phi0 = 0 but for a hair: both hands have the same energy."""
         found = other_minima([600.0], [1e-9], [15.0])
         assert found.multistable[0]
-        assert found.energy[0] == pytest.approx(solve_rods([600.0], [1e-9], [15.0]).energy[0], abs=1e-4)
+        assert found.energy[0] == pytest.approx(
+            solve_rods([600.0], [1e-9], [15.0]).energy[0], abs=1e-4
+        )
 
     def test_only_where_twist_is_weak(self, thesis_rods: Floats, solved: RodSolution) -> None:
         found = other_minima(*thesis_rods.T, solution=solved)

@@ -22,9 +22,13 @@ class TestRotation:
 
 class TestKeyframes:
     def test_keys_are_met_without_overshoot(self) -> None:
-        keys = Keyframes([0.0, 1.0, 2.0, 4.0], [[0, 0, 0], [1, 0, 0], [1, 2, 0], [3, 1, 0]], np.zeros((4, 3)))
+        keys = Keyframes(
+            [0.0, 1.0, 2.0, 4.0], [[0, 0, 0], [1, 0, 0], [1, 2, 0], [3, 1, 0]], np.zeros((4, 3))
+        )
         for time, move in zip(
-            (0.0, 1.0, 2.0, 4.0, 9.0), ([0, 0, 0], [1, 0, 0], [1, 2, 0], [3, 1, 0], [3, 1, 0]), strict=True
+            (0.0, 1.0, 2.0, 4.0, 9.0),
+            ([0, 0, 0], [1, 0, 0], [1, 2, 0], [3, 1, 0], [3, 1, 0]),
+            strict=True,
         ):
             assert keys.pose(time)[:, 3] == pytest.approx(move)
         times = np.linspace(0.0, 4.0, 401)
@@ -37,7 +41,12 @@ class TestKeyframes:
         assert np.abs(speed[[0, -1]]).max() < 0.05  # at rest at both ends
 
     def test_turns_are_about_a_point(self) -> None:
-        keys = Keyframes([0.0, 1.0], np.zeros((2, 3)), np.array([[0, 0, 0], [0, 0, np.pi]]), about=[1.0, 0.0, 0.0])
+        keys = Keyframes(
+            [0.0, 1.0],
+            np.zeros((2, 3)),
+            np.array([[0, 0, 0], [0, 0, np.pi]]),
+            about=[1.0, 0.0, 0.0],
+        )
         turn, move = keys.pose(1.0)[:, :3], keys.pose(1.0)[:, 3]
         assert turn @ [1.0, 0.0, 0.0] + move == pytest.approx([1.0, 0.0, 0.0])
         assert turn @ [2.0, 0.0, 0.0] + move == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
@@ -58,7 +67,9 @@ class TestKeyframes:
 class TestMovingMesh:
     def test_frames_are_met_and_parabolas_are_exact_between(self) -> None:
         times = np.array([0.0, 0.5, 0.7, 1.5, 2.0])
-        mesh = MovingMesh(np.array([[0, 1, 2]]), times, times[:, None, None] ** 2 * np.ones((5, 3, 3)))
+        mesh = MovingMesh(
+            np.array([[0, 1, 2]]), times, times[:, None, None] ** 2 * np.ones((5, 3, 3))
+        )
         for time in times:
             assert mesh.at(time) == pytest.approx(np.full((3, 3), time**2))
         assert mesh.at(1.1) == pytest.approx(np.full((3, 3), 1.1**2))
@@ -67,11 +78,15 @@ class TestMovingMesh:
 
 class TestOtherMotions:
     def test_a_linear_motion_has_even_speeds_and_ramps(self) -> None:
-        keys = Keyframes([0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True, ramp=1.0)
+        keys = Keyframes(
+            [0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True, ramp=1.0
+        )
         at = [keys.pose(time)[0, 3] for time in (0.0, 0.5, 1.0, 2.0, 3.0, 3.5, 4.0, 9.0)]
         assert at == pytest.approx([0.0, 0.125, 0.5, 1.5, 2.5, 2.875, 3.0, 3.0])
         assert keys.last == 4.0
-        sharp = Keyframes([0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True)
+        sharp = Keyframes(
+            [0.0, 3.0], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], np.zeros((2, 3)), linear=True
+        )
         assert sharp.pose(1.5)[0, 3] == pytest.approx(1.5)
 
     def test_a_spin_gains_its_speed_and_keeps_it(self) -> None:
@@ -86,6 +101,8 @@ class TestOtherMotions:
         bones[1, 1, 2, 3] = 1.0
         weights = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
         for strength in (1.0, 0.5):
-            mesh = MovingMesh(np.array([[0, 1, 2]]), [0.0, 1.0], bones, np.eye(3), weights, strength)
+            mesh = MovingMesh(
+                np.array([[0, 1, 2]]), [0.0, 1.0], bones, np.eye(3), weights, strength
+            )
             moved = mesh.at(1.0) - np.eye(3)
             assert moved[:, 2] == pytest.approx(strength * np.array([0.0, 0.5, 1.0]))

@@ -12,7 +12,9 @@ from stickslip_sim_core.scenes import cloth_drag, holders
 
 pytestmark = pytest.mark.physics
 
-DURATION = cloth_drag.duration_of(cloth_drag.DROP) + cloth_drag.LEGS * cloth_drag.duration_of(cloth_drag.DRAG)  # s
+DURATION = cloth_drag.duration_of(cloth_drag.DROP) + cloth_drag.LEGS * cloth_drag.duration_of(
+    cloth_drag.DRAG
+)  # s
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +25,15 @@ def dragged() -> ClothRun:
 
 class TestHolders:
     def test_lengths_and_times(self) -> None:
-        """6 cm down, 30 cm to, fro, to, fro, at 1 cm/s after a second of 1 cm/s^2: 7 s and four times 31 s."""
+        """6 cm down, 30 cm to, fro, to, fro, at 1 cm/s after a second of 1 cm/s^2: 7 s and four
+        times 31 s.
+        """
         assert cloth_drag.duration_of(0.06) == pytest.approx(7.0)
         assert cloth_drag.duration_of(0.3) == pytest.approx(31.0)
         assert pytest.approx(131.0) == DURATION
-        ends = [cloth_drag.holder_path(t).tolist() for t in (0.0, 7.0, 38.0, 69.0, 100.0, 131.0, 140.0)]
+        ends = [
+            cloth_drag.holder_path(t).tolist() for t in (0.0, 7.0, 38.0, 69.0, 100.0, 131.0, 140.0)
+        ]
         x = [0.0, 0.0, 0.3, 0.0, 0.3, 0.0, 0.0]
         assert np.array(ends) == pytest.approx(np.column_stack([x, [0.0] + [-0.06] * 6]), abs=1e-12)
 
@@ -41,7 +47,9 @@ class TestHolders:
         assert (speed[down][:, 1] <= 1e-12).all()
         assert np.abs(speed[down][:, 0]).max() == 0.0
         assert np.abs(speed[drag][:, 1]).max() < 1e-12
-        assert np.mean(np.isclose(np.abs(speed[drag][:, 0]), 0.01)) == pytest.approx(29.0 / 31.0, abs=0.01)
+        assert np.mean(np.isclose(np.abs(speed[drag][:, 0]), 0.01)) == pytest.approx(
+            29.0 / 31.0, abs=0.01
+        )
 
     def test_frames_cover_it(self) -> None:
         assert cloth_drag.FRAMES == 300
@@ -59,7 +67,9 @@ class TestClothRun:
         assert dragged.self_intersections.shape == (110,)
 
     def test_frames_are_at_their_times(self, dragged: ClothRun) -> None:
-        """Held corners are where the holders are at k/2.4 s, to 0.02 mm: between steps they are on a cubic."""
+        """Held corners are where the holders are at k/2.4 s, to 0.02 mm: between steps they are on
+        a cubic.
+        """
         assert dragged.times == pytest.approx(np.arange(110) / 2.4)
         corner = int(np.argmax(dragged.rest.sum(axis=1)))
         came = dragged.positions[:, corner] - dragged.positions[0, corner]
@@ -69,7 +79,9 @@ class TestClothRun:
         assert np.abs(came[:, 1]).max() == 0.0
 
     def test_starts_at_rest_over_the_floor(self, dragged: ClothRun) -> None:
-        assert dragged.positions[0, :, 2].min() == pytest.approx(cloth_drag.CLEARANCE, abs=2e-3)  # it sags
+        assert dragged.positions[0, :, 2].min() == pytest.approx(
+            cloth_drag.CLEARANCE, abs=2e-3
+        )  # it sags
         assert dragged.positions[:, :, 2].min() > -2e-5  # between steps, on a cubic
         assert dragged.positions[60, :, 2].min() < 1e-9
 
@@ -102,19 +114,26 @@ class TestClothRun:
             assert fallen.labels["landed_side"] == np.sign(offset)
             seen.add(fallen.labels["bias_side"])
         assert seen == {-1, 1}
-        assert cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=17).run().labels["landed_side"] == 0
+        assert (
+            cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=17).run().labels["landed_side"]
+            == 0
+        )
 
     def test_hung_shape_is_one(self) -> None:
         """Whatever the preset, settings and kernels: to 1e-6 mm and 1e-3 mm."""
         mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 10, 10)
         first = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(holders, "HANGING", replace(holders.HANGING, tolerance=1e-4, time_step=0.035))
+            patch.setattr(
+                holders, "HANGING", replace(holders.HANGING, tolerance=1e-4, time_step=0.035)
+            )
             second = cloth_drag.hang(mesh, fabric("camel-ponte-roma"), seed=0, kernel="baseline")
         assert first.reason == second.reason == ""
         assert second.positions == pytest.approx(first.positions, abs=1e-6)
         starts = [
-            cloth_drag.scene("gray-interlock", 0.5, mesh=9, frames=1, preset=preset).run().positions[0]
+            cloth_drag.scene("gray-interlock", 0.5, mesh=9, frames=1, preset=preset)
+            .run()
+            .positions[0]
             for preset in ("certified", "fast", "thesis-high")
         ]
         assert (starts[0] == starts[1]).all()
@@ -128,7 +147,9 @@ class TestClothRun:
             assert hung.reason == "", name
             assert not hung.reason, name
 
-    def test_hung_shape_that_does_not_settle_is_not_valid(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_hung_shape_that_does_not_settle_is_not_valid(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(holders, "HANGING_STEPS_MAX", 2)
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=1).run()
         assert not scene.valid
@@ -136,23 +157,31 @@ class TestClothRun:
 
     def test_frames_are_announced(self) -> None:
         seen: list[tuple[int, int]] = []
-        cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=4).run(lambda *done: seen.append(done))
+        cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=4).run(
+            lambda *done: seen.append(done)
+        )
         assert seen == [(2, 4), (3, 4), (4, 4)]
 
     def test_kernel_is_recorded(self) -> None:
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=2, kernel="baseline").run()
         assert scene.labels["kernel"] == "baseline"
-        with pytest.raises(ValueError, match="kernel: must be one that this processor runs, baseline"):
+        with pytest.raises(
+            ValueError, match="kernel: must be one that this processor runs, baseline"
+        ):
             cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=2, kernel="best").run()
 
     def test_rerun_is_bit_identical(self) -> None:
-        first, second = (cloth_drag.scene("gray-interlock", 0.3, mesh=7, frames=30).run() for _ in range(2))
+        first, second = (
+            cloth_drag.scene("gray-interlock", 0.3, mesh=7, frames=30).run() for _ in range(2)
+        )
         assert first.positions.tobytes() == second.positions.tobytes()
         assert first.record["contact_force"].tobytes() == second.record["contact_force"].tobytes()
 
     def test_other_meshes_and_presets(self) -> None:
         mesh = meshes.unstructured(cloth_drag.SIDE, cloth_drag.SIDE, 0.02, 1)
-        assert cloth_drag.scene("gray-interlock", 0.3, mesh=mesh, frames=8, preset="fast").run().valid
+        assert (
+            cloth_drag.scene("gray-interlock", 0.3, mesh=mesh, frames=8, preset="fast").run().valid
+        )
 
     @pytest.mark.parametrize(
         ("settings", "message"),

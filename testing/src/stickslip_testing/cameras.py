@@ -17,8 +17,8 @@ def looking_at(
 ) -> Camera:
     """Place a camera around a target, upright, the target in the middle of its image.
 
-    Azimuth is the camera's direction seen from the target, from +x towards +y [degree]; elevation is above the
-    horizon [degree], within (-90, 90); distance [scene units]; focal [px].
+    Azimuth is the camera's direction seen from the target, from +x towards +y [degree]; elevation
+    is above the horizon [degree], within (-90, 90); distance [scene units]; focal [px].
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])

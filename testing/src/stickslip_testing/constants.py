@@ -1,6 +1,8 @@
-"""Sensitivity of the cloth solver to its constants: small scenes that run with each of them halved and doubled.
+"""Sensitivity of the cloth solver to its constants: small scenes that run with each of them halved
+and doubled.
 
-`python -m stickslip_testing.constants OUT.json` runs them all and writes what changes (4 CPU minutes).
+`python -m stickslip_testing.constants OUT.json` runs them all and writes what changes (4 CPU
+minutes).
 """
 
 import json
@@ -26,7 +28,17 @@ from stickslip_testing.tumbles import STEP, Tumble, crumple, folding, pile, sque
 FABRIC = "gray-interlock"
 COUNTS = frozenset(
     {
-        *(f"newton.{name}" for name in ("reversals_from", "rounds_max", "window", "cuts_max", "smooth_hops", "hops")),
+        *(
+            f"newton.{name}"
+            for name in (
+                "reversals_from",
+                "rounds_max",
+                "window",
+                "cuts_max",
+                "smooth_hops",
+                "hops",
+            )
+        ),
         *("newton.halving_iterations", "newton.longest", "path.rounds_max", "factor.pool"),
         *("stepping.strained_soon", "stepping.strained_long", "stepping.smooth_iterations"),
         *("control.halvings", "control.looks"),
@@ -71,7 +83,9 @@ class Change:
 
 
 def scaled(name: str, factor: float) -> float:
-    """Return a constant times a factor, within `LARGEST`, and rounded to an integer >= 1 where it is a count."""
+    """Return a constant times a factor, within `LARGEST`, and rounded to an integer >= 1 where it
+    is a count.
+    """
     value = min(_sim_core.cloth_constants()[name] * factor, LARGEST.get(name, np.inf))
     return float(max(1, round(value))) if name in COUNTS else value
 
@@ -81,7 +95,12 @@ def outcome(scene: str, constants: Mapping[str, float] = MappingProxyType({})) -
     cloth = SCENES[scene](replace(preset_named("certified"), constants=dict(constants)))
     found = cloth.total
     return Outcome(
-        cloth.positions, found.newton, found.krylov, found.factorizations, found.unconverged, found.least_distance
+        cloth.positions,
+        found.newton,
+        found.krylov,
+        found.factorizations,
+        found.unconverged,
+        found.least_distance,
     )
 
 
@@ -151,7 +170,9 @@ def valley(preset: SolverSettings) -> Cloth:
 
 
 def strip(preset: SolverSettings) -> Cloth:
-    """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's choice."""
+    """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's
+    choice.
+    """
     mesh = meshes.grid(0.02, 0.12, 3, 16)
     held = np.flatnonzero(mesh.rest[:, 1] > 0.06 - 1e-9)
     cloth = Cloth(mesh, fabric(FABRIC), preset, held=held, self_contact=SelfContact(0.5))
@@ -189,9 +210,9 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
         "let down": lambda preset: controlled(folding(9, preset), 1.0),
     }
 )
-"""Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls, one that is squeezed
-within its plane, one on a ball, one that slides, one on edges, one in a valley; the crumple and the fold by steps of
-the controller's choice."""
+"""Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls,
+one that is squeezed within its plane, one on a ball, one that slides, one on edges, one in a
+valley; the crumple and the fold by steps of the controller's choice."""
 
 
 def main(out: Path) -> None:
@@ -204,7 +225,9 @@ def main(out: Path) -> None:
         if scaled(name, factor) != scaled(name, 1.0)
         for scene in SCENES
     ]
-    out.write_text(json.dumps({"constants": _sim_core.cloth_constants(), "rows": rows}, indent=1) + "\n")
+    out.write_text(
+        json.dumps({"constants": _sim_core.cloth_constants(), "rows": rows}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":

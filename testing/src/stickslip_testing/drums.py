@@ -1,4 +1,6 @@
-"""Strips that are drawn over cylinders of triangles and of cloth, where the capstan has a round one."""
+"""Strips that are drawn over cylinders of triangles and of cloth, where the capstan has a round
+one.
+"""
 
 from typing import ClassVar
 
@@ -30,7 +32,9 @@ class OverTriangles(capstan.Strip):
 
     def over(self, mu: float, mesh: meshes.Mesh, material: Fabric, force_scale: float) -> Cloth:
         around = tube(self.facets, capstan.WIDTH * self.cell, mu)
-        return Cloth(mesh, material, self.preset, held=self.held, surfaces=[around], force_scale=force_scale)
+        return Cloth(
+            mesh, material, self.preset, held=self.held, surfaces=[around], force_scale=force_scale
+        )
 
 
 class OverCloth(OverTriangles):
@@ -51,20 +55,34 @@ class OverCloth(OverTriangles):
 
 
 def tube(facets: int, breadth: float, mu: float) -> Surface:
-    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches at the radius."""
+    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches
+    at the radius.
+    """
     angle = 2.0 * np.pi * np.arange(facets) / facets
-    ring = (capstan.RADIUS - THICKNESS) * np.column_stack([np.cos(angle), 0.0 * angle, np.sin(angle)])
+    ring = (capstan.RADIUS - THICKNESS) * np.column_stack(
+        [np.cos(angle), 0.0 * angle, np.sin(angle)]
+    )
     i = np.arange(facets)
     j = (i + 1) % facets
-    triangles = np.concatenate([np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])])
-    return Surface(triangles, np.concatenate([ring + np.array([0.0, s * breadth, 0.0]) for s in (-1.0, 1.0)]), mu)
+    triangles = np.concatenate(
+        [np.column_stack([i, j, facets + i]), np.column_stack([j, facets + j, facets + i])]
+    )
+    return Surface(
+        triangles,
+        np.concatenate([ring + np.array([0.0, s * breadth, 0.0]) for s in (-1.0, 1.0)]),
+        mu,
+    )
 
 
 def cover(facets: int, breadth: float) -> tuple[meshes.Mesh, Floats]:
-    """Return a sheet around the arc that the strip lies on and 30 degrees more, and its vertices (V, 3) [m]."""
+    """Return a sheet around the arc that the strip lies on and 30 degrees more, and its vertices
+    (V, 3) [m].
+    """
     angle = 2.0 * np.pi / facets
     cells = int(np.ceil((capstan.WRAP + np.pi / 6.0) / angle))
     radius = capstan.RADIUS - THICKNESS
-    mesh = meshes.grid(cells * angle * radius, breadth, cells, max(2, round(breadth / (angle * radius))))
+    mesh = meshes.grid(
+        cells * angle * radius, breadth, cells, max(2, round(breadth / (angle * radius)))
+    )
     at = 0.5 * capstan.WRAP + mesh.rest[:, 0] / radius
     return mesh, np.column_stack([-radius * np.cos(at), mesh.rest[:, 1], radius * np.sin(at)])

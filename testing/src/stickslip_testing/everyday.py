@@ -1,4 +1,6 @@
-"""Everyday scenes of cloth with a known answer or bound: each is right, refused, or not valid for the true reason."""
+"""Everyday scenes of cloth with a known answer or bound: each is right, refused, or not valid for
+the true reason.
+"""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -40,7 +42,9 @@ def _run(
     cloth.set_state(start, bodies=bodies(0.0))
     for frame in range(1, round(seconds * fps) + 1):
         cloth.advance(
-            frame / fps, lambda t: (cloth.gravity, path(start[hands], t), bodies(t)), damping=lambda _: damping
+            frame / fps,
+            lambda t: (cloth.gravity, path(start[hands], t), bodies(t)),
+            damping=lambda _: damping,
         )
     return checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))[0], cloth
 
@@ -54,7 +58,9 @@ def napkin_on_floor(cells: int) -> str:
     """The floor bears the weight within 5 %."""
     code, cloth = _run(cells, lambda _: [plane(0.5)], seconds=0.4)
     share = cloth.contact_force()[2] / (cloth.masses.sum() * GRAVITY)
-    return code or ("right" if abs(share - 1.0) < 0.05 else f"wrong: bears {share:.3g} of the weight")
+    return code or (
+        "right" if abs(share - 1.0) < 0.05 else f"wrong: bears {share:.3g} of the weight"
+    )
 
 
 def _caught(cells: int, bodies: Bodies) -> str:
@@ -87,16 +93,22 @@ def rod_of_half(cells: int) -> str:
 def wide_rod(cells: int) -> str:
     """A rod with a radius of ten cells carries the napkin."""
     radius = 10.0 * SIDE / cells
-    return _caught(cells, lambda _: [cylinder(1.0, radius, origin=[0.0, 0.0, 0.01 - radius], rotation=ALONG_Y)])
+    return _caught(
+        cells, lambda _: [cylinder(1.0, radius, origin=[0.0, 0.0, 0.01 - radius], rotation=ALONG_Y)]
+    )
 
 
 def table_corner(cells: int) -> str:
     """The rounded corner of a table carries the middle of a napkin that falls on it."""
-    return _caught(cells, lambda _: [box(1.0, [0.2, 0.2, 0.1], rounding=0.0128, origin=[0.08, 0.08, -0.045])])
+    return _caught(
+        cells, lambda _: [box(1.0, [0.2, 0.2, 0.1], rounding=0.0128, origin=[0.08, 0.08, -0.045])]
+    )
 
 
 def _thrown(cells: int, speed: float) -> str:
-    """A ball of two cells that goes 0.2 m, from 5 cm below, does not go through a held napkin unseen."""
+    """A ball of two cells that goes 0.2 m, from 5 cm below, does not go through a held napkin
+    unseen.
+    """
     radius = 2.0 * SIDE / cells
 
     def bodies(t: float) -> list[Body]:
@@ -105,7 +117,11 @@ def _thrown(cells: int, speed: float) -> str:
     rim = _rim(cells).astype(int)
     code, cloth = _run(cells, bodies, seconds=0.2 / speed, held=rim, fps=50.0 * speed)
     middle = cloth.positions[len(cloth.positions) // 2, 2]
-    return code or ("right" if middle > 0.1 else f"wrong: the ball went through, the middle is at {middle:.3g} m")
+    return code or (
+        "right"
+        if middle > 0.1
+        else f"wrong: the ball went through, the middle is at {middle:.3g} m"
+    )
 
 
 def thrown_ball(cells: int) -> str:
@@ -119,10 +135,14 @@ def pushed_ball(cells: int) -> str:
 
 
 def paddle(cells: int) -> str:
-    """A floor that turns by 20 rad/s for 0.05 s throws no vertex faster than twice its own fastest point there."""
+    """A floor that turns by 20 rad/s for 0.05 s throws no vertex faster than twice its own fastest
+    point there.
+    """
 
     def bodies(t: float) -> list[Body]:
-        return [plane(0.0, origin=[-0.06, 0.0, 0.0], normal=[-np.sin(20.0 * t), 0.0, np.cos(20.0 * t)])]
+        return [
+            plane(0.0, origin=[-0.06, 0.0, 0.0], normal=[-np.sin(20.0 * t), 0.0, np.cos(20.0 * t)])
+        ]
 
     code, cloth = _run(cells, bodies, seconds=0.05, height=1e-6)
     speed = float(np.linalg.norm(cloth.velocities, axis=1).max())
@@ -144,19 +164,27 @@ def hanging(cells: int) -> str:
     """Two held corners bear the weight within 5 %."""
     code, cloth = _run(cells, lambda _: [], held=[0, cells], seconds=1.0, damping=10.0)
     share = cloth.reactions[cloth.held, 2].sum() / (cloth.masses.sum() * GRAVITY)
-    return code or ("right" if abs(share - 1.0) < 0.05 else f"wrong: holders bear {share:.3g} of the weight")
+    return code or (
+        "right" if abs(share - 1.0) < 0.05 else f"wrong: holders bear {share:.3g} of the weight"
+    )
 
 
 def lifted(cells: int) -> str:
     """A floor that rises with 5 m/s^2 bears 1 + 5 / g of the weight within 5 %."""
-    code, cloth = _run(cells, lambda t: [plane(0.5, origin=[0.0, 0.0, 2.5 * t * t])], height=1e-6, seconds=1.0)
+    code, cloth = _run(
+        cells, lambda t: [plane(0.5, origin=[0.0, 0.0, 2.5 * t * t])], height=1e-6, seconds=1.0
+    )
     share = cloth.contact_force()[2] / (cloth.masses.sum() * (GRAVITY + 5.0))
-    return code or ("right" if abs(share - 1.0) < 0.05 else f"wrong: bears {share:.3g} of what it should")
+    return code or (
+        "right" if abs(share - 1.0) < 0.05 else f"wrong: bears {share:.3g} of what it should"
+    )
 
 
 def _on_incline(cells: int, mu: float) -> tuple[str, float]:
     """Return the code, and the mean acceleration down an incline of 30 degrees [m/s^2]."""
-    tilt = np.array([[np.cos(np.pi / 6), 0.0, 0.5], [0.0, 1.0, 0.0], [-0.5, 0.0, np.cos(np.pi / 6)]])
+    tilt = np.array(
+        [[np.cos(np.pi / 6), 0.0, 0.5], [0.0, 1.0, 0.0], [-0.5, 0.0, np.cos(np.pi / 6)]]
+    )
     code, cloth = _run(cells, lambda _: [plane(mu, normal=tilt[:, 2])], height=1e-6, turn=tilt)
     return code, float(cloth.velocities.mean(axis=0) @ tilt[:, 0]) / cloth.time
 
@@ -165,7 +193,11 @@ def slides_down(cells: int) -> str:
     """At mu 0.2 it accelerates by g (sin - mu cos) within 5 %."""
     code, found = _on_incline(cells, 0.2)
     expected = GRAVITY * (0.5 - 0.2 * np.cos(np.pi / 6))
-    return code or ("right" if abs(found / expected - 1.0) < 0.05 else f"wrong: {found:.3g} m/s^2, not {expected:.3g}")
+    return code or (
+        "right"
+        if abs(found / expected - 1.0) < 0.05
+        else f"wrong: {found:.3g} m/s^2, not {expected:.3g}"
+    )
 
 
 def sticks(cells: int) -> str:
@@ -175,12 +207,16 @@ def sticks(cells: int) -> str:
 
 
 def slides_into_corner(cells: int) -> str:
-    """A corner of a floor and two walls, turned until all three bear, carries the corner of a napkin within 5 %."""
+    """A corner of a floor and two walls, turned until all three bear, carries the corner of a
+    napkin within 5 %.
+    """
     along, up = np.array([1.0, -1.0, 0.0]) / 2.0, np.array([-1.0, -1.0, 1.0]) / 6.0**0.5
     axes = np.column_stack([up - along, up + along, np.array([1.0, 1.0, 2.0]) / 6.0**0.5])
     code, cloth = _run(
         cells,
-        lambda _: [plane(0.1, normal=axis, origin=-0.055 * axis * (i < 2)) for i, axis in enumerate(axes.T)],
+        lambda _: [
+            plane(0.1, normal=axis, origin=-0.055 * axis * (i < 2)) for i, axis in enumerate(axes.T)
+        ],
         height=1e-4,
         seconds=1.0,
         damping=2.0,
@@ -227,13 +263,19 @@ def shaken_floor(cells: int) -> str:
 
 
 def shaken_from_rest(cells: int) -> str:
-    """A floor that begins to shake after 0.5 s, in periods of the longest step, takes the cloth along within 5 %."""
+    """A floor that begins to shake after 0.5 s, in periods of the longest step, takes the cloth
+    along within 5 %.
+    """
 
     def bodies(t: float) -> list[Body]:
-        return [plane(1.0, origin=[1e-3 * (1.0 - np.cos(16.0 * np.pi * max(t - 0.5, 0.0))), 0.0, 0.0])]
+        return [
+            plane(1.0, origin=[1e-3 * (1.0 - np.cos(16.0 * np.pi * max(t - 0.5, 0.0))), 0.0, 0.0])
+        ]
 
     code, cloth = _run(cells, bodies, seconds=0.5625, height=1e-6, fps=16.0)
-    way = float((cloth.positions_at(0.5625) - np.pad(cloth.mesh.rest, ((0, 0), (0, 1))))[:, 0].mean())
+    way = float(
+        (cloth.positions_at(0.5625) - np.pad(cloth.mesh.rest, ((0, 0), (0, 1))))[:, 0].mean()
+    )
     return code or ("right" if abs(way / 2e-3 - 1.0) < 0.05 else f"wrong: goes {way:.3g} m of 2 mm")
 
 
@@ -244,14 +286,19 @@ def jumping_floor(cells: int) -> str:
 
 def jumping_holder(cells: int) -> str:
     """A holder that is 1 cm further from one instant to the next."""
-    return _run(cells, lambda _: [], held=[0, cells], path=lambda start, t: start + 0.01 * (t > 0.15))[0]
+    return _run(
+        cells, lambda _: [], held=[0, cells], path=lambda start, t: start + 0.01 * (t > 0.15)
+    )[0]
 
 
 def squeezed(cells: int) -> str:
     """Two blocks close on a napkin until they cross."""
 
     def bodies(t: float) -> list[Body]:
-        return [plane(0.5), box(0.5, [0.2, 0.2, 0.1], rounding=0.04, origin=[0.0, 0.0, 0.06 - 0.2 * t])]
+        return [
+            plane(0.5),
+            box(0.5, [0.2, 0.2, 0.1], rounding=0.04, origin=[0.0, 0.0, 0.06 - 0.2 * t]),
+        ]
 
     return _run(cells, bodies, seconds=0.15)[0]
 

@@ -1,4 +1,7 @@
-"""Films of cloth as a phone records them: lens distortion, camera shake and lossy H.264. Needs PyAV and OpenCV."""
+"""Films of cloth as a phone records them: lens distortion, camera shake and lossy H.264.
+
+Needs PyAV and OpenCV.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +22,9 @@ def meshes_at(run: Runs, seconds: Array) -> SingleFloats:
     times = np.maximum(np.asarray(seconds), 0.0) * RATE
     known = np.array(run.instants)
     after = np.clip(np.searchsorted(known, times, side="right"), 1, len(known) - 1)
-    share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)[:, None, None, None]
+    share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)[
+        :, None, None, None
+    ]
 
     def moved(instants: Array) -> Floats:
         x, z = holder_path(instants)
@@ -39,9 +44,11 @@ def write_film(
     shake: Floats,
     quality: int = 20,
 ) -> None:
-    """Write pictures (height, width, 3), 0 to 255, of a pinhole camera as an H.264 film through a lens.
+    """Write pictures (height, width, 3), 0 to 255, of a pinhole camera as an H.264 film through a
+    lens.
 
-    Each is moved by its row of `shake` (F, 2) [px]. `quality` is x264's constant rate factor: larger is worse.
+    Each is moved by its row of `shake` (F, 2) [px]. `quality` is x264's constant rate factor:
+    larger is worse.
     """
     import av
     import cv2
@@ -49,7 +56,9 @@ def write_film(
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     columns, rows = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
     seen = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(seen, matrix, np.array(distortion), P=matrix).reshape(camera.height, camera.width, 2)
+    flat = cv2.undistortPoints(seen, matrix, np.array(distortion), P=matrix).reshape(
+        camera.height, camera.width, 2
+    )
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height = camera.width, camera.height

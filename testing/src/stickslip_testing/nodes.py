@@ -1,4 +1,7 @@
-"""Coordinators and workers in processes of their own, which tests kill. The workers only pretend to work."""
+"""Coordinators and workers in processes of their own, which tests kill.
+
+The workers only pretend to work.
+"""
 
 import json
 import os
@@ -69,7 +72,9 @@ for line in sys.stdin:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Return the process that starts others: it has imported what they need, which takes 2 s of CPU time each time."""
+    """Return the process that starts others: it has imported what they need, which takes 2 s of CPU
+    time each time.
+    """
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", NURSERY], text=True, **pipes)  # type: ignore[call-overload,no-any-return]
 

@@ -1,4 +1,7 @@
-"""A PostgreSQL server for tests, in a temporary directory, with a Unix socket; it ends with the process."""
+"""A PostgreSQL server for tests, in a temporary directory, with a Unix socket.
+
+It ends with the process.
+"""
 
 import ctypes
 import os
@@ -21,7 +24,13 @@ from stickslip_services.settings import Settings
 
 _PR_SET_PDEATHSIG = 1
 _OPTIONS = (
-    *("listen_addresses=", "fsync=off", "synchronous_commit=off", "full_page_writes=off", "shared_buffers=64MB"),
+    *(
+        "listen_addresses=",
+        "fsync=off",
+        "synchronous_commit=off",
+        "full_page_writes=off",
+        "shared_buffers=64MB",
+    ),
     *("wal_level=minimal", "max_wal_senders=0", "autovacuum=off"),
 )
 """Without TCP, and without waiting for the disk."""
@@ -38,7 +47,9 @@ _INITIAL = (
 def find_programs() -> Path | None:
     """Return the directory of PostgreSQL's programs, None if they are not installed."""
     found = [Path(path).parent for path in (shutil.which("initdb"),) if path]
-    versions = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4]))
+    versions = sorted(
+        Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4])
+    )
     found += [path.parent for path in reversed(versions)]
     return next((path for path in found if (path / "postgres").exists()), None)
 
@@ -74,7 +85,9 @@ class PostgresqlServer:
                 "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity "
                 "WHERE datname = current_database() AND pid != pg_backend_pid()"
             )
-            connection.execute("; ".join([*deletions, "SELECT setval(seqrelid, 1, false) FROM pg_sequence"]))
+            connection.execute(
+                "; ".join([*deletions, "SELECT setval(seqrelid, 1, false) FROM pg_sequence"])
+            )
         return self._migrated
 
     def execute(self, statement: str, database: str = "postgres") -> None:
@@ -126,7 +139,9 @@ def postgresql_server(programs: Path) -> Iterator[PostgresqlServer]:
         shutil.rmtree(directory)
 
 
-def _wait_until_ready(server: PostgresqlServer, process: "subprocess.Popen[bytes]", log: Path) -> None:
+def _wait_until_ready(
+    server: PostgresqlServer, process: "subprocess.Popen[bytes]", log: Path
+) -> None:
     deadline = time.monotonic() + 120
     while True:
         try:

@@ -1,4 +1,6 @@
-"""A real S3 server in a process of its own, and a proxy in front of it that does what networks and clouds do."""
+"""A real S3 server in a process of its own, and a proxy in front of it that does what networks and
+clouds do.
+"""
 
 import http.client
 import os
@@ -18,7 +20,9 @@ from http.server import BaseHTTPRequestHandler
 _START_SECONDS = 60.0
 
 Fault = Callable[[str, str], str]
-"""Says what is to happen to a request, by its method and its path: "" for nothing, or a key of `Proxy.faults`."""
+"""Says what is to happen to a request, by its method and its path: "" for nothing, or a key of
+`Proxy.faults`.
+"""
 
 
 def no_fault(method: str, path: str) -> str:
@@ -58,15 +62,22 @@ def _handler(proxy: Proxy) -> type[BaseHTTPRequestHandler]:
             fault = proxy.fault(self.command, self.path)
             proxy.counts[fault] += 1
             size = int(self.headers.get("Content-Length", 0))
-            if fault == "torn upload":  # part of the body arrives, then the line is cut, to the server too
+            if (
+                fault == "torn upload"
+            ):  # part of the body arrives, then the line is cut, to the server too
                 self._pass_on(self.rfile.read(size // 2), size)
                 return self._hang_up()
             body = self.rfile.read(size)
             if fault == "late":
                 time.sleep(0.3)
             if fault in ("503", "409", "500", "501"):
-                return self._answer(int(fault), {"Content-Type": "application/xml"}, f"<Error>{fault}</Error>".encode())
-            # S3 looks and writes at once; moto does one after the other, and lets two writers of one object win.
+                return self._answer(
+                    int(fault),
+                    {"Content-Type": "application/xml"},
+                    f"<Error>{fault}</Error>".encode(),
+                )
+            # S3 looks and writes at once; moto does one after the other, and lets two writers of
+            # one object win.
             conditional = self.command == "PUT" and "If-None-Match" in self.headers
             with proxy.one_by_one if conditional else nullcontext():
                 status, headers, answer = self._ask(body)
@@ -92,7 +103,9 @@ def _handler(proxy: Proxy) -> type[BaseHTTPRequestHandler]:
                 head = "".join(f"{name}: {value}\r\n" for name, value in self.headers.items())
                 line.sendall(f"{self.command} {self.path} HTTP/1.1\r\n{head}\r\n".encode() + part)
 
-        def _answer(self, status: int, headers: dict[str, str], body: bytes, *, stop: int | None = None) -> None:
+        def _answer(
+            self, status: int, headers: dict[str, str], body: bytes, *, stop: int | None = None
+        ) -> None:
             self.send_response_only(status)
             for name, value in headers.items():
                 if name.lower() not in ("connection", "transfer-encoding", "content-length"):
@@ -129,9 +142,21 @@ def s3_proxy() -> Iterator[Proxy]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-W", "ignore", "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    command = [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-m",
+        "moto.server",
+        "-H",
+        "127.0.0.1",
+        "-p",
+        str(port),
+    ]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("AWS_")}
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
+    ) as process:
         try:
             _wait(port, process)
             proxy = Proxy(port)
@@ -152,7 +177,9 @@ def _wait(port: int, process: "subprocess.Popen[bytes]") -> None:
             return
         except OSError as error:
             if process.poll() is not None or time.monotonic() > end:
-                raise RuntimeError(f"moto's server did not start; status {process.poll()}") from error
+                raise RuntimeError(
+                    f"moto's server did not start; status {process.poll()}"
+                ) from error
         time.sleep(0.05)
 
 

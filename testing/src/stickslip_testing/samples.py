@@ -1,4 +1,6 @@
-"""Samples of a spec by way of its models: slow, plain, and what `stickslip_schemas.plan.points` must agree with."""
+"""Samples of a spec by way of its models: slow, plain, and what `stickslip_schemas.plan.points`
+must agree with.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -47,18 +49,26 @@ def samples(spec: JobSpec, builds: Builds) -> Iterator[Sample]:
 
 def simulation_key(simulation: Simulation, builds: Builds) -> str:
     """Return the content key of a trajectory: its physics and the build that makes it."""
-    return content_key("simulate", {"simulation": simulation.model_dump(mode="json"), "build": builds.simulate})
+    return content_key(
+        "simulate", {"simulation": simulation.model_dump(mode="json"), "build": builds.simulate}
+    )
 
 
 def render_key(render: Render, of_simulation: str, builds: Builds) -> str:
     """Return the content key of a render: its trajectory, its appearance and the renderer's build."""
     return content_key(
-        "render", {"render": render.model_dump(mode="json"), "simulation": of_simulation, "build": builds.render}
+        "render",
+        {
+            "render": render.model_dump(mode="json"),
+            "simulation": of_simulation,
+            "build": builds.render,
+        },
     )
 
 
 def split_of(spec: JobSpec, point: Mapping[str, Any]) -> int:
-    """Return the number of the split of a sample: a hash of its physics, so that no build or order moves it.
+    """Return the number of the split of a sample: a hash of its physics, so that no build or order
+    moves it.
 
     With `by: clip` it is a hash of all its axes.
     """
@@ -68,4 +78,6 @@ def split_of(spec: JobSpec, point: Mapping[str, Any]) -> int:
         seeds = {rule.field for rule in spec.simulation_seeds}
         drawn = spec.simulation(point).model_dump(mode="json", exclude=seeds)
     position = derived_seed(spec.seed, "split", drawn) / 2**31
-    return int(position >= spec.splits.train) + int(position >= spec.splits.train + spec.splits.validation)
+    return int(position >= spec.splits.train) + int(
+        position >= spec.splits.train + spec.splits.validation
+    )

@@ -71,7 +71,9 @@ class ServerProcess(RunningServer):
 class HttpApi:
     """The worker API over HTTP."""
 
-    def __init__(self, url: str, key: str, post: Callable[..., httpx.Response] | None = None) -> None:
+    def __init__(
+        self, url: str, key: str, post: Callable[..., httpx.Response] | None = None
+    ) -> None:
         self._url = url
         self._key = key
         self._send = post or partial(httpx.post, trust_env=False)
@@ -105,7 +107,9 @@ class HttpApi:
 def serving(app: FastAPI) -> Iterator[str]:
     """Serve an application from a thread of this process; yield its URL."""
     listener = listen("127.0.0.1", 0)
-    config = uvicorn.Config(app, log_level="error", lifespan="on", timeout_graceful_shutdown=1, http=PatientProtocol)
+    config = uvicorn.Config(
+        app, log_level="error", lifespan="on", timeout_graceful_shutdown=1, http=PatientProtocol
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
@@ -120,14 +124,24 @@ def serving(app: FastAPI) -> Iterator[str]:
 
 @contextmanager
 def served(data: Path) -> Iterator[RunningServer]:
-    """Serve a coordinator with the data directory `data` from a thread of this process, which starts in 0.2 s."""
+    """Serve a coordinator with the data directory `data` from a thread of this process, which
+    starts in 0.2 s.
+    """
     with serving(make_app(Settings(data=data, durable=False))) as url:
         yield RunningServer(url, data)
 
 
 def start_server(data: Path, port: int = 0, options: Sequence[str] = ()) -> ServerProcess:
     """Start a coordinator in a separate process, which takes 2 s, and wait until it answers."""
-    command = [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--port", str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "stickslip_services.app",
+        "--data",
+        str(data),
+        "--port",
+        str(port),
+    ]
     command += options
     log = (data.parent / f"{data.name}.log").open("ab")
     with log:

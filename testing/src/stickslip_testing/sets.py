@@ -1,4 +1,6 @@
-"""New test sets: the maintainers' tool `benchmarks/training/freeze_set.py`, and tests with sets of their own."""
+"""New test sets: the maintainers' tool `benchmarks/training/freeze_set.py`, and tests with sets of
+their own.
+"""
 
 import json
 from io import BytesIO
@@ -12,13 +14,29 @@ from stickslip_training.data.reader import DatasetReader, Split
 def frozen(
     name: str, about: str, spec: dict[str, Any], split: Split | None, reader: DatasetReader
 ) -> tuple[bytes, bytes]:
-    """Return the files NAME.json and NAME.npz of a new set, whose published version the reader has open."""
+    """Return the files NAME.json and NAME.npz of a new set, whose published version the reader has
+    open.
+    """
     task = TASKS[reader.kind]
     slots = reader.slots(split)
     seen = task.seen(reader, slots)
-    new = NamedSet(name, about, spec, labels_digest(task, reader, slots), split, (reader.manifest_digest,), seen)
+    new = NamedSet(
+        name,
+        about,
+        spec,
+        labels_digest(task, reader, slots),
+        split,
+        (reader.manifest_digest,),
+        seen,
+    )
     new.check(reader)
-    document = {"about": about, "split": split, "labels": new.labels, "published": [*new.published], "spec": spec}
+    document = {
+        "about": about,
+        "split": split,
+        "labels": new.labels,
+        "published": [*new.published],
+        "spec": spec,
+    }
     packed = BytesIO()
     np.savez_compressed(packed, **seen)  # type: ignore[arg-type]  # its stub takes no dictionary
     return (json.dumps(document, indent=2) + "\n").encode(), packed.getvalue()

@@ -10,7 +10,9 @@ def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int32]
     It is an icosahedron whose 20 triangles are each cut into four so many times.
     """
     t = 0.5 * (1.0 + np.sqrt(5.0))
-    vertices = np.array([np.roll([0.0, s, r * t], k) for k in range(3) for s in (-1.0, 1.0) for r in (-1.0, 1.0)])
+    vertices = np.array(
+        [np.roll([0.0, s, r * t], k) for k in range(3) for s in (-1.0, 1.0) for r in (-1.0, 1.0)]
+    )
     near = np.linalg.norm(vertices[:, None] - vertices, axis=2) < 2.1
     triangles = np.array(
         [

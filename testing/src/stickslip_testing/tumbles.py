@@ -1,6 +1,8 @@
-"""Cloth that falls, is crumpled, folds and piles up, by seed: small scenes that are hard on contact with itself.
+"""Cloth that falls, is crumpled, folds and piles up, by seed: small scenes that are hard on contact
+with itself.
 
-`watch` runs one, and after every step looks for crossings by comparing all edges with all triangles.
+`watch` runs one, and after every step looks for crossings by comparing all edges with all
+triangles.
 """
 
 import time
@@ -47,8 +49,8 @@ class Watched:
     """Steps at whose ends an edge crosses a triangle."""
 
     least_distance: float
-    """Of pieces of cloth that do not hang together, and of cloth and surfaces, over how far apart they are to stay, at
-    the ends of all steps; inf where none came near."""
+    """Of pieces of cloth that do not hang together, and of cloth and surfaces, over how far apart
+    they are to stay, at the ends of all steps; inf where none came near."""
 
     newton: int
     """Iterations."""
@@ -72,7 +74,9 @@ def watch(tumble: Tumble, steps: int | None = None) -> Watched:
             crossed += crossings(at, own, others, triangles) + crossings(others, triangles, at, own)
         crossing += crossed > 0
     least = cloth.total.least_distance / THICKNESS
-    return Watched(cloth.total.steps, cloth.total.unconverged, crossing, least, cloth.total.newton, seconds)
+    return Watched(
+        cloth.total.steps, cloth.total.unconverged, crossing, least, cloth.total.newton, seconds
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +88,16 @@ class Balance:
     """Sum of the sizes of the forces of pairs [N]."""
 
     force: Floats
-    """(3,): sum of the forces on vertices [N]; nothing, since what acts on one side acts on the other."""
+    """(3,): sum of the forces on vertices [N]; nothing, since what acts on one side acts on the
+    other.
+    """
 
     moment: Floats
     """(3,): sum of their moments [N m]."""
 
     moment_of_friction: Floats
-    """(3,): its required value [N m]. A force along the normal has no moment; friction acts on both sides of the
-    distance, and turns by it."""
+    """(3,): its required value [N m]. A force along the normal has no moment; friction acts on both
+    sides of the distance, and turns by it."""
 
 
 def balance(cloth: Cloth) -> Balance:
@@ -111,11 +117,14 @@ def balance(cloth: Cloth) -> Balance:
     )
 
 
-def crossings(positions: Floats, triangles: NDArray[np.int32], others: Floats, cut: NDArray[np.int32]) -> int:
-    """Count the edges of `triangles` that cross a triangle of `cut`: each with each, except where they share a vertex.
+def crossings(
+    positions: Floats, triangles: NDArray[np.int32], others: Floats, cut: NDArray[np.int32]
+) -> int:
+    """Count the edges of `triangles` that cross a triangle of `cut`: each with each, except where
+    they share a vertex.
 
-    The ends p and q of the edge lie on both sides of the triangle's plane, by more than `FLAT`, and the volumes of p, q
-    and each side of the triangle have one sign.
+    The ends p and q of the edge lie on both sides of the triangle's plane, by more than `FLAT`, and
+    the volumes of p, q and each side of the triangle have one sign.
 
     Args:
         positions: (N, 3) [m]
@@ -134,7 +143,9 @@ def crossings(positions: Floats, triangles: NDArray[np.int32], others: Floats, c
         pairs = pairs[~(edges[pairs[:, 0], :, None] == cut[pairs[:, 1], None, :]).any(axis=(1, 2))]
     start, along = p[pairs[:, 0]], (q - p)[pairs[:, 0]]
     a, b, c = np.moveaxis(corners[pairs[:, 1]] - start[:, None], 1, 0)
-    sides = np.stack([(along * np.cross(one, two)).sum(axis=1) for one, two in ((a, b), (b, c), (c, a))])
+    sides = np.stack(
+        [(along * np.cross(one, two)).sum(axis=1) for one, two in ((a, b), (b, c), (c, a))]
+    )
     return int((np.abs(np.sign(sides).sum(axis=0)) == 3).sum())
 
 
@@ -149,7 +160,11 @@ def drop(seed: int, preset: SolverSettings) -> Tumble:
     """A sheet of any fabric falls and spins onto a floor, a corner or an edge ahead."""
     rng = np.random.default_rng(seed)
     cells = int(rng.integers(6, 13))
-    mesh = meshes.grid(SIDE, SIDE, cells, cells) if seed % 2 else meshes.unstructured(SIDE, SIDE, SIDE / cells, seed)
+    mesh = (
+        meshes.grid(SIDE, SIDE, cells, cells)
+        if seed % 2
+        else meshes.unstructured(SIDE, SIDE, SIDE / cells, seed)
+    )
     a, tilt, heading = rng.uniform(0.0, 6.0), rng.uniform(-0.5, 0.5), rng.uniform(0.0, 6.0)
     c, s = np.cos(a), np.sin(a)
     flat = mesh.rest @ np.array([[c, s], [-s, c]])
@@ -161,17 +176,26 @@ def drop(seed: int, preset: SolverSettings) -> Tumble:
     velocity = np.cross(spin, start) + speed
     start[:, 2] += 0.005 - start[:, 2].min()
     name = fabric_names()[int(rng.integers(len(fabric_names())))]
-    cloth = Cloth(mesh, fabric(name), preset, self_contact=SelfContact(float(rng.uniform(0.0, 1.2))))
+    cloth = Cloth(
+        mesh, fabric(name), preset, self_contact=SelfContact(float(rng.uniform(0.0, 1.2)))
+    )
     cloth.set_state(start, velocity)
     return Tumble(cloth, [plane(float(rng.uniform(0.1, 1.2)))], _free, 100)
 
 
 def crumple(seed: int, preset: SolverSettings) -> Tumble:
-    """Four walls, which are surfaces, push a wavy sheet on a floor together, to a quarter of its area."""
+    """Four walls, which are surfaces, push a wavy sheet on a floor together, to a quarter of its
+    area.
+    """
     rng = np.random.default_rng(seed)
-    mesh = meshes.grid(0.1, 0.1, 10, 10) if seed % 2 else meshes.unstructured(0.1, 0.1, 0.0105, seed)
+    mesh = (
+        meshes.grid(0.1, 0.1, 10, 10) if seed % 2 else meshes.unstructured(0.1, 0.1, 0.0105, seed)
+    )
     u, v = mesh.rest.T
-    waves = sum(np.sin(rng.uniform(30, 90) * u + rng.uniform(30, 90) * v + rng.uniform(0, 6)) for _ in range(3))
+    waves = sum(
+        np.sin(rng.uniform(30, 90) * u + rng.uniform(30, 90) * v + rng.uniform(0, 6))
+        for _ in range(3)
+    )
     friction = float(rng.uniform(0.0, 1.0))
     cloth = Cloth(
         mesh,
@@ -186,15 +210,22 @@ def crumple(seed: int, preset: SolverSettings) -> Tumble:
 
 def squeeze(seed: int, preset: SolverSettings) -> Tumble:
     """Four walls push a flat sheet together within its plane, which it has no reason to leave."""
-    mesh = meshes.grid(0.1, 0.1, 10, 10) if seed % 2 else meshes.unstructured(0.1, 0.1, 0.0105, seed)
+    mesh = (
+        meshes.grid(0.1, 0.1, 10, 10) if seed % 2 else meshes.unstructured(0.1, 0.1, 0.0105, seed)
+    )
     walls = [wall(turn, 0.5) for turn in range(4)]
-    cloth = Cloth(mesh, fabric("royal-target"), preset, self_contact=SelfContact(0.5), surfaces=walls)
+    cloth = Cloth(
+        mesh, fabric("royal-target"), preset, self_contact=SelfContact(0.5), surfaces=walls
+    )
     cloth.set_state(np.column_stack([mesh.rest, np.zeros(len(mesh.rest))]))
     return Tumble(cloth, [plane(0.5)], _free, 12)
 
 
 def wall(turn: int, mu: float) -> Surface:
-    """Return an upright wall that comes closer to the origin, from 51 to 25 mm in 0.5 s; turned by quarters about z."""
+    """Return an upright wall that comes closer to the origin, from 51 to 25 mm in 0.5 s.
+
+    Turned by quarters about z.
+    """
     corners = np.array([[-0.1, 0.0, -0.01], [0.1, 0.0, -0.01], [0.1, 0.0, 0.2], [-0.1, 0.0, 0.2]])
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[turn]
     about = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -207,13 +238,21 @@ def wall(turn: int, mu: float) -> Surface:
 
 
 def folding(seed: int, preset: SolverSettings) -> Tumble:
-    """A strip is let down onto a floor, by its upper edge, faster than it can slide away, and folds to and fro."""
+    """A strip is let down onto a floor, by its upper edge, faster than it can slide away, and folds
+    to and fro.
+    """
     rng = np.random.default_rng(seed)
     cells = int(rng.integers(16, 25))
-    mesh = meshes.grid(0.03, 0.2, 3, cells) if seed % 2 else meshes.unstructured(0.03, 0.2, 0.2 / cells, seed)
+    mesh = (
+        meshes.grid(0.03, 0.2, 3, cells)
+        if seed % 2
+        else meshes.unstructured(0.03, 0.2, 0.2 / cells, seed)
+    )
     up = mesh.rest[:, 1] + 0.102
     held = np.flatnonzero(up > up.max() - 1e-9)
-    start = np.column_stack([1e-3 * np.sin(40.0 * up + rng.uniform(0, 6)) * (up.max() - up), mesh.rest[:, 0], up])
+    start = np.column_stack(
+        [1e-3 * np.sin(40.0 * up + rng.uniform(0, 6)) * (up.max() - up), mesh.rest[:, 0], up]
+    )
     start[:, 0] += 0.05 * rng.uniform(-1.0, 1.0) * (up - up.max())
 
     def lowered(time: float) -> Floats:
@@ -221,7 +260,11 @@ def folding(seed: int, preset: SolverSettings) -> Tumble:
         return moved
 
     cloth = Cloth(
-        mesh, fabric(SOFT[seed % len(SOFT)]), preset, held=held, self_contact=SelfContact(float(rng.uniform(0.1, 1.0)))
+        mesh,
+        fabric(SOFT[seed % len(SOFT)]),
+        preset,
+        held=held,
+        self_contact=SelfContact(float(rng.uniform(0.1, 1.0))),
     )
     cloth.set_state(start)
     return Tumble(cloth, [plane(1.0)], lowered, 110)
@@ -231,7 +274,8 @@ def pile(seed: int, preset: SolverSettings, sheets: int = 5) -> Tumble:
     """Sheets of 6 x 6 cm, turned and tilted, fall onto each other and a floor."""
     rng = np.random.default_rng(seed)
     parts = [
-        meshes.grid(0.06, 0.06, 5, 5) if i % 2 else meshes.unstructured(0.06, 0.06, 0.012, i) for i in range(sheets)
+        meshes.grid(0.06, 0.06, 5, 5) if i % 2 else meshes.unstructured(0.06, 0.06, 0.012, i)
+        for i in range(sheets)
     ]
     places = []
     for i, part in enumerate(parts):
@@ -239,7 +283,9 @@ def pile(seed: int, preset: SolverSettings, sheets: int = 5) -> Tumble:
         c, s = np.cos(angle), np.sin(angle)
         flat = part.rest @ np.array([[c, s], [-s, c]])
         places.append(np.column_stack([flat, 0.01 + 0.012 * i + flat @ tilt]))
-    cloth = Cloth(meshes.together(*parts), fabric("gray-interlock"), preset, self_contact=SelfContact(0.4))
+    cloth = Cloth(
+        meshes.together(*parts), fabric("gray-interlock"), preset, self_contact=SelfContact(0.4)
+    )
     start = np.concatenate(places)
     start[:, 2] -= min(start[:, 2].min(), 0.0)  # none starts below the floor
     cloth.set_state(start)

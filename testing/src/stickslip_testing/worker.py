@@ -1,4 +1,6 @@
-"""A worker that runs no simulation: it finishes tasks at once with invented data, which it stores as a real one."""
+"""A worker that runs no simulation: it finishes tasks at once with invented data, which it stores
+as a real one.
+"""
 
 import warnings
 from collections import Counter
@@ -34,7 +36,13 @@ from stickslip_schemas.documents.worker_api import (
     WorkerCondition,
     WorkerRegistration,
 )
-from stickslip_schemas.format.codecs import decode_chunk, decode_shard_index, encode_chunk, encode_sample, encode_shard
+from stickslip_schemas.format.codecs import (
+    decode_chunk,
+    decode_shard_index,
+    encode_chunk,
+    encode_sample,
+    encode_shard,
+)
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -69,7 +77,9 @@ def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed")
 
 def rejection(message: str = "it diverged") -> TaskResult:
     """Return the result of a rejected sample."""
-    return TaskResult(outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0)
+    return TaskResult(
+        outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0
+    )
 
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:
@@ -90,7 +100,10 @@ class DirectApi:
 
 @dataclass
 class PretendWorker:
-    """A dispatcher that finishes tasks at once and stores invented data; `judge` may give other results."""
+    """A dispatcher that finishes tasks at once and stores invented data.
+
+    `judge` may give other results.
+    """
 
     api: Any  # DirectApi or HttpApi
     store: Store
@@ -114,7 +127,10 @@ class PretendWorker:
     def register(self) -> "PretendWorker":
         """Register with the coordinator."""
         registration = WorkerRegistration(
-            name=self.name, builds=dict.fromkeys(self.kinds, self.builds), condition=self.condition, versions={}
+            name=self.name,
+            builds=dict.fromkeys(self.kinds, self.builds),
+            condition=self.condition,
+            versions={},
         )
         self.id = self.api.register(registration).worker_id
         return self
@@ -122,7 +138,9 @@ class PretendWorker:
     def lease(self, **wanted: int) -> tuple[Lease, ...]:
         """Lease tasks: so many of each named stage, by default all."""
         stages = {Stage(stage): count for stage, count in wanted.items()} or ALL_STAGES
-        leases: tuple[Lease, ...] = self.api.lease(LeaseRequest(worker_id=self.id, wanted=stages)).leases
+        leases: tuple[Lease, ...] = self.api.lease(
+            LeaseRequest(worker_id=self.id, wanted=stages)
+        ).leases
         return leases
 
     def start(self, *leases: Lease) -> tuple[str, ...]:
@@ -131,7 +149,10 @@ class PretendWorker:
 
     def beat(self, *leases: Lease, started: bool = False) -> tuple[str, ...]:
         """Renew leases; return the ids of tasks to drop."""
-        states = tuple(LeaseState(task_id=lease.task_id, token=lease.token, started=started) for lease in leases)
+        states = tuple(
+            LeaseState(task_id=lease.task_id, token=lease.token, started=started)
+            for lease in leases
+        )
         drop: tuple[str, ...] = self.api.heartbeat(
             Heartbeat(worker_id=self.id, leases=states, condition=self.condition)
         ).drop
@@ -139,7 +160,10 @@ class PretendWorker:
 
     def report(self, *ended: tuple[Lease, TaskResult | None]) -> list[str]:
         """Report results; return the verdicts."""
-        reports = tuple(Report(task_id=lease.task_id, token=lease.token, result=result) for lease, result in ended)
+        reports = tuple(
+            Report(task_id=lease.task_id, token=lease.token, result=result)
+            for lease, result in ended
+        )
         answer = self.api.report(ReportBatch(worker_id=self.id, reports=reports))
         return [verdict.verdict for verdict in answer.verdicts]
 
@@ -167,7 +191,9 @@ class PretendWorker:
         needed = input_digests(task, self.store.read)
         damaged = tuple(digest for digest in needed if not self.store.holds(digest))
         if damaged:
-            return failure(Reason.storage_error, "inputs are damaged").model_copy(update={"damaged_inputs": damaged})
+            return failure(Reason.storage_error, "inputs are damaged").model_copy(
+                update={"damaged_inputs": damaged}
+            )
         output: Any
         if task.stage == "simulate":
             digest = self.store.publish(task.model_dump_json().encode())
@@ -177,30 +203,48 @@ class PretendWorker:
             digest = self.store.publish(data)
             preview = self.store.publish(b"\x89PNG" + data) if task.preview else None
             where = ChunkRef(digest=digest, offset=0, length=len(data))
-            output = RenderOutput(chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]})
+            output = RenderOutput(
+                chunks={"views": where}, preview=preview, labels={"color": [1.0, 0.5, 0.0]}
+            )
         elif task.stage == "pack" and self.whole:
             arrays = [array for array in layout(task.spec) if not array.is_label]
-            shards = ((array.shard_path(task.shard), _encoded(array, task, self.record)) for array in arrays)
+            shards = (
+                (array.shard_path(task.shard), _encoded(array, task, self.record))
+                for array in arrays
+            )
             output = PackOutput(
                 files=tuple(
-                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data)) for path, data in shards
+                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data))
+                    for path, data in shards
                 ),
                 labels=self.store.publish(
-                    encode_shard([_encoded(array, task, self.record) for array in layout(task.spec) if array.is_label])
+                    encode_shard(
+                        [
+                            _encoded(array, task, self.record)
+                            for array in layout(task.spec)
+                            if array.is_label
+                        ]
+                    )
                 ),
             )
         elif task.stage == "pack":
             data = b"".join(slot.sample_key.encode() for slot in task.slots) * 50
-            entry = FileEntry(path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data))
+            entry = FileEntry(
+                path=f"views/c/{task.shard}/0", sha256=self.store.publish(data), size=len(data)
+            )
             keys = bytes.fromhex("".join(slot.sample_key for slot in task.slots))
             labels = self.store.publish(encode_shard([encode_chunk(keys)]))
             output = PackOutput(files=(entry,), labels=labels)
         else:
             output = self._publish(task)
-        return TaskResult(outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0, call_seconds=1.0)
+        return TaskResult(
+            outcome="succeeded", output=output, cpu_seconds=2.0, wall_seconds=1.0, call_seconds=1.0
+        )
 
     def _publish(self, task: PublishTask) -> PublishOutput:
-        given = [PublishSection.model_validate_json(self.store.read(digest)) for digest in task.sections]
+        given = [
+            PublishSection.model_validate_json(self.store.read(digest)) for digest in task.sections
+        ]
         count = task.spec.sample_count
         zarr = {file.path: file for file in self._zarr(count)}
         group = self.store.read(zarr.pop(GROUP_NAME).sha256)
@@ -210,10 +254,14 @@ class PretendWorker:
         sections: list[FileEntry] = []
         if has_sections(task.spec):
             for number, section in enumerate(given):
-                kept = ManifestSection(**{name: getattr(section, name) for name in ManifestSection.model_fields})
+                kept = ManifestSection(
+                    **{name: getattr(section, name) for name in ManifestSection.model_fields}
+                )
                 data = kept.model_dump_json().encode()
                 path = section_path(number)
-                sections.append(FileEntry(path=path, sha256=self.store.publish(data), size=len(data)))
+                sections.append(
+                    FileEntry(path=path, sha256=self.store.publish(data), size=len(data))
+                )
         manifest = Manifest(
             dataset=task.dataset,
             version=task.version,
@@ -228,7 +276,9 @@ class PretendWorker:
             rejection_counts=Counter(str(rejection.reason) for rejection in rejections),
             sections=tuple(sections),
             rejections=() if sections else rejections,
-            sample_keys=() if sections else tuple(key for section in given for key in section.sample_keys),
+            sample_keys=()
+            if sections
+            else tuple(key for section in given for key in section.sample_keys),
             files=tuple(sorted(own if sections else [*own, *listed], key=lambda file: file.path)),
         )
         content = manifest.model_dump_json().encode()
@@ -239,23 +289,31 @@ class PretendWorker:
         every = [*own, *listed, *sections]
         for path, artifact in (named | {file.path: file.sha256 for file in every}).items():
             self.store.show(artifact, task.dataset, task.version, path)
-        return PublishOutput(manifest=digest, group=group_digest, bytes=sum(file.size for file in every))
+        return PublishOutput(
+            manifest=digest, group=group_digest, bytes=sum(file.size for file in every)
+        )
 
-    def _label_files(self, task: PublishTask, given: Sequence[PublishSection]) -> Iterator[FileEntry]:
+    def _label_files(
+        self, task: PublishTask, given: Sequence[PublishSection]
+    ) -> Iterator[FileEntry]:
         """Yield the files of the labels of the packed shards: all labels, or only `sample_key`."""
         labels = [array for array in layout(task.spec) if array.is_label]
         labels = labels if self.whole else [array for array in labels if array.name == "sample_key"]
         columns: dict[str, list[bytes]] = {array.name: [] for array in labels}
         for digest in (digest for section in given for digest in section.labels):
             data = self.store.read(digest)
-            for array, (offset, length) in zip(labels, decode_shard_index(data, len(labels)).tolist(), strict=True):
+            for array, (offset, length) in zip(
+                labels, decode_shard_index(data, len(labels)).tolist(), strict=True
+            ):
                 columns[array.name].append(bytes(decode_chunk(data[offset : offset + length])))
         for array in labels:
             values = b"".join(columns[array.name])
             size = task.spec.samples_per_file(array) * array.sample_bytes
             for number in range(-(-len(values) // size)):
                 data = encode_chunk(values[number * size : (number + 1) * size].ljust(size, b"\0"))
-                yield FileEntry(path=array.shard_path(number), sha256=self.store.publish(data), size=len(data))
+                yield FileEntry(
+                    path=array.shard_path(number), sha256=self.store.publish(data), size=len(data)
+                )
 
     def _zarr(self, count: int) -> list[FileEntry]:
         """Return the files of a small Zarr group."""
@@ -264,10 +322,14 @@ class PretendWorker:
 
         memory: dict[str, Any] = {}
         group = zarr.open_group(MemoryStore(memory), mode="w")
-        array = group.create_array("mu", shape=(count,), chunks=(count,), dtype="float64", dimension_names=["sample"])
+        array = group.create_array(
+            "mu", shape=(count,), chunks=(count,), dtype="float64", dimension_names=["sample"]
+        )
         array[:] = range(count)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # consolidated metadata is not in the Zarr v3 specification yet
+            warnings.simplefilter(
+                "ignore"
+            )  # consolidated metadata is not in the Zarr v3 specification yet
             zarr.consolidate_metadata(group.store)
         entries = []
         for path, value in memory.items():
@@ -277,20 +339,31 @@ class PretendWorker:
 
 
 def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> bytes:
-    """Return the file of an array: an axis of the grid, recorded, or of values that grow from sample to sample."""
+    """Return the file of an array: an axis of the grid, recorded, or of values that grow from
+    sample to sample.
+    """
     size = task.spec.samples_per_shard
-    ramp, of_axis = np.arange(prod(array.shape)).reshape(array.shape), array.name in task.spec.named_axes
+    ramp, of_axis = (
+        np.arange(prod(array.shape)).reshape(array.shape),
+        array.name in task.spec.named_axes,
+    )
     known = [{**record, **(slot.labels if of_axis else {})}.get(array.name) for slot in task.slots]
     values = [
         np.asarray(
-            (ramp + slot.slot) % 251 if own is None else array.categories.index(own) if array.categories else own,
+            (ramp + slot.slot) % 251
+            if own is None
+            else array.categories.index(own)
+            if array.categories
+            else own,
             array.dtype,
         )
         for slot, own in zip(task.slots, known, strict=True)
         if slot.valid or of_axis
     ]
     if array.name == "sample_key":
-        keys = [np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots]
+        keys = [
+            np.frombuffer(bytes.fromhex(slot.sample_key), dtype=np.uint8) for slot in task.slots
+        ]
         values = keys
     if array.per_sample:
         rows = iter(values)
@@ -300,7 +373,10 @@ def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> b
         values = [np.asarray(slot.valid) for slot in task.slots]
     elif array.name != "sample_key" and len(values) < len(task.slots):
         rows = iter(values)
-        values = [next(rows) if slot.valid else np.full(array.shape, array.fill, array.dtype) for slot in task.slots]
+        values = [
+            next(rows) if slot.valid else np.full(array.shape, array.fill, array.dtype)
+            for slot in task.slots
+        ]
     rows_held = len(task.slots) if array.is_label else size
     column = np.full((rows_held, *array.shape), array.fill, dtype=array.dtype)
     column[: len(values)] = values

@@ -1,4 +1,7 @@
-"""Read stickslip datasets and train on them. See the modules, one concept each; `reader` needs no torch."""
+"""Read stickslip datasets and train on them.
+
+See the modules, one concept each; `reader` needs no torch.
+"""
 
 from importlib.metadata import version
 

@@ -10,7 +10,14 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_testing.samples import samples
 from stickslip_testing.sets import frozen
 from stickslip_training.benchmark import sets
-from stickslip_training.benchmark.sets import enter, load_set, read_record, set_names, table, with_tables
+from stickslip_training.benchmark.sets import (
+    enter,
+    load_set,
+    read_record,
+    set_names,
+    table,
+    with_tables,
+)
 from stickslip_training.benchmark.tasks import NOISES, RodTask
 from stickslip_training.cli import app
 from stickslip_training.data.reader import DatasetReader
@@ -23,7 +30,9 @@ RECORDS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
 
 
 def add_set(folder, name, dataset, split="test"):
-    spec = json.loads(dataset.spec.model_dump_json(exclude_defaults=True)) | {"kind": dataset.spec.kind}
+    spec = json.loads(dataset.spec.model_dump_json(exclude_defaults=True)) | {
+        "kind": dataset.spec.kind
+    }
     with DatasetReader(dataset.root) as reader:
         document, seen = frozen(name, "a set to test with", spec, split, reader)
     (folder / f"{name}.json").write_bytes(document)
@@ -62,14 +71,19 @@ def rod_answers(dataset, factor=1.0, gamma=None):
     ]
 
 
-# --- which dataset is the set ---------------------------------------------------------------------------------
+# --- which dataset is the set
+# ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", set_names())
 def test_the_labels_of_a_committed_set_follow_from_its_spec(name):
     chosen = load_set(name)
     builds = Builds(**{stage: sha256(stage.encode()) for stage in Builds.model_fields})
-    planned = [sample for sample in samples(chosen.parsed_spec, builds) if chosen.split in (None, SPLITS[sample.split])]
+    planned = [
+        sample
+        for sample in samples(chosen.parsed_spec, builds)
+        if chosen.split in (None, SPLITS[sample.split])
+    ]
     always = {"lighting": "drawn"} if chosen.spec["kind"] == "cloth_drag" else {}
     labels = [{"slot": sample.slot, **sample.labels, **always} for sample in planned]
     assert sha256(canonical_json(labels).encode()) == chosen.labels
@@ -81,22 +95,34 @@ def test_the_labels_of_a_committed_set_follow_from_its_spec(name):
 def test_a_set_that_was_made_again_is_known(rod_set, tmp_path):
     slots, making = checked("some-rods", rod_set.root)
     assert making == "published"
-    assert slots.tolist() == np.flatnonzero((rod_set.arrays["split"] == 2) & rod_set.arrays["valid"]).tolist()
+    assert (
+        slots.tolist()
+        == np.flatnonzero((rod_set.arrays["split"] == 2) & rod_set.arrays["valid"]).tolist()
+    )
     again = rod_set.copy(tmp_path / "again")
     again.edit_manifest(certificate=sha256(b"another build"))
     assert checked("some-rods", again.root)[1] == "remade"
 
 
 def test_another_dataset_is_refused(rod_set, make_rods, monkeypatch):
-    with pytest.raises(ValueError, match="must be the test set some-rods, and is not: its spec is another one"):
+    with pytest.raises(
+        ValueError, match="must be the test set some-rods, and is not: its spec is another one"
+    ):
         checked("some-rods", make_rods(seed=3, rejected=(5, 59)).root)
     tested = int(checked("some-rods", rod_set.root)[0][0])
     with pytest.raises(ValueError, match=r"the labels of its .* samples to answer have SHA-256"):
         checked("some-rods", make_rods(rejected=(5, 59, tested)).root)
     # Another machine's rods, further off than rounding.
     read = DatasetReader.read
-    monkeypatch.setattr(DatasetReader, "read", lambda self, name, slots: read(self, name, slots) * np.float32(1.0003))
-    with pytest.raises(ValueError, match=r"centerline differs by up to .*, and 1e-05 is allowed. .* take a published"):
+    monkeypatch.setattr(
+        DatasetReader,
+        "read",
+        lambda self, name, slots: read(self, name, slots) * np.float32(1.0003),
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"centerline differs by up to .*, and 1e-05 is allowed. .* take a published",
+    ):
         checked("some-rods", rod_set.root)
 
 
@@ -122,22 +148,35 @@ def test_an_unknown_set_is_named(folder, rods):
         load_set("rods-9")
 
 
-# --- scores ---------------------------------------------------------------------------------------------------
+# --- scores
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_scores_of_known_answers_about_rods(rod_set, tmp_path):
     answers = rod_answers(rod_set, 1.1, 0.8)
     answers[0]["bending"] = None
     (tmp_path / "answers.json").write_text(json.dumps(answers))
-    record = enter("some-rods", tmp_path / "answers.json", rod_set.root, method="m", by="b", trained_on="nothing")
-    assert (record.making, record.predictions) == ("published", sha256((tmp_path / "answers.json").read_bytes()))
+    record = enter(
+        "some-rods",
+        tmp_path / "answers.json",
+        rod_set.root,
+        method="m",
+        by="b",
+        trained_on="nothing",
+    )
+    assert (record.making, record.predictions) == (
+        "published",
+        sha256((tmp_path / "answers.json").read_bytes()),
+    )
     for noise in ("0.001", "0.005", "0.01"):
         scores = record.scores[noise]
         assert scores["rods"] == len(answers) // 3
         assert scores["bending"]["median"]["value"] == pytest.approx(0.1, abs=1e-5)
         assert scores["gamma"]["median"]["value"] == pytest.approx(0.2, abs=1e-5)
     assert [record.scores[noise]["failed"] for noise in ("0.001", "0.005", "0.01")] == [1, 0, 0]
-    assert record.scores["0.001"]["bending"]["p95"] is None  # a rod without an answer is infinitely wrong
+    assert (
+        record.scores["0.001"]["bending"]["p95"] is None
+    )  # a rod without an answer is infinitely wrong
     assert record.scores["0.005"]["bending"]["p95"]["value"] == pytest.approx(0.1, abs=1e-5)
     row = RodTask().row(record.scores)
     assert row == ("10 %; - (1 fail)", "10 %; 10 %", "10 %; 10 %", "20 %; 20 %")
@@ -149,10 +188,22 @@ def test_scores_of_known_answers_about_rods(rod_set, tmp_path):
         (lambda a: a.pop(), "must be answered at every noise, and 1 are not, .* at 0.01 first"),
         (lambda a: a.append(a[0]), "is answered twice at noise 0.001"),
         (lambda a: a[0].update(noise=0.002), "slot and noise of answer 0 must be of the test set"),
-        (lambda a: a[0].update(bending=[1.0]), "bending of answer 0 must be 150 finite numbers of 0 or more, or null"),
-        (lambda a: a[1]["bending"].__setitem__(3, -1.0), "bending of answer 1 must be 150 finite numbers"),
-        (lambda a: a[1]["bending"].__setitem__(3, float("nan")), "bending of answer 1 must be 150 finite numbers"),
-        (lambda a: a[2].update(gamma=-3.0), "gamma of answer 2 must be more than 0 and finite, and is -3.0"),
+        (
+            lambda a: a[0].update(bending=[1.0]),
+            "bending of answer 0 must be 150 finite numbers of 0 or more, or null",
+        ),
+        (
+            lambda a: a[1]["bending"].__setitem__(3, -1.0),
+            "bending of answer 1 must be 150 finite numbers",
+        ),
+        (
+            lambda a: a[1]["bending"].__setitem__(3, float("nan")),
+            "bending of answer 1 must be 150 finite numbers",
+        ),
+        (
+            lambda a: a[2].update(gamma=-3.0),
+            "gamma of answer 2 must be more than 0 and finite, and is -3.0",
+        ),
         (lambda a: a[2].pop("bending"), "answer 2 must have slot, noise and bending"),
     ],
 )
@@ -166,7 +217,14 @@ def test_answers_about_rods_are_checked(rod_set, change, message):
 def test_what_a_method_is_given_is_the_noisy_centreline(rod_set, tmp_path):
     lines = []
     for out, secret in (("a.npz", "mine"), ("b.npz", "mine"), ("c.npz", "other")):
-        command = ["benchmark", "inputs", "some-rods", str(rod_set.root), "--out", str(tmp_path / out)]
+        command = [
+            "benchmark",
+            "inputs",
+            "some-rods",
+            str(rod_set.root),
+            "--out",
+            str(tmp_path / out),
+        ]
         done = runner.invoke(app, [*command, "--secret", str(tmp_path / secret)])
         assert done.exit_code == 0, done.output
         with np.load(tmp_path / out) as file:
@@ -194,15 +252,21 @@ def test_scores_of_known_answers_about_clips(folder, clips, tmp_path):
         for label in labels
     ]
     (tmp_path / "answers.json").write_text(json.dumps(answers))
-    done = runner.invoke(app, ["benchmark", "score", "some-clips", str(tmp_path / "answers.json"), str(clips.root)])
+    done = runner.invoke(
+        app, ["benchmark", "score", "some-clips", str(tmp_path / "answers.json"), str(clips.root)]
+    )
     assert done.exit_code == 0, done.output
     cells = [cell.strip() for cell in done.stdout.splitlines()[-1].split("|")]
     assert cells[3:11] == ["1.000", "50% / 50%", "100%", "100%", "0.000", "0.300", "", ""]
-    with pytest.raises(ValueError, match="a method is given the clips themselves"), DatasetReader(clips.root) as reader:
+    with (
+        pytest.raises(ValueError, match="a method is given the clips themselves"),
+        DatasetReader(clips.root) as reader,
+    ):
         load_set("some-clips").task.inputs(reader, reader.slots(), b"")
 
 
-# --- the command and the table --------------------------------------------------------------------------------
+# --- the command and the table
+# --------------------------------------------------------------------------------
 
 
 def test_an_entry_from_spec_to_table(rod_set, tmp_path):
@@ -215,8 +279,23 @@ def test_an_entry_from_spec_to_table(rod_set, tmp_path):
     for method, factor in (("worse", 1.2), ("better", 1.05)):
         (tmp_path / "answers.json").write_text(json.dumps(rod_answers(rod_set, factor)))
         records.append(tmp_path / f"{method}.json")
-        command = ["benchmark", "score", "some-rods", str(tmp_path / "answers.json"), str(rod_set.root)]
-        told = ["--method", method, "--by", "us", "--trained-on", "nothing", "--record", str(records[-1])]
+        command = [
+            "benchmark",
+            "score",
+            "some-rods",
+            str(tmp_path / "answers.json"),
+            str(rod_set.root),
+        ]
+        told = [
+            "--method",
+            method,
+            "--by",
+            "us",
+            "--trained-on",
+            "nothing",
+            "--record",
+            str(records[-1]),
+        ]
         done = runner.invoke(app, [*command, *told])
         assert done.exit_code == 0, done.output
         first = records[-1].read_bytes()
@@ -226,21 +305,33 @@ def test_an_entry_from_spec_to_table(rod_set, tmp_path):
     assert printed.stdout.index("better") < printed.stdout.index("worse")
     page = tmp_path / "page.md"
     page.write_text("# Results\n\n<!-- results of some-rods -->\nold\n<!-- end -->\n\nAfter.\n")
-    assert runner.invoke(app, ["benchmark", "table", *map(str, records), "--page", str(page)]).exit_code == 0
+    assert (
+        runner.invoke(
+            app, ["benchmark", "table", *map(str, records), "--page", str(page)]
+        ).exit_code
+        == 0
+    )
     assert "old" not in page.read_text()
-    assert page.read_text().endswith("| remade |\n<!-- end -->\n\nAfter.\n") or "| published |" in page.read_text()
+    assert (
+        page.read_text().endswith("| remade |\n<!-- end -->\n\nAfter.\n")
+        or "| published |" in page.read_text()
+    )
     assert asdict(read_record(records[0]))["method"] == "worse"
     refused = runner.invoke(app, ["benchmark", "table", str(tmp_path / "answers.json")])
     assert refused.exit_code == 1
     assert "must be a record of" in refused.stderr
-    with pytest.raises(ValueError, match="must have a place `<!-- results of NAME -->` for some-rods"):
+    with pytest.raises(
+        ValueError, match="must have a place `<!-- results of NAME -->` for some-rods"
+    ):
         with_tables("# Nothing\n", [read_record(records[0])])
 
 
 def test_the_page_shows_the_committed_records():
     records = [read_record(path) for path in RECORDS]
     page = (ROOT / "docs" / "benchmark.md").read_text()
-    again = "run: stickslip-train benchmark table benchmarks/results/*/*.json --page docs/benchmark.md"
+    again = (
+        "run: stickslip-train benchmark table benchmarks/results/*/*.json --page docs/benchmark.md"
+    )
     assert with_tables(page, records) == page, again
     assert {record.set for record in records} == set(set_names())
     for path, record in zip(RECORDS, records, strict=True):

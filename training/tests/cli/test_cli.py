@@ -12,7 +12,10 @@ def test_info_says_what_is_in_a_dataset(clips):
     result = runner.invoke(app, ["info", str(clips.root), "--verify"])
     assert result.exit_code == 0, result.output
     counts = clips.manifest.split_counts
-    assert f"10 of 12 valid: {counts['train']} train, {counts['validation']} validation" in result.output
+    assert (
+        f"10 of 12 valid: {counts['train']} train, {counts['validation']} validation"
+        in result.output
+    )
     assert "83.3%; rejected: 2 out_of_frame" in result.output
     assert clips.manifest.certificate in result.output
     assert "verified" in result.output
@@ -38,7 +41,8 @@ def test_curvature_trains_and_writes(rods, tmp_path):
     assert json.loads((out / "report.json").read_text())["config"]["noise"] == 0.01
     assert (out / "model.pt").is_file()
     more = runner.invoke(
-        app, ["curvature", str(rods.root), "--out", str(out), "--resume", *options[2:], "--steps", "4"]
+        app,
+        ["curvature", str(rods.root), "--out", str(out), "--resume", *options[2:], "--steps", "4"],
     )
     assert more.exit_code == 0, more.output
     assert len(json.loads((out / "report.json").read_text())["history"]) == 2
@@ -50,14 +54,17 @@ def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
     result = runner.invoke(app, [command[0], "nowhere", *command[1:]])
     assert result.exit_code == 1
     assert (
-        result.stderr == "stickslip-train: nowhere/manifest.json is not there: this is no committed dataset version\n"
+        result.stderr
+        == "stickslip-train: nowhere/manifest.json is not there: this is no committed dataset version\n"
     )
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="this torch has CUDA")
 def test_a_device_that_torch_cannot_use_is_said_in_a_line(rods, tmp_path):
-    result = runner.invoke(app, ["curvature", str(rods.root), "--out", str(tmp_path / "out"), "--device", "cuda"])
+    result = runner.invoke(
+        app, ["curvature", str(rods.root), "--out", str(tmp_path / "out"), "--device", "cuda"]
+    )
     assert result.exit_code == 1
     assert "device must be one that torch can use here" in result.output
     assert "Traceback" not in result.output

@@ -15,7 +15,12 @@ from typer.testing import CliRunner
 pytestmark = pytest.mark.physics
 
 runner = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"})
-AXES = {"material": ["gray-interlock", "11oz-black-denim"], "mu": [0.1, 0.4], "texture": "plaid", "viewpoint": "left"}
+AXES = {
+    "material": ["gray-interlock", "11oz-black-denim"],
+    "mu": [0.1, 0.4],
+    "texture": "plaid",
+    "viewpoint": "left",
+}
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +30,9 @@ def packed(request):
 
 @pytest.fixture(scope="module")
 def clips(make_clips):
-    made = make_clips(rejected=(1,), axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0})
+    made = make_clips(
+        rejected=(1,), axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0}
+    )
     made.edit_manifest(cameras=load_rig("drag"))
     return made
 
@@ -37,7 +44,15 @@ def test_train_and_resume(packed, tmp_path):
     for name, some in (("train", slice(0, None, 12)), ("validation", slice(1, None, 48))):
         part = {"differences": arrays["differences"][:, some], "about": arrays["about"][some]}
         np.savez(tmp_path / f"{name}.npz", **arrays | part)
-    alone = ["cloth", "train", str(tmp_path / "train.npz"), "--out", str(tmp_path / "run"), "--threads", "1"]
+    alone = [
+        "cloth",
+        "train",
+        str(tmp_path / "train.npz"),
+        "--out",
+        str(tmp_path / "run"),
+        "--threads",
+        "1",
+    ]
     refused = runner.invoke(app, alone)
     assert refused.exit_code == 1
     assert "validation must be a packed file of simulations" in " ".join(refused.stderr.split())
@@ -88,8 +103,9 @@ def test_what_cannot_be_measured_is_refused(clips, rods, make_clips):
         "predict", str(rods.root), "--model", str(WEIGHTS)
     )
     short = make_clips(frames=2)
-    assert "a clip must have a frame within 0.06 s of 25.00 s after the start; its nearest of 2 is" in refused(
-        "predict", str(short.root), "--model", str(WEIGHTS)
+    assert (
+        "a clip must have a frame within 0.06 s of 25.00 s after the start; its nearest of 2 is"
+        in refused("predict", str(short.root), "--model", str(WEIGHTS))
     )
     assert "split must be one of train, validation, test, and is 'all'" in refused(
         "predict", str(clips.root), "--model", str(WEIGHTS), "--split", "all"

@@ -24,9 +24,11 @@ def runs(packed: Path) -> Runs:
 
 @pytest.fixture(scope="session")
 def split_runs() -> Callable[..., list[Runs]]:
-    """Return a function that parts runs into train, validation and test, by shares of the last two in every fabric.
+    """Return a function that parts runs into train, validation and test, by shares of the last two
+    in every fabric.
 
-    The runs with the least and the largest mu of a fabric are in train: nothing can be learned beyond them.
+    The runs with the least and the largest mu of a fabric are in train: nothing can be learned
+    beyond them.
     """
 
     def split(runs: Runs, *shares: float) -> list[Runs]:

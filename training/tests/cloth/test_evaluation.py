@@ -3,7 +3,14 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from stickslip_training.cloth.evaluation import Scores, Truth, errors, measure, predictions, score_predictions
+from stickslip_training.cloth.evaluation import (
+    Scores,
+    Truth,
+    errors,
+    measure,
+    predictions,
+    score_predictions,
+)
 from stickslip_training.cloth.posterior import Bins, Estimates, Posterior, estimates
 
 BINS = Bins(0.0, 1.6, 64)
@@ -48,7 +55,10 @@ def test_scores_of_known_answers():
     assert scores.blind.mae.value == pytest.approx(0.05, abs=2e-3)
     assert (scores.blind.within_01.value, scores.blind.within_02.value) == (0.75, 1.0)
     assert scores.blind.coverage.value == 0.75
-    assert (scores.top_1.value, scores.top_2.value) == (0.5, 0.5)  # where two materials tie, the true one is behind
+    assert (scores.top_1.value, scores.top_2.value) == (
+        0.5,
+        0.5,
+    )  # where two materials tie, the true one is behind
     assert set(scores.bands) == {"0 to 0.4", "0.4 to 0.8", "0.8 to 1.2", "1.2 to 1.6"}
     assert scores.bands["0.8 to 1.2"].mae.value == pytest.approx(0.15, abs=2e-3)
     json.dumps(asdict(scores))
@@ -93,7 +103,10 @@ def test_printed_predictions_score_as_the_posteriors_do():
         (lambda a: a.pop(), "every slot of the test set must be answered, and 1 are not, 9 first"),
         (lambda a: a.append(a[0]), "slot 4 is answered twice"),
         (lambda a: a[0].update(slot=5), "slot of answer 0 must be one of the test set, and is 5"),
-        (lambda a: a[1].update(mu={"median": 2.0, "low": 0.0, "high": 1.0}), "low <= median <= high"),
+        (
+            lambda a: a[1].update(mu={"median": 2.0, "low": 0.0, "high": 1.0}),
+            "low <= median <= high",
+        ),
         (lambda a: a[1].pop("mu"), "answer 1 must have slot, material and mu"),
         (lambda a: a[1].update(material={"silk": 1.0}), "must give probabilities of a, b, c"),
     ],
@@ -115,13 +128,21 @@ def test_an_interval_that_reaches_the_largest_known_mu_says_above():
 
 def test_a_clip_without_an_answer_has_no_mu_and_scores_as_the_prior():
     told = predictions(
-        answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9], (np.array([1, 0.01, 1]), [None, "glued", None])
+        answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]),
+        [4, 7, 9],
+        (np.array([1, 0.01, 1]), [None, "glued", None]),
     )
-    assert [(each["mu"] is None, each["no_answer"]) for each in told] == [(False, None), (True, "glued"), (False, None)]
+    assert [(each["mu"] is None, each["no_answer"]) for each in told] == [
+        (False, None),
+        (True, "glued"),
+        (False, None),
+    ]
     scores = score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.2, 0.6, 1.0]))
     assert scores.blind.mae.value == pytest.approx((0.0 + 0.2 + 0.0) / 3, abs=0.01)
 
 
 def test_the_interval_score_is_the_width_and_ten_times_what_is_beyond():
     found = Estimates(np.array([0.5, 0.5]), np.array([0.4, 0.4]), np.array([0.6, 0.6]))
-    assert errors(found, np.array([0.5, 0.7]), np.arange(2)).interval.value == pytest.approx((0.2 + 0.2 + 10 * 0.1) / 2)
+    assert errors(found, np.array([0.5, 0.7]), np.arange(2)).interval.value == pytest.approx(
+        (0.2 + 0.2 + 10 * 0.1) / 2
+    )

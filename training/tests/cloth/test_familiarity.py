@@ -4,7 +4,15 @@ from functools import partial
 import numpy as np
 import pytest
 from stickslip_training.cloth.clips import INSTANTS, render_clips
-from stickslip_training.cloth.familiarity import ALARMS, UNKNOWN, Familiarity, hanging, holders_at, pooled, reordered
+from stickslip_training.cloth.familiarity import (
+    ALARMS,
+    UNKNOWN,
+    Familiarity,
+    hanging,
+    holders_at,
+    pooled,
+    reordered,
+)
 from stickslip_training.cloth.model import load_friction
 
 pytestmark = pytest.mark.physics  # pictures are rendered
@@ -15,7 +23,12 @@ def few(runs):
     chosen = runs[np.arange(0, 99, 5)]
     frames = [chosen.instants.index(instant) for instant in INSTANTS]
     return type(chosen)(
-        chosen.positions[:, frames], INSTANTS, chosen.materials, chosen.material, chosen.mu, chosen.landed
+        chosen.positions[:, frames],
+        INSTANTS,
+        chosen.materials,
+        chosen.material,
+        chosen.mu,
+        chosen.landed,
     )
 
 
@@ -36,7 +49,9 @@ def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split
         (hanging, "never touches the floor"),
         (partial(reordered, frames=[2, 3, 0, 1, 2, 3]), "moves out of phase"),
     ):
-        clips = render_clips(replace(judged, positions=made(judged.positions, held)), 4, 3, drawn_world=True)
+        clips = render_clips(
+            replace(judged, positions=made(judged.positions, held)), 4, 3, drawn_world=True
+        )
         told = known.judge(silhouettes(clips))[1]
         assert np.mean([each == reason for each in told]) > 0.8
     noise = np.random.default_rng(0).random((3, 6, 18, 22), dtype=np.float32)
@@ -48,6 +63,8 @@ def test_the_weights_of_the_package_know_dragged_cloth_and_refuse_what_is_none(f
     judged = few.named(model.materials)
     clips = render_clips(judged, 2, 5)
     assert np.mean([reason is None for reason in model.judge(clips)[1]]) > 0.9
-    empty = render_clips(replace(judged, positions=judged.positions - np.float32([0, 0, 9])), 1, 6, drawn_world=True)
+    empty = render_clips(
+        replace(judged, positions=judged.positions - np.float32([0, 0, 9])), 1, 6, drawn_world=True
+    )
     assert all(model.judge(empty)[1])
     assert UNKNOWN.startswith("looks like no square of cloth")

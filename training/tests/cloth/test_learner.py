@@ -50,7 +50,9 @@ def unfamiliar(monkeypatch):
 
 
 @pytest.mark.physics
-def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(few, unfamiliar, tmp_path, monkeypatch):
+def test_resume_equals_uninterrupted_to_the_bit_and_another_seed_does_not(
+    few, unfamiliar, tmp_path, monkeypatch
+):
     from stickslip_training.engine import fit as engine
 
     straight = train_friction(*few[:2], replace(SMALL, epoch=2))
@@ -124,7 +126,9 @@ def test_temperatures_mend_what_is_too_sure():
         -0.5 * ((MU_BINS.centers - seen[:, None]) / 0.05) ** 2
     )  # as if the deviation was 0.05: temperature (0.1/0.05)^2
     mu = np.repeat(log[:, None], 2, axis=1).astype(np.float32)
-    material = np.tile(np.float32([0.0, np.log(4.0)]), (2000, 1))  # 80 %, and it is so in 80 % of the cases
+    material = np.tile(
+        np.float32([0.0, np.log(4.0)]), (2000, 1)
+    )  # 80 %, and it is so in 80 % of the cases
     code = (np.arange(2000) % 5 > 0).astype(int)
     found = likeliest_temperatures(material, mu, code, truth, MU_BINS)
     assert found[0] == pytest.approx(1.0, abs=0.1)
@@ -178,7 +182,11 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, first
     fresh = train_friction(*few[:2], going, clips=clips)
 
     def distance(a, b):
-        return sum(float((weights(a)[name] - value).norm()) for name, value in weights(b).items() if value.ndim > 1)
+        return sum(
+            float((weights(a)[name] - value).norm())
+            for name, value in weights(b).items()
+            if value.ndim > 1
+        )
 
     assert 0.0 < distance(model, first) < 0.2 * distance(fresh, first)
 
@@ -187,7 +195,9 @@ def test_training_goes_on_from_a_model_with_clips_of_another_renderer(few, first
 def test_half_of_each_batch_is_of_the_clips(few):
     clips = some_clips(few)
     known = replace(clips.train, mu=np.full(18, 9.0))
-    learner = FrictionLearner(*few[:2], replace(SMALL, batch_size=16), RenderedClips(known, clips.validation))
+    learner = FrictionLearner(
+        *few[:2], replace(SMALL, batch_size=16), RenderedClips(known, clips.validation)
+    )
     crops, direction, material, mu, _ = learner.batch(0)
     assert len(crops) == len(direction) == len(material) == 16
     assert (mu == 9.0).tolist() == [False] * 8 + [True] * 8
@@ -209,7 +219,9 @@ def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrore
             plain, mirrored = plain + len(same), mirrored + len(other)
             assert torch.equal(known[4][k] if same else known[4][k].flip(2), seen)
             assert material == known[2][k]
-            assert torch.equal(direction, known[1][k] * torch.tensor([1.0, 1.0 if same else -1.0, 1.0]))
+            assert torch.equal(
+                direction, known[1][k] * torch.tensor([1.0, 1.0 if same else -1.0, 1.0])
+            )
         assert min(plain, mirrored) >= 2
 
 
@@ -228,7 +240,10 @@ def test_jittered_crops_are_those_of_another_exposure():
     assert torch.equal(other, jittered(crops, torch.Generator().manual_seed(1)))
     for clip, changed in zip(crops, other, strict=True):
         shifts = [torch.roll(clip, (y, x), (1, 2)) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-        likeness = max(float(torch.corrcoef(torch.stack([s.flatten(), changed.flatten()]))[0, 1]) for s in shifts)
+        likeness = max(
+            float(torch.corrcoef(torch.stack([s.flatten(), changed.flatten()]))[0, 1])
+            for s in shifts
+        )
         assert 0.95 < likeness < 1.0
 
 
@@ -238,14 +253,17 @@ def test_clips_of_one_simulation_in_both_splits_are_refused(few):
     with pytest.raises(ValueError, match="clips of one simulation must not be in both splits"):
         RenderedClips(clips, clips)
     with pytest.raises(
-        ValueError, match="the clips for validation must be some, and of materials of the runs: 0 clips"
+        ValueError,
+        match="the clips for validation must be some, and of materials of the runs: 0 clips",
     ):
         RenderedClips(clips, clips[np.arange(0)])
 
 
 @pytest.mark.physics
 def test_a_model_of_another_size_is_no_start(few, first):
-    with pytest.raises(ValueError, match="the model to start from must know the runs' materials, and be"):
+    with pytest.raises(
+        ValueError, match="the model to start from must know the runs' materials, and be"
+    ):
         train_friction(*few[:2], replace(SMALL, width=96), start=first)
 
 
@@ -253,11 +271,21 @@ def file_of_clips(path, shown):
     video = np.random.default_rng(0).integers(0, 255, (len(shown), 6, 224, 224, 3), dtype=np.uint8)
     classes = np.random.default_rng(1).integers(0, 4, video.shape[:-1], dtype=np.uint8)
     about = [
-        {"run": 5, "material": shown.materials[code], "mu": mu, "landed_side": 1, "viewpoint": "calibrated"}
+        {
+            "run": 5,
+            "material": shown.materials[code],
+            "mu": mu,
+            "landed_side": 1,
+            "viewpoint": "calibrated",
+        }
         for code, mu in zip(shown.material.tolist(), shown.mu.tolist(), strict=True)
     ]
     np.savez(
-        path, video=video, segmentation=classes, instants=np.array(INSTANTS), about=[json.dumps(clip) for clip in about]
+        path,
+        video=video,
+        segmentation=classes,
+        instants=np.array(INSTANTS),
+        about=[json.dumps(clip) for clip in about],
     )
 
 
@@ -268,14 +296,18 @@ def test_clips_of_files_are_parted_by_simulation_and_those_of_others_are_refused
     alone, about = clips_of_file(tmp_path / "a.npz", train.materials)
     assert alone.crops.shape == (2, 6, 72, 88)
     assert alone.run.tolist() == [clip["run"] for clip in about] == [5, 5]
-    digests, clips = training_clips([str(tmp_path / name) for name in ("a.npz", "b.npz")], train, validation)
+    digests, clips = training_clips(
+        [str(tmp_path / name) for name in ("a.npz", "b.npz")], train, validation
+    )
     assert len(set(digests)) == 2
     assert clips.train.run.tolist() == [3, 0]
     assert clips.train.mu.tolist() == train.mu[[3, 0]].tolist()
     assert torch.equal(clips.train.crops, alone.crops)
     assert clips.validation.run.tolist() == [len(train) + 1]
     file_of_clips(tmp_path / "c.npz", test)
-    with pytest.raises(ValueError, match="clips must show simulations to train on or to validate: 2 of 2 do not"):
+    with pytest.raises(
+        ValueError, match="clips must show simulations to train on or to validate: 2 of 2 do not"
+    ):
         training_clips([str(tmp_path / "c.npz")], train, validation)
     assert len(Clips.joined([alone, alone[np.array([1])]])) == 3
 

@@ -1,4 +1,6 @@
-"""A network learns friction and material from clips, and is judged on simulations that it has not seen."""
+"""A network learns friction and material from clips, and is judged on simulations that it has not
+seen.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,14 @@ from stickslip_training.cloth.evaluation import predictions, score_predictions
 from stickslip_training.cloth.learner import ClothTraining, train_friction
 
 QUICK = ClothTraining(
-    steps=840, epoch=210, worlds=False, width=48, repeats=4, dropout=0.0, learning_rate=3e-3, smoothing=(0.2, 0.05)
+    steps=840,
+    epoch=210,
+    worlds=False,
+    width=48,
+    repeats=4,
+    dropout=0.0,
+    learning_rate=3e-3,
+    smoothing=(0.2, 0.05),
 )
 """For few simulations over dark floors, in a minute of CPU time."""
 

@@ -5,26 +5,55 @@ import pytest
 import torch
 from stickslip_testing.cameras import looking_at
 from stickslip_training.cloth.clips import INSTANTS, LATE_MAX, RATE, frames_at, training_cameras
-from stickslip_training.cloth.crop import ANCHOR, HEIGHT, WIDTH, Cameras, Crops, cut, grey, holder_crops, holder_path
-from stickslip_training.cloth.render import POINTS, _refined, draw_style, draw_textures, render_crops, splat, turned
+from stickslip_training.cloth.crop import (
+    ANCHOR,
+    HEIGHT,
+    WIDTH,
+    Cameras,
+    Crops,
+    cut,
+    grey,
+    holder_crops,
+    holder_path,
+)
+from stickslip_training.cloth.render import (
+    POINTS,
+    _refined,
+    draw_style,
+    draw_textures,
+    render_crops,
+    splat,
+    turned,
+)
 from stickslip_training.cloth.surroundings import Codec, apply_codec, sample_surroundings
 
 RIG = training_cameras()
 FACING = looking_at(
-    (0.0, 0.0, 0.0), azimuth=0, elevation=0, distance=1.0, name="facing", width=64, height=48, focal=100.0
+    (0.0, 0.0, 0.0),
+    azimuth=0,
+    elevation=0,
+    distance=1.0,
+    name="facing",
+    width=64,
+    height=48,
+    focal=100.0,
 )
 
 
 def square(side, center=(0.0, 0.0), half=0.1, x=0.0):
     """A square in the plane of x, as a grid of vertices; 100 px a metre in `FACING`."""
-    y, z = torch.meshgrid(torch.linspace(-half, half, side), torch.linspace(-half, half, side), indexing="xy")
+    y, z = torch.meshgrid(
+        torch.linspace(-half, half, side), torch.linspace(-half, half, side), indexing="xy"
+    )
     return torch.stack([torch.full_like(y, x), y + center[0], z + center[1]], dim=-1)
 
 
 def silhouettes(positions, camera, points):
     """Share of each pixel of the picture that meshes (F, side, side, 3) cover, (F, height, width)."""
     fine = _refined(positions[None], points)
-    whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, len(positions), 2), torch.ones(1, len(positions)))
+    whole = Crops(
+        torch.tensor(ANCHOR[::-1]).expand(1, len(positions), 2), torch.ones(1, len(positions))
+    )
     size = camera.height, camera.width
     return splat(fine, torch.ones(fine.shape[:-1]), Cameras.of([camera]), whole, size=size)[0][0]
 
@@ -37,7 +66,10 @@ def test_a_square_covers_its_area_wherever_it_lies():
 
 
 def test_an_edge_moves_through_a_pixel_as_far_as_the_cloth_does():
-    sums = [silhouettes(square(5, (shift / 100, 0.0))[None], FACING, points=60)[0].sum(dim=0) for shift in (0.0, 0.3)]
+    sums = [
+        silhouettes(square(5, (shift / 100, 0.0))[None], FACING, points=60)[0].sum(dim=0)
+        for shift in (0.0, 0.3)
+    ]
     column = torch.arange(64.0)
     centers = [float((total * column).sum() / total.sum()) for total in sums]
     assert centers[1] - centers[0] == pytest.approx(0.3, abs=0.01)
@@ -52,7 +84,14 @@ def test_what_is_nearer_hides_what_is_behind():
     colors = (x > 0).float()[None, None]
     for azimuth, expected in ((0, 1.0), (180, 0.0)):
         camera = looking_at(
-            (0, 0, 0), azimuth=azimuth, elevation=0, distance=1.0, name="c", width=64, height=48, focal=100.0
+            (0, 0, 0),
+            azimuth=azimuth,
+            elevation=0,
+            distance=1.0,
+            name="c",
+            width=64,
+            height=48,
+            focal=100.0,
         )
         whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, 1, 2), torch.ones(1, 1))
         alpha, color = splat(points, colors, Cameras.of([camera]), whole, size=(48, 64))
@@ -91,9 +130,13 @@ def test_turning_a_camera_turns_it_about_the_scene():
     middle = torch.tensor([0.15, 0.0, 0.05]).expand(3, 1, 3)
     for before, after in zip(cameras.project(middle), moved.project(middle), strict=True):
         torch.testing.assert_close(after, before, atol=1e-3, rtol=1e-4)
-    torch.testing.assert_close(moved.rotation @ moved.rotation.transpose(1, 2), torch.eye(3).expand(3, 3, 3))
+    torch.testing.assert_close(
+        moved.rotation @ moved.rotation.transpose(1, 2), torch.eye(3).expand(3, 3, 3)
+    )
     place = -(moved.rotation.transpose(1, 2) @ moved.translation[..., None])[..., 0] - middle[:, 0]
-    old = -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0] - middle[:, 0]
+    old = (
+        -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0] - middle[:, 0]
+    )
     angles = [torch.atan2(each[:, 1], each[:, 0]) for each in (place, old)]
     assert (angles[0] - angles[1]).abs().tolist() == pytest.approx([0.2] * 3, abs=0.02)
 
@@ -110,7 +153,9 @@ def test_frames_are_found_by_their_instants():
     frames, instants = frames_at(tuple(range(0, 300, 10)))
     assert instants == INSTANTS
     assert frames == [6, 8, 13, 15, 21, 22]
-    with pytest.raises(ValueError, match=r"must have a frame within 0\.06 s of 25\.00 s .* of 2 is at 0\.00 s"):
+    with pytest.raises(
+        ValueError, match=r"must have a frame within 0\.06 s of 25\.00 s .* of 2 is at 0\.00 s"
+    ):
         frames_at((0, 150))
 
 
@@ -138,7 +183,10 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
 
     def seen(seed, drawn=True):
         generator = torch.Generator().manual_seed(seed)
-        style, world = draw_style(3, 6, generator), sample_surroundings(3, generator) if drawn else None
+        style, world = (
+            draw_style(3, 6, generator),
+            sample_surroundings(3, generator) if drawn else None,
+        )
         return render_crops(meshes, cameras, instants, style, generator, world)
 
     first, again, other, dark = seen(1), seen(1), seen(2), seen(1, drawn=False)
@@ -147,13 +195,17 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
     behind = (first[1] == 0) & (dark[1] == 0)
     assert first[0][behind].mean() > dark[0][behind].mean() + 0.1
     assert 0 <= first[0].min() <= first[0].max() <= 1
-    assert (first[1] - dark[1]).abs().mean() < 0.05  # the camera is off by 3 % and 1.5 degrees at most
+    assert (
+        first[1] - dark[1]
+    ).abs().mean() < 0.05  # the camera is off by 3 % and 1.5 degrees at most
 
 
 def test_a_codec_keeps_what_is_smooth():
     number = torch.ones(2, 1, 1, 1)
     codec = Codec(is_on=torch.tensor([1.0, 0.0])[:, None, None, None], step=0.1 * number)
-    ramp = torch.linspace(0, 1, WIDTH).expand(2, 1, HEIGHT, WIDTH) + 0.02 * torch.randn(2, 1, HEIGHT, WIDTH)
+    ramp = torch.linspace(0, 1, WIDTH).expand(2, 1, HEIGHT, WIDTH) + 0.02 * torch.randn(
+        2, 1, HEIGHT, WIDTH
+    )
     kept = apply_codec(ramp, codec)
     assert torch.equal(kept[1], ramp[1])
     assert 0.001 < (kept[0] - ramp[0]).abs().mean() < 0.03

@@ -38,7 +38,9 @@ def test_meshes_are_taken_between_neighbours_of_one_fabric_and_side(runs):
         assert runs.landed[a] == runs.landed[b]
         assert 0 <= runs.mu[b] - runs.mu[a] <= (0.3 if runs.mu[a] >= 0.4 else 0.15)
         inner = (runs.mu > runs.mu[a]) & (runs.mu < runs.mu[b])
-        assert not (inner & (runs.material == runs.material[a]) & (runs.landed == runs.landed[a])).any()
+        assert not (
+            inner & (runs.material == runs.material[a]) & (runs.landed == runs.landed[a])
+        ).any()
 
 
 def test_a_mesh_between_two_is_near_the_simulation_that_lies_there(runs):
@@ -46,7 +48,9 @@ def test_a_mesh_between_two_is_near_the_simulation_that_lies_there(runs):
     off = []
     for code in range(len(runs.materials)):
         for side in (-1, 1):
-            chosen = np.flatnonzero((runs.material == code) & (runs.landed == side) & (runs.mu > 0.4))
+            chosen = np.flatnonzero(
+                (runs.material == code) & (runs.landed == side) & (runs.mu > 0.4)
+            )
             chosen = chosen[np.argsort(runs.mu[chosen])]
             for (a, b), (_, c) in pairwise(pairwise(chosen.tolist())):
                 share = (runs.mu[b] - runs.mu[a]) / (runs.mu[c] - runs.mu[a])

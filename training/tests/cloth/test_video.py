@@ -1,4 +1,6 @@
-"""Videos of one's own: a film of rendered cloth, with a lens, a hand that shakes and a codec that loses."""
+"""Videos of one's own: a film of rendered cloth, with a lens, a hand that shakes and a codec that
+loses.
+"""
 
 import math
 from dataclasses import replace
@@ -12,7 +14,13 @@ from stickslip_training.cloth import video
 from stickslip_training.cloth.clips import INSTANTS, RATE
 from stickslip_training.cloth.crop import ANCHOR, Cameras, Crops, cut, holder_crops
 from stickslip_training.cloth.render import _refined, splat
-from stickslip_training.cloth.video import FLOOR_MAX, VideoError, floor_motion, import_video, load_camera
+from stickslip_training.cloth.video import (
+    FLOOR_MAX,
+    VideoError,
+    floor_motion,
+    import_video,
+    load_camera,
+)
 
 pytest.importorskip("av")
 cv2 = pytest.importorskip("cv2")
@@ -31,7 +39,9 @@ def marks(contrast):
 
 
 def pictures(run, seconds, floor=0.05):
-    """Return grey levels (F, 224, 224) as a pinhole camera sees them: a checked cloth on a dark floor."""
+    """Return grey levels (F, 224, 224) as a pinhole camera sees them: a checked cloth on a dark
+    floor.
+    """
     lines = torch.linspace(0, 1, 112)
     checks = 0.35 + 0.3 * ((lines[:, None] * 20).floor() + (lines * 20).floor()).remainder(2)
     found = []
@@ -91,7 +101,9 @@ def test_start_shake_and_crops_are_found(imported, run):
     assert clip.direction[0].tolist() == pytest.approx(CAMERA.rotation[2])
 
 
-def test_a_film_that_begins_half_a_second_late_over_a_floor_without_marks_gives_the_same_crops(run, shown, tmp_path):
+def test_a_film_that_begins_half_a_second_late_over_a_floor_without_marks_gives_the_same_crops(
+    run, shown, tmp_path
+):
     seconds = shown[0][20:]
     assert 0.5 < seconds[0] < 0.6
     filmed(tmp_path / "late.mp4", pictures(run, seconds), np.zeros((len(seconds), 2)))
@@ -106,36 +118,53 @@ def test_the_floor_tells_how_the_camera_moved(run):
     moved = np.array([23.3, -11.6])
     for contrast in (0.01, 0.1):
         first, last = (255 * pictures(run, seconds, marks(contrast))).round().astype(np.uint8)
-        shifted = cv2.warpAffine(last, np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]]), (224, 224))
+        shifted = cv2.warpAffine(
+            last, np.array([[1.0, 0.0, moved[0]], [0.0, 1.0, moved[1]]]), (224, 224)
+        )
         motion, deviation = floor_motion(first, shifted, moved + np.array([1.5, -1.0]))
         assert motion == pytest.approx(moved, abs=0.1)
         assert deviation < 0.05
-    blank, noise = np.full((224, 224), 200, np.uint8), np.random.default_rng(1).normal(0, 1, (2, 224, 224))
+    blank, noise = (
+        np.full((224, 224), 200, np.uint8),
+        np.random.default_rng(1).normal(0, 1, (2, 224, 224)),
+    )
     assert floor_motion(blank, blank, np.zeros(2))[1] == math.inf
     assert floor_motion(*(blank + noise).round().astype(np.uint8), np.zeros(2))[1] > FLOOR_MAX
 
 
 def test_a_wrong_frame_rate_is_refused(film):
-    for rate, message in ((1.1 * FRAMES_A_SECOND, "must"), (2.0, "frame_rate must be at least 8.3 frames a second")):
+    for rate, message in (
+        (1.1 * FRAMES_A_SECOND, "must"),
+        (2.0, "frame_rate must be at least 8.3 frames a second"),
+    ):
         with pytest.raises(VideoError, match=message):
             import_video(film, LENS, frame_rate=rate)
-    with pytest.raises(VideoError, match="frame_rate must be more than 0 frames a second and finite, and is -1"):
+    with pytest.raises(
+        VideoError, match="frame_rate must be more than 0 frames a second and finite, and is -1"
+    ):
         import_video(film, LENS, frame_rate=-1.0)
 
 
 def test_a_wrong_start_is_refused(film):
-    with pytest.raises(VideoError, match=r"the start must be the same in both halves .* and differs by"):
+    with pytest.raises(
+        VideoError, match=r"the start must be the same in both halves .* and differs by"
+    ):
         import_video(film, LENS, start=START - 1.0)
 
 
 def test_another_camera_is_refused(film):
-    with pytest.raises(VideoError, match="frames must have the size of the calibration, 300 x 224, and have 224 x 224"):
+    with pytest.raises(
+        VideoError,
+        match="frames must have the size of the calibration, 300 x 224, and have 224 x 224",
+    ):
         import_video(film, LENS.model_copy(update={"width": 300}))
 
 
 def test_a_short_video_is_refused(run, tmp_path):
     filmed(tmp_path / "short.mp4", pictures(run, np.arange(30) / 6.0), np.zeros((30, 2)))
-    with pytest.raises(VideoError, match=r"the video must show 91 s from the start on, and lasts 3\.2 s"):
+    with pytest.raises(
+        VideoError, match=r"the video must show 91 s from the start on, and lasts 3\.2 s"
+    ):
         import_video(tmp_path / "short.mp4", LENS)
 
 
@@ -149,7 +178,11 @@ def test_calibration_is_read_as_opencv_writes_it(tmp_path):
     vector = cv2.Rodrigues(np.array(CAMERA.rotation))[0].ravel().tolist()
     keys = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     lines = [f"{key} = {value}" for key, value in keys.items()]
-    lines += [f"rotation = {vector}", f"translation = {list(CAMERA.translation)}", "distortion = [-0.1, 0.0, 0.0, 0.0]"]
+    lines += [
+        f"rotation = {vector}",
+        f"translation = {list(CAMERA.translation)}",
+        "distortion = [-0.1, 0.0, 0.0, 0.0]",
+    ]
     (tmp_path / "camera.toml").write_text("\n".join(lines))
     read = load_camera(tmp_path / "camera.toml")
     assert np.allclose(read.rotation, CAMERA.rotation, atol=1e-9)
@@ -178,5 +211,7 @@ def test_a_floor_that_moves_apart_from_the_holders_is_refused(shown, tmp_path, m
         return registration, wanders
 
     monkeypatch.setattr(video, "_register", astray)
-    with pytest.raises(VideoError, match=r"one motion of the camera to within 2 px .*, and differ by 2\.\d"):
+    with pytest.raises(
+        VideoError, match=r"one motion of the camera to within 2 px .*, and differ by 2\.\d"
+    ):
         import_video(tmp_path / "film.mp4", LENS)

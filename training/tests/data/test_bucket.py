@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
-from stickslip_training.data.sources import BucketSource, CorruptDataError, MissingFileError, SourceError, open_source
+from stickslip_training.data.sources import (
+    BucketSource,
+    CorruptDataError,
+    MissingFileError,
+    SourceError,
+    open_source,
+)
 
-pytest.importorskip("obstore", reason="obstore is not installed: pip install 'stickslip-training[s3]'")
+pytest.importorskip(
+    "obstore", reason="obstore is not installed: pip install 'stickslip-training[s3]'"
+)
 pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
 
 import obstore.store
@@ -49,7 +57,9 @@ def test_values_are_those_of_the_directory(clips_url, clips):
         slots = local.slots()
         assert np.array_equal(reader.slots(), slots)
         for name in local.arrays:
-            assert np.array_equal(reader.read(name, slots), local.read(name, slots), equal_nan=name != "video"), name
+            assert np.array_equal(
+                reader.read(name, slots), local.read(name, slots), equal_nan=name != "video"
+            ), name
 
 
 def test_a_sample_is_one_request(clips_url, server, monkeypatch):
@@ -58,7 +68,9 @@ def test_a_sample_is_one_request(clips_url, server, monkeypatch):
         reader.read("video", slots)  # the indexes of the shards are read once
         asked = []
         inner = obstore.get_range
-        monkeypatch.setattr(obstore, "get_range", lambda *a, **k: asked.append(a[1]) or inner(*a, **k))
+        monkeypatch.setattr(
+            obstore, "get_range", lambda *a, **k: asked.append(a[1]) or inner(*a, **k)
+        )
         reader.read("video", slots)
         assert len(asked) == len(slots)
 
@@ -67,7 +79,11 @@ def test_a_sample_is_one_request(clips_url, server, monkeypatch):
 def test_workers_that_are_spawned_read_it(clips_url, clips):
     dataset = Samples(clips_url, "train")
     loader = dataset.loader(2, num_workers=1, multiprocessing_context="spawn")
-    found = {int(slot): video for batch in loader for slot, video in zip(batch["slot"], batch["video"], strict=True)}
+    found = {
+        int(slot): video
+        for batch in loader
+        for slot, video in zip(batch["slot"], batch["video"], strict=True)
+    }
     assert sorted(found) == dataset.slots.tolist()
     for slot, video in found.items():
         assert np.array_equal(video.numpy(), clips.arrays["video"][slot])
@@ -102,5 +118,8 @@ def test_a_shard_that_is_too_short_is_told(server, clips, tmp_path):
     made = clips.copy(tmp_path / "short")
     path = made.root / "video/c/0/0/0/0/0"
     path.write_bytes(path.read_bytes()[:-100])
-    with DatasetReader(put(made, "short")) as reader, pytest.raises((CorruptDataError, SourceError)):
+    with (
+        DatasetReader(put(made, "short")) as reader,
+        pytest.raises((CorruptDataError, SourceError)),
+    ):
         reader.read("video", reader.slots()[:1])

@@ -10,7 +10,12 @@ from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Contents
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.data.sources import CorruptDataError, InvalidDatasetError, MissingFileError, RejectedSampleError
+from stickslip_training.data.sources import (
+    CorruptDataError,
+    InvalidDatasetError,
+    MissingFileError,
+    RejectedSampleError,
+)
 from stickslip_training.export.formats import Content
 
 SELECTION = Selection(arrays=("video",), where=("material==gray-interlock",))
@@ -33,7 +38,9 @@ def part(clips: Any, tmp_path: Path) -> Any:
 
 def write_selection(root: Path, selection: Selection) -> None:
     manifest = sha256((root / "manifest.json").read_bytes())
-    (root / SELECTION_NAME).write_text(PartDocument(manifest=manifest, selection=selection).model_dump_json())
+    (root / SELECTION_NAME).write_text(
+        PartDocument(manifest=manifest, selection=selection).model_dump_json()
+    )
 
 
 def test_the_samples_of_a_part_are_read(part: Any) -> None:

@@ -39,7 +39,9 @@ def test_rejected_samples_are_skipped_and_cannot_be_read(clips):
     reader = DatasetReader(clips.root)
     assert len(reader) == 12
     assert reader.slots().tolist() == [slot for slot in range(12) if slot not in (3, 9)]
-    with pytest.raises(RejectedSampleError, match="sample 9 was rejected: out_of_frame, leaves view 2"):
+    with pytest.raises(
+        RejectedSampleError, match="sample 9 was rejected: out_of_frame, leaves view 2"
+    ):
         reader.read("video", [9])
     with pytest.raises(RejectedSampleError):
         reader.read("mu", [3])
@@ -51,7 +53,9 @@ def test_splits_part_the_valid_samples(rods):
     assert sorted(np.concatenate(parts).tolist()) == reader.slots().tolist()
     assert [len(part) for part in parts] == list(rods.manifest.split_counts.values())
     assert all(len(part) for part in parts)
-    with pytest.raises(ValueError, match="split must be one of train, validation, test, and is 'all'"):
+    with pytest.raises(
+        ValueError, match="split must be one of train, validation, test, and is 'all'"
+    ):
         reader.slots("all")
 
 
@@ -103,7 +107,8 @@ def test_works_in_a_forked_child_after_use_in_the_parent(clips):
     assert np.array_equal(reader.read("video", [7]), clips.arrays["video"][[7]])
 
 
-# --- damage ---------------------------------------------------------------------------------------------------
+# --- damage
+# ---------------------------------------------------------------------------------------------------
 
 
 def is_told(root, shard):
@@ -126,7 +131,9 @@ def test_no_flipped_bit_is_silent(clips, tmp_path):
     shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
     sizes = np.array([path.stat().st_size for path in shards])
     generator = np.random.default_rng(3)
-    targets = np.concatenate([np.repeat(np.arange(len(shards)), 6), generator.choice(len(shards), 100)])
+    targets = np.concatenate(
+        [np.repeat(np.arange(len(shards)), 6), generator.choice(len(shards), 100)]
+    )
     silent = []
     for target in targets:
         path = shards[target]
@@ -148,12 +155,19 @@ def test_the_message_about_a_corrupt_chunk_names_array_sample_and_file(clips, tm
     data[100] ^= 1
     path.write_bytes(data)
     reader = DatasetReader(made.root, check_shards=False)
-    with pytest.raises(CorruptDataError, match=r"array video, sample 0, .*video/c/0/0/0/0/0: the crc32c of the chunk"):
+    with pytest.raises(
+        CorruptDataError,
+        match=r"array video, sample 0, .*video/c/0/0/0/0/0: the crc32c of the chunk",
+    ):
         reader.read("video", [0])
     assert np.array_equal(reader.read("video", [1]), made.arrays["video"][[1]])
-    with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"):
+    with pytest.raises(
+        CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"
+    ):
         DatasetReader(made.root).read("video", [1])
-    with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"):
+    with pytest.raises(
+        CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"
+    ):
         DatasetReader(made.root, verify=True)
 
 
@@ -173,7 +187,10 @@ def test_a_truncated_shard_raises_where_the_manifest_agrees_with_it(clips, tmp_p
     path = "video/c/1/0/0/0/0"
     made.rewrite(path, (made.root / path).read_bytes()[:kept])
     reader = DatasetReader(made.root)
-    with pytest.raises(CorruptDataError, match=r"array video.*(too short for a shard index|crc32c of the shard index)"):
+    with pytest.raises(
+        CorruptDataError,
+        match=r"array video.*(too short for a shard index|crc32c of the shard index)",
+    ):
         reader.read("video", [8])
 
 
@@ -182,7 +199,9 @@ def test_a_missing_shard_raises(clips, tmp_path):
     (made.root / "video/c/1/0/0/0/0").unlink()
     reader = DatasetReader(made.root)
     reader.read("video", [0])
-    with pytest.raises(MissingFileError, match=r"video/c/1/0/0/0/0 is not there, and the manifest says it is"):
+    with pytest.raises(
+        MissingFileError, match=r"video/c/1/0/0/0/0 is not there, and the manifest says it is"
+    ):
         reader.read("video", [8])
     (made.root / "valid/c/0").unlink()
     with pytest.raises(MissingFileError):
@@ -193,7 +212,9 @@ def test_a_shard_that_is_not_in_the_manifest_raises_although_it_is_there(clips, 
     made = clips.copy(tmp_path / "v1")
     files = made.manifest.files
     made.edit_manifest(files=tuple(file for file in files if file.path != "video/c/1/0/0/0/0"))
-    with pytest.raises(MissingFileError, match=r"array video, shard 1: video/c/1/0/0/0/0 is not in the manifest"):
+    with pytest.raises(
+        MissingFileError, match=r"array video, shard 1: video/c/1/0/0/0/0 is not in the manifest"
+    ):
         DatasetReader(made.root)
 
 
@@ -217,7 +238,9 @@ def test_a_chunk_of_another_size_raises(clips, tmp_path):
     made.rewrite("video/c/0/0/0/0/0", encode_shard(chunks))
     reader = DatasetReader(made.root)
     assert reader.read("video", [4]).all()
-    with pytest.raises(CorruptDataError, match=r"sample 2, .*the chunk decodes to 150528 bytes, and 301056"):
+    with pytest.raises(
+        CorruptDataError, match=r"sample 2, .*the chunk decodes to 150528 bytes, and 301056"
+    ):
         reader.read("video", [2])
 
 
@@ -258,7 +281,9 @@ def test_no_flipped_bit_in_the_files_that_vouch_for_the_others_is_silent(rods, t
 
 @pytest.mark.physics
 def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
-    """200 swaps: those that chance makes equal in size, and a sample's chunk that is put where another's was."""
+    """200 swaps: those that chance makes equal in size, and a sample's chunk that is put where
+    another's was.
+    """
     made = clips.copy(tmp_path / "v1")
     shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
     content = {path: path.read_bytes() for path in shards}
@@ -278,7 +303,9 @@ def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
 
 
 def test_a_sample_that_changed_its_place_in_a_shard_raises(clips, tmp_path):
-    """Every chunk has its checksum, and the file its size: only the manifest knows whose chunk it was."""
+    """Every chunk has its checksum, and the file its size: only the manifest knows whose chunk it
+    was.
+    """
     made = clips.copy(tmp_path / "v1")
     path = made.root / "video/c/0/0/0/0/0"
     data, index = path.read_bytes(), -(16 * 8 + 4)
@@ -303,12 +330,19 @@ def test_each_of_the_three_is_checked(clips, tmp_path):
     made = clips.copy(tmp_path / "v1")
     group, seal_of = made.root / "zarr.json", made.root / "manifest.sha256"
     other = sha256(b"other")
-    group.write_text(group.read_text().replace(sha256((made.root / "manifest.json").read_bytes()), other))
+    group.write_text(
+        group.read_text().replace(sha256((made.root / "manifest.json").read_bytes()), other)
+    )
     with pytest.raises(CorruptDataError, match=r"zarr.json has SHA-256"):
         DatasetReader(made.root)
-    lines = [f"{sha256((made.root / name).read_bytes())}  {name}\n" for name in ("manifest.json", "zarr.json")]
+    lines = [
+        f"{sha256((made.root / name).read_bytes())}  {name}\n"
+        for name in ("manifest.json", "zarr.json")
+    ]
     seal_of.write_text("".join(lines))
-    with pytest.raises(CorruptDataError, match=f"manifest_sha256 must be that of manifest.json, .*, and is {other}"):
+    with pytest.raises(
+        CorruptDataError, match=f"manifest_sha256 must be that of manifest.json, .*, and is {other}"
+    ):
         DatasetReader(made.root)
     made.seal()
     seal_of.write_text("".join(lines) + "\n")
@@ -316,7 +350,8 @@ def test_each_of_the_three_is_checked(clips, tmp_path):
         DatasetReader(made.root)
 
 
-# --- contradictions -------------------------------------------------------------------------------------------
+# --- contradictions
+# -------------------------------------------------------------------------------------------
 
 
 def test_the_manifest_must_be_one(clips, tmp_path):
@@ -332,7 +367,10 @@ def test_the_manifest_must_be_one(clips, tmp_path):
     [
         ({"sample_count": 13}, "sample_count of the manifest is 13, its spec asks for 12"),
         ({"valid_count": 11}, "valid_count of the manifest is 11"),
-        ({"rejections": (), "valid_count": 12}, "array valid must be false at the manifest's rejections"),
+        (
+            {"rejections": (), "valid_count": 12},
+            "array valid must be false at the manifest's rejections",
+        ),
         ({"split_counts": {"train": 1}}, "split_counts of the manifest"),
     ],
 )
@@ -346,10 +384,14 @@ def test_the_manifest_must_not_contradict_itself_or_the_arrays(clips, tmp_path, 
 def test_the_manifest_of_another_dataset_is_refused(clips, rods, tmp_path):
     made = clips.copy(tmp_path / "v1")
     (made.root / "manifest.json").write_text(rods.manifest.model_dump_json())
-    with pytest.raises(CorruptDataError, match=r"manifest.json has SHA-256 .*, and manifest.sha256 says"):
+    with pytest.raises(
+        CorruptDataError, match=r"manifest.json has SHA-256 .*, and manifest.sha256 says"
+    ):
         DatasetReader(made.root)
     shutil.copy(rods.root / "manifest.sha256", made.root)
-    with pytest.raises(CorruptDataError, match=r"zarr.json has SHA-256 .*, and manifest.sha256 says"):
+    with pytest.raises(
+        CorruptDataError, match=r"zarr.json has SHA-256 .*, and manifest.sha256 says"
+    ):
         DatasetReader(made.root)
 
 
@@ -357,7 +399,9 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
     made = clips.copy(tmp_path / "v1")
     keys = made.manifest.sample_keys
     made.edit_manifest(sample_keys=(keys[1], keys[0], *keys[2:]))
-    with pytest.raises(InvalidDatasetError, match=r"sample_key is not what the manifest says of samples \[0, 1\]"):
+    with pytest.raises(
+        InvalidDatasetError, match=r"sample_key is not what the manifest says of samples \[0, 1\]"
+    ):
         DatasetReader(made.root)
 
 
@@ -369,7 +413,11 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
         ('"data_type": "int16"', '"data_type": "int32"', "array texture: data_type must be"),
         ('"fill_value": -1', '"fill_value": 0', "array texture: fill_value must be -1, and is 0"),
         ('"separator": "/"', '"separator": "."', "array video: chunk_key_encoding must be"),
-        ('"viewpoint": {', '"view": {', "array viewpoint: there must be metadata, and there are none"),
+        (
+            '"viewpoint": {',
+            '"view": {',
+            "array viewpoint: there must be metadata, and there are none",
+        ),
         ('"node_type": "group"', '"node_type": "array"', "zarr.json must be of a Zarr v3 group"),
     ],
 )
@@ -386,7 +434,9 @@ def test_metadata_must_say_the_order_of_bytes_of_a_number(clips, tmp_path):
     made = clips.copy(tmp_path / "v1")
     group = json.loads((made.root / "zarr.json").read_text())
     (order,) = [
-        codec for codec in group["consolidated_metadata"]["metadata"]["texture"]["codecs"] if "bytes" in codec.values()
+        codec
+        for codec in group["consolidated_metadata"]["metadata"]["texture"]["codecs"]
+        if "bytes" in codec.values()
     ]
     del order["configuration"]["endian"]
     made.rewrite("zarr.json", json.dumps(group).encode())

@@ -19,13 +19,18 @@ def test_a_rod(rods):
         "centerline": (torch.float32, (150, 3)),
         "curvature": (torch.float32, (150, 3)),
         "frame": (torch.float32, (150, 3, 3)),
-        **dict.fromkeys(("gamma", "phi0", "phi1", "energy", "self_contact_distance", "reach"), (torch.float32, ())),
+        **dict.fromkeys(
+            ("gamma", "phi0", "phi1", "energy", "self_contact_distance", "reach"),
+            (torch.float32, ()),
+        ),
         "multistable": (torch.int64, ()),
         "slot": (torch.int64, ()),
         "sample_key": (torch.uint8, (32,)),
     }
     for name in ("centerline", "curvature", "gamma", "phi0", "phi1", "sample_key"):
-        assert np.array_equal(item[name].numpy(), rods.arrays[name][slot].astype(item[name].numpy().dtype))
+        assert np.array_equal(
+            item[name].numpy(), rods.arrays[name][slot].astype(item[name].numpy().dtype)
+        )
 
 
 def test_a_rod_with_views_and_frame(seen_rods):
@@ -39,14 +44,22 @@ def test_a_rod_with_views_and_frame(seen_rods):
 
 def test_a_clip(clips):
     dataset = Samples(clips.root)
-    assert [int(item["slot"]) for item in dataset] == [slot for slot in range(12) if slot not in (3, 9)]
+    assert [int(item["slot"]) for item in dataset] == [
+        slot for slot in range(12) if slot not in (3, 9)
+    ]
     item = dataset[8]
     assert item["video"].shape == (2, 224, 224, 3)
     assert np.array_equal(item["video"].numpy(), clips.arrays["video"][10])
     assert isinstance(item, Item)
-    assert [item.name(label) for label in ("material", "texture", "viewpoint")] == ["camel-ponte-roma", "plaid", "left"]
+    assert [item.name(label) for label in ("material", "texture", "viewpoint")] == [
+        "camel-ponte-roma",
+        "plaid",
+        "left",
+    ]
     assert dataset.categories["material"][item["material"]] == "camel-ponte-roma"
-    with pytest.raises(ValueError, match=r"label must be one of texture, viewpoint, .*material.*, and is 'mu'"):
+    with pytest.raises(
+        ValueError, match=r"label must be one of texture, viewpoint, .*material.*, and is 'mu'"
+    ):
         item.name("mu")
     assert item["mu"] == np.float32(0.4)
     assert item["landed_side"] == clips.arrays["landed_side"][10]
@@ -58,7 +71,9 @@ def test_a_clip_with_its_mesh(clips):
     assert np.array_equal(dataset[8]["positions"].numpy(), clips.arrays["positions"][10])
     batch = dataset.__getitems__([8, 0, 3])
     assert batch["positions"].shape == (3, 300, 25, 3)
-    assert np.array_equal(batch["positions"].numpy(), clips.arrays["positions"][dataset.slots[[8, 0, 3]]])
+    assert np.array_equal(
+        batch["positions"].numpy(), clips.arrays["positions"][dataset.slots[[8, 0, 3]]]
+    )
 
 
 def test_a_dataset_without_meshes_says_so(make_clips):
@@ -81,7 +96,13 @@ def test_a_batch_is_its_items(clips):
 def test_by_default_a_clip_has_its_video_and_all_scalar_labels(clips):
     dataset = Samples(clips.root)
     assert set(dataset[0]) >= {"video", "mu", "bias_side", "landed_side", "kernel"}
-    assert not set(dataset[0]) & {"positions", "contact_force", "bending_rigidity", "valid", "split"}
+    assert not set(dataset[0]) & {
+        "positions",
+        "contact_force",
+        "bending_rigidity",
+        "valid",
+        "split",
+    }
 
 
 def test_what_does_not_fit_is_refused(clips, rods):

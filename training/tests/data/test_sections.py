@@ -1,11 +1,18 @@
-"""Datasets whose manifest has sections are read like others, and each section is checked before its samples are."""
+"""Datasets whose manifest has sections are read like others, and each section is checked before its
+samples are.
+"""
 
 import pickle
 
 import numpy as np
 import pytest
 from stickslip_schemas.base import canonical_json, sha256
-from stickslip_schemas.format.manifest import FileEntry, ManifestSection, section_path, section_samples
+from stickslip_schemas.format.manifest import (
+    FileEntry,
+    ManifestSection,
+    section_path,
+    section_samples,
+)
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
 from stickslip_training.data.sources import (
@@ -18,19 +25,31 @@ from stickslip_training.data.sources import (
 
 
 def write_sections(made, **changes):
-    """Move what the manifest of a dataset lists of samples into sections; `changes` are of the second one."""
+    """Move what the manifest of a dataset lists of samples into sections.
+
+    `changes` are of the second one.
+    """
     manifest = made.manifest
     size = section_samples(manifest.spec)
     labels = {name for name, array in DatasetReader(made.root).arrays.items() if array.is_label}
-    shards = [file for file in manifest.files if "/c/" in file.path and file.path.split("/")[0] not in labels]
+    shards = [
+        file
+        for file in manifest.files
+        if "/c/" in file.path and file.path.split("/")[0] not in labels
+    ]
     (made.root / "manifest").mkdir()
     entries = []
     for number, first in enumerate(range(0, manifest.sample_count, size)):
-        within = range(first // manifest.spec.samples_per_shard, (first + size) // manifest.spec.samples_per_shard)
+        within = range(
+            first // manifest.spec.samples_per_shard,
+            (first + size) // manifest.spec.samples_per_shard,
+        )
         section = ManifestSection(
             first=first,
             sample_keys=manifest.sample_keys[first : first + size],
-            rejections=tuple(item for item in manifest.rejections if first <= item.slot < first + size),
+            rejections=tuple(
+                item for item in manifest.rejections if first <= item.slot < first + size
+            ),
             files=tuple(file for file in shards if int(file.path.split("/")[2]) in within),
         )
         if number == 1:
@@ -62,12 +81,19 @@ def sectioned(clips, tmp_path):
 def test_it_is_read_like_any_other(clips, sectioned):
     with DatasetReader(clips.root) as whole, DatasetReader(sectioned.root, verify=True) as reader:
         for name in whole.label_names:
-            assert np.array_equal(reader.label(name), whole.label(name), equal_nan=whole.label(name).dtype.kind == "f")
+            assert np.array_equal(
+                reader.label(name), whole.label(name), equal_nan=whole.label(name).dtype.kind == "f"
+            )
         for name in ("video", "positions"):
-            assert np.array_equal(reader.read(name, reader.slots()), whole.read(name, whole.slots()))
+            assert np.array_equal(
+                reader.read(name, reader.slots()), whole.read(name, whole.slots())
+            )
         assert list(reader.rejections()) == list(whole.rejections())
         listed = {file.path for file in reader.files()}
-        assert listed - {file.path for file in whole.files()} == {"manifest/0.json", "manifest/1.json"}
+        assert listed - {file.path for file in whole.files()} == {
+            "manifest/0.json",
+            "manifest/1.json",
+        }
         for rejection in whole.rejections():
             with pytest.raises(RejectedSampleError, match=rejection.message):
                 reader.read("video", [rejection.slot])
@@ -116,7 +142,11 @@ def test_no_flipped_bit_of_a_section_is_silent(sectioned):
     [
         ({"first": 7}, CorruptDataError, "must list the samples 8 to 11, and lists 7 to 10"),
         ({"files": ()}, MissingFileError, "is not in the manifest"),
-        ({"rejections": ()}, InvalidDatasetError, "array valid must be false at the manifest's rejections"),
+        (
+            {"rejections": ()},
+            InvalidDatasetError,
+            "array valid must be false at the manifest's rejections",
+        ),
         ({"sample_keys": tuple(4 * ["0" * 64])}, InvalidDatasetError, r"samples \[8, 10, 11\]"),
     ],
 )

@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
-from stickslip_training.data.sources import CorruptDataError, HttpSource, MissingFileError, SourceError
+from stickslip_training.data.sources import (
+    CorruptDataError,
+    HttpSource,
+    MissingFileError,
+    SourceError,
+)
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -122,9 +127,13 @@ def test_verify_reads_every_file(server, seen_rods):
 def test_workers_make_connections_of_their_own(server, seen_rods, method):
     dataset = Samples(_url(server), arrays=["centerline", "views"])
     dataset[0]  # the parent is connected already
-    loader = dataset.loader(2, num_workers=2, multiprocessing_context=multiprocessing.get_context(method))
+    loader = dataset.loader(
+        2, num_workers=2, multiprocessing_context=multiprocessing.get_context(method)
+    )
     for batch in loader:
-        assert np.array_equal(batch["views"].numpy(), seen_rods.arrays["views"][batch["slot"].numpy()])
+        assert np.array_equal(
+            batch["views"].numpy(), seen_rods.arrays["views"][batch["slot"].numpy()]
+        )
     assert np.array_equal(dataset[0]["views"].numpy(), seen_rods.arrays["views"][0])
     dataset.close()
 
@@ -145,7 +154,9 @@ def test_a_server_that_stays_away_is_an_error(server, monkeypatch):
 
 
 def test_a_version_that_is_not_there(server):
-    with pytest.raises(MissingFileError, match=r"manifest.json is not there: this is no committed dataset version"):
+    with pytest.raises(
+        MissingFileError, match=r"manifest.json is not there: this is no committed dataset version"
+    ):
         DatasetReader(_url(server, "v1/datasets/ds-x/versions/2"))
 
 
@@ -160,13 +171,19 @@ def test_the_key_is_sent(server, monkeypatch):
 
 def test_a_server_without_ranges_is_refused(server):
     server.ranges = False
-    with DatasetReader(_url(server)) as reader, pytest.raises(SourceError, match="it does not serve ranges"):
+    with (
+        DatasetReader(_url(server)) as reader,
+        pytest.raises(SourceError, match="it does not serve ranges"),
+    ):
         reader.read("views", [0])
 
 
 def test_a_short_answer_is_refused(server):
     server.cut = 1
-    with DatasetReader(_url(server)) as reader, pytest.raises(CorruptDataError, match=r"sent \d+ bytes, and \d+"):
+    with (
+        DatasetReader(_url(server)) as reader,
+        pytest.raises(CorruptDataError, match=r"sent \d+ bytes, and \d+"),
+    ):
         reader.read("views", [0])
 
 

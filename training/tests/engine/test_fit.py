@@ -3,14 +3,23 @@ from dataclasses import replace
 import pytest
 import torch
 from stickslip_training.engine import fit as module
-from stickslip_training.engine.fit import FitSettings, Learner, cosine_rate, fit, load_tensors, seeded
+from stickslip_training.engine.fit import (
+    FitSettings,
+    Learner,
+    cosine_rate,
+    fit,
+    load_tensors,
+    seeded,
+)
 from torch import nn
 
 SETTINGS = FitSettings(steps=23, epoch=5, seed=3, averaging=0.9, clip=1.0, threads=1)
 
 
 class Line(Learner):
-    """y = 2 x - 1 from points that each step draws by itself, through dropout: torch's generator is at work, too."""
+    """y = 2 x - 1 from points that each step draws by itself, through dropout: torch's generator is
+    at work, too.
+    """
 
     def __init__(self, validates=True):
         with seeded(0):
@@ -100,7 +109,11 @@ def test_a_checkpoint_within_an_epoch_is_as_good(tmp_path, monkeypatch):
 def test_a_resumed_run_must_be_the_same(tmp_path):
     fit(Line(), SETTINGS, out=tmp_path, identity={"data": "a"})
     for changed, identity, message in (
-        (replace(SETTINGS, seed=9), {"data": "a"}, "seed must be that of the run that is resumed, 3, and is 9"),
+        (
+            replace(SETTINGS, seed=9),
+            {"data": "a"},
+            "seed must be that of the run that is resumed, 3, and is 9",
+        ),
         (SETTINGS, {"data": "b"}, "data must be that of the run that is resumed, a, and is b"),
     ):
         with pytest.raises(ValueError, match=message):

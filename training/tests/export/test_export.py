@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 
 run = CliRunner().invoke
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of the libraries that read; some warn as they are imported
+pytestmark = pytest.mark.filterwarnings(
+    "ignore"
+)  # of the libraries that read; some warn as they are imported
 
 
 @pytest.fixture(params=["clips", "rods", "seen_rods"])
@@ -37,18 +39,26 @@ def expected(source: Any) -> dict[str, np.ndarray]:
     """Return what an export of everything must hold, by array."""
     slots = np.flatnonzero(source.arrays["valid"])
     return {"slot": slots} | {
-        array.name: source.arrays[array.name][slots] for array in layout(source.spec) if array.name != "valid"
+        array.name: source.arrays[array.name][slots]
+        for array in layout(source.spec)
+        if array.name != "valid"
     }
 
 
 def same(found: Any, wanted: np.ndarray) -> bool:
     """Return whether two arrays have the same type, shape and bits."""
     found = np.asarray(found)
-    return found.dtype == wanted.dtype and found.shape == wanted.shape and found.tobytes() == wanted.tobytes()
+    return (
+        found.dtype == wanted.dtype
+        and found.shape == wanted.shape
+        and found.tobytes() == wanted.tobytes()
+    )
 
 
 def test_hdf5_is_the_source(source: Any, tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'")
+    h5py = pytest.importorskip(
+        "h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'"
+    )
     target = tmp_path / "out.h5"
     export(source, "--hdf5", target)
     wanted = expected(source)
@@ -63,12 +73,16 @@ def test_hdf5_is_the_source(source: Any, tmp_path: Path) -> None:
         for name, array in arrays.items():
             if name != "valid":
                 assert [item.label for item in file[name].dims] == ["sample", *array.dimensions]
-                assert tuple(file[name].attrs.get("categories", ())) == tuple(map(str, array.categories))
+                assert tuple(file[name].attrs.get("categories", ())) == tuple(
+                    map(str, array.categories)
+                )
     assert [path.name for path in tmp_path.iterdir()] == ["out.h5"]
 
 
 def test_a_flipped_bit_in_hdf5_is_an_error(clips: Any, tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'")
+    h5py = pytest.importorskip(
+        "h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'"
+    )
     target = tmp_path / "out.h5"
     export(clips, "--hdf5", target)
     with h5py.File(target) as file:
@@ -80,10 +94,16 @@ def test_a_flipped_bit_in_hdf5_is_an_error(clips: Any, tmp_path: Path) -> None:
         file["video"][:]
 
 
-def test_webdataset_is_the_source(source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed: pip install webdataset")
+def test_webdataset_is_the_source(
+    source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    webdataset = pytest.importorskip(
+        "webdataset", reason="webdataset is not installed: pip install webdataset"
+    )
     monkeypatch.setattr(
-        content_module, "FILE_BYTES", 2 * sum(array.sample_bytes for array in layout(source.spec)) + 100
+        content_module,
+        "FILE_BYTES",
+        2 * sum(array.sample_bytes for array in layout(source.spec)) + 100,
     )
     target = tmp_path / "out"
     export(source, "--webdataset", target)
@@ -97,7 +117,9 @@ def test_webdataset_is_the_source(source: Any, tmp_path: Path, monkeypatch: pyte
             assert item["json"]["split"] == code
             assert int(item["__key__"]) == item["json"]["slot"]
             for name in wanted:
-                found[name].append(item["json"][name] if name in item["json"] else item[f"{name}.npy"])
+                found[name].append(
+                    item["json"][name] if name in item["json"] else item[f"{name}.npy"]
+                )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # webdataset closes no file
         gc.collect()
@@ -108,16 +130,22 @@ def test_webdataset_is_the_source(source: Any, tmp_path: Path, monkeypatch: pyte
             assert item[f"{name}.npy"].dtype == values.dtype
     described = json.loads((target / "dataset.json").read_bytes())
     assert described["arrays"].keys() == wanted.keys()
-    assert (target / "source-manifest.json").read_bytes() == (source.root / "manifest.json").read_bytes()
+    assert (target / "source-manifest.json").read_bytes() == (
+        source.root / "manifest.json"
+    ).read_bytes()
 
 
 @pytest.mark.physics
-def test_huggingface_is_the_source(source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_huggingface_is_the_source(
+    source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     datasets = pytest.importorskip(
         "datasets", reason="datasets is not installed: pip install 'stickslip-training[export]'"
     )
     monkeypatch.setattr(
-        content_module, "FILE_BYTES", 2 * sum(array.sample_bytes for array in layout(source.spec)) + 100
+        content_module,
+        "FILE_BYTES",
+        2 * sum(array.sample_bytes for array in layout(source.spec)) + 100,
     )
     target = tmp_path / "out"
     export(source, "--huggingface", target)
@@ -148,14 +176,22 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "an export needs one of --hdf5, --webdataset, --huggingface, --lerobot, --obj, and has none"),
+        (
+            [],
+            "an export needs one of --hdf5, --webdataset, --huggingface, --lerobot, --obj, and has none",
+        ),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
         (["--webdataset", "OUT", "--arrays", "movie"], "got 'movie'"),
-        (["--webdataset", "OUT", "--split", "all"], "split: Input should be 'train', 'validation' or 'test'"),
+        (
+            ["--webdataset", "OUT", "--split", "all"],
+            "split: Input should be 'train', 'validation' or 'test'",
+        ),
         (["--webdataset", "OUT", "--where", "mu>9"], "no valid sample is in this part"),
     ],
 )
-def test_what_makes_no_sense_is_refused(clips: Any, tmp_path: Path, options: list[str], message: str) -> None:
+def test_what_makes_no_sense_is_refused(
+    clips: Any, tmp_path: Path, options: list[str], message: str
+) -> None:
     options = [str(tmp_path / "out") if option == "OUT" else option for option in options]
     done = run(app, ["export", str(clips.root), *options])
     assert done.exit_code == 1
@@ -175,7 +211,9 @@ def test_nothing_is_overwritten(clips: Any, tmp_path: Path) -> None:
 def test_an_export_that_fails_leaves_nothing(clips: Any, tmp_path: Path) -> None:
     copy = clips.copy(tmp_path / "copy")
     shard = next(
-        file for file in sorted((copy.root / "video").rglob("*")) if file.is_file() and file.name != "zarr.json"
+        file
+        for file in sorted((copy.root / "video").rglob("*"))
+        if file.is_file() and file.name != "zarr.json"
     )
     data = bytearray(shard.read_bytes())
     data[len(data) // 2] ^= 1
@@ -186,7 +224,9 @@ def test_an_export_that_fails_leaves_nothing(clips: Any, tmp_path: Path) -> None
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
-def test_one_sample_at_a_time_is_read(clips: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_sample_at_a_time_is_read(
+    clips: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Memory does not grow with the dataset."""
     read: list[int] = []
     inner = DatasetReader.read
@@ -200,7 +240,9 @@ def test_one_sample_at_a_time_is_read(clips: Any, tmp_path: Path, monkeypatch: p
     assert set(read) == {1}
 
 
-def test_files_are_of_one_split_and_of_bounded_size(clips: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_of_one_split_and_of_bounded_size(
+    clips: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from stickslip_schemas.format.selection import Selection
 
     with DatasetReader(clips.root) as reader:
@@ -210,4 +252,6 @@ def test_files_are_of_one_split_and_of_bounded_size(clips: Any, monkeypatch: pyt
     assert max(len(slots) for *_, slots in parts) == 3
     for split, _, _, slots in parts:
         assert {SPLITS[code] for code in clips.arrays["split"][slots]} == {split}
-    assert sorted(np.concatenate([slots for *_, slots in parts])) == list(np.flatnonzero(clips.arrays["valid"]))
+    assert sorted(np.concatenate([slots for *_, slots in parts])) == list(
+        np.flatnonzero(clips.arrays["valid"])
+    )

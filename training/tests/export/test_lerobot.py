@@ -14,7 +14,11 @@ from stickslip_training.export import lerobot
 
 FRAMES, INSTANTS, VERTICES, SIDE = 10, 46, 25, 64
 VIEWS = ("front", "high")
-PYTHON = Path(os.environ.get("STICKSLIP_LEROBOT_PYTHON", Path(__file__).parents[3] / ".venv-lerobot/bin/python"))
+PYTHON = Path(
+    os.environ.get(
+        "STICKSLIP_LEROBOT_PYTHON", Path(__file__).parents[3] / ".venv-lerobot/bin/python"
+    )
+)
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
 
@@ -38,7 +42,9 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
         array("viewpoint", "code", "int16", categories=VIEWS),
         array("split", "code", "uint8", categories=SPLITS),
     )  # fmt: skip
-    rest = np.stack(np.meshgrid(*[np.linspace(0.0, 0.2, 5)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    rest = np.stack(np.meshgrid(*[np.linspace(0.0, 0.2, 5)] * 2, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     count = 2 * simulations
 
     def random(*shape: int) -> Any:
@@ -78,7 +84,9 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
 
 
 def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> None:
-    pytest.importorskip("pandas", reason="pandas is not installed: pip install 'stickslip-training[export]'")
+    pytest.importorskip(
+        "pandas", reason="pandas is not installed: pip install 'stickslip-training[export]'"
+    )
     parquet = pytest.importorskip("pyarrow.parquet")
     made, data = content(without=(3,))  # the second simulation lacks a view
     lerobot.write(made, tmp_path, lambda _: None)
@@ -91,7 +99,9 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
     rows = parquet.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
     instants = made.arrays[1].attributes["instants"]
     pose, grasped = data["holder_pose"][0][instants], data["grasped"][0][instants]
-    own = np.concatenate([pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1).reshape(FRAMES, -1)
+    own = np.concatenate(
+        [pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1
+    ).reshape(FRAMES, -1)
     state, action = np.array(rows["observation.state"][:FRAMES]), np.array(rows["action"][:FRAMES])
     np.testing.assert_array_equal(state[:, :20], own)
     np.testing.assert_array_equal(action[:-1], own[1:])
@@ -102,7 +112,9 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
     assert names[9:11] == ["napkin.left.grasp", "napkin.right.x"]
     assert names[-15:-12] == ["napkin.0.x", "napkin.0.y", "napkin.0.z"]
     assert len(names) == state.shape[1]
-    np.testing.assert_allclose(rows["observation.time"][:FRAMES], np.array(instants) / 15.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        rows["observation.time"][:FRAMES], np.array(instants) / 15.0, rtol=1e-6
+    )
     stats = json.loads((tmp_path / "meta/stats.json").read_text())
     every = np.array(rows["action"])
     np.testing.assert_allclose(stats["action"]["mean"], every.mean(axis=0), atol=1e-12)
@@ -110,7 +122,9 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
 
 
 def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
-    av = pytest.importorskip("av", reason="av is not installed: pip install 'stickslip-training[export]'")
+    av = pytest.importorskip(
+        "av", reason="av is not installed: pip install 'stickslip-training[export]'"
+    )
     made, data = content(1)
     lerobot.write(made, tmp_path, lambda _: None)
     for slot, view in enumerate(VIEWS):
@@ -127,7 +141,9 @@ def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
         ({"slots": np.array([0, 3])}, "an episode needs a clip of each of front, high"),
     ],
 )
-def test_what_is_no_episode_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_what_is_no_episode_is_refused(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
     made, _ = content(2)
     vars(made).update(change)
     with pytest.raises(ValueError, match=message):
@@ -162,7 +178,10 @@ def test_lerobot_reads_frames_and_actions(tmp_path: Path) -> None:
     lerobot.write(made, out, lambda _: None)
     order = np.argsort(data["split"][::2], kind="stable")
     instants = made.arrays[1].attributes["instants"]
-    pose, grasped = data["holder_pose"][::2][order][:, instants], data["grasped"][::2][order][:, instants]
+    pose, grasped = (
+        data["holder_pose"][::2][order][:, instants],
+        data["grasped"][::2][order][:, instants],
+    )
     own = np.concatenate([pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1)
     own = own.reshape(16, FRAMES, -1)
     wanted = {

@@ -1,4 +1,6 @@
-"""From views to centrelines, on pictures of our own: silhouettes of tubes, counted on a fine grid of points."""
+"""From views to centrelines, on pictures of our own: silhouettes of tubes, counted on a fine grid
+of points.
+"""
 
 import json
 import re
@@ -25,18 +27,24 @@ def curl(turns, opening, count=150):
     """A hanging curl of length 1, wider towards its free end, at uniform arc length."""
     s = np.linspace(0.0, 1.0, 20 * (count - 1) + 1)
     tilt, turn = opening * np.sin(0.5 * np.pi * s), 2.0 * np.pi * turns * s
-    tangent = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1)
+    tangent = np.stack(
+        [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1
+    )
     steps = 0.5 * (tangent[1:] + tangent[:-1]) * (s[1] - s[0])
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])[::20]
 
 
 def coverage(line, camera, radius=RADIUS):
     """The share of each pixel that lies within the tube's outline, to 1/FINE^2."""
-    dense = np.stack([np.interp(np.linspace(0, 149, 3000), np.arange(150), axis) for axis in line.T], axis=1)
+    dense = np.stack(
+        [np.interp(np.linspace(0, 149, 3000), np.arange(150), axis) for axis in line.T], axis=1
+    )
     pixels, depth = camera.project(dense)
     half = radius * camera.fx / depth.mean()
     low = np.maximum(np.floor(pixels.min(axis=0) - half - 1), 0).astype(int)
-    high = np.minimum(np.ceil(pixels.max(axis=0) + half + 2), [camera.width, camera.height]).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0) + half + 2), [camera.width, camera.height]).astype(
+        int
+    )
     width, height = high - low
     offset = (np.arange(FINE) + 0.5) / FINE - 0.5
     x = (low[0] + np.arange(width)[:, None] + offset).ravel()
@@ -44,7 +52,9 @@ def coverage(line, camera, radius=RADIUS):
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     inside = cKDTree(pixels).query(grid, distance_upper_bound=half)[0] <= half
     share = np.zeros((camera.height, camera.width))
-    share[low[1] : high[1], low[0] : high[0]] = inside.reshape(height, FINE, width, FINE).mean(axis=(1, 3))
+    share[low[1] : high[1], low[0] : high[0]] = inside.reshape(height, FINE, width, FINE).mean(
+        axis=(1, 3)
+    )
     return share
 
 
@@ -54,7 +64,9 @@ def picture(share, *, color=COLOR, noise=0.0, seed=0, vignette=0.0):
     ground = (GROUND + vignette * (1.0 + 0.5 * x - 0.3 * y**2))[..., None]
     light = ground + share[..., None] * (color - ground)
     light = light + noise * np.random.default_rng(seed).standard_normal(light.shape)
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clip(1e-9) ** (1 / 2.4) - 0.055)
+    encoded = np.where(
+        light <= 0.0031308, 12.92 * light, 1.055 * light.clip(1e-9) ** (1 / 2.4) - 0.055
+    )
     return np.rint(255 * encoded.clip(0, 1)).astype(np.uint8)
 
 
@@ -89,7 +101,13 @@ def test_a_curl_that_crosses_itself_in_views_is_found_to_a_thousandth(tight):
 def test_noise_and_an_uneven_ground_cost_little():
     line = curl(1.5, 0.9)
     views = [
-        picture(coverage(line, camera), noise=0.02, seed=seed, vignette=0.02, color=np.array([0.3, 0.6, 0.65]))
+        picture(
+            coverage(line, camera),
+            noise=0.02,
+            seed=seed,
+            vignette=0.02,
+            color=np.array([0.3, 0.6, 0.65]),
+        )
         for seed, camera in enumerate(RIG)
     ]
     found = reconstruct(views, RIG, radius=RADIUS)
@@ -104,7 +122,14 @@ def test_units_clamp_and_large_pictures_of_the_user():
     cameras = []
     for camera in RIG:
         t = length * np.asarray(camera.translation) - np.asarray(camera.rotation) @ clamp
-        own = {"width": 3 * 224, "height": 3 * 224, "fx": 3 * 620, "fy": 3 * 620, "cx": 335.5, "cy": 335.5}
+        own = {
+            "width": 3 * 224,
+            "height": 3 * 224,
+            "fx": 3 * 620,
+            "fy": 3 * 620,
+            "cx": 335.5,
+            "cy": 335.5,
+        }
         cameras.append(Camera(**{**camera.model_dump(), **own, "translation": tuple(t)}))
     world = clamp + length * line
     views = [picture(coverage(world, camera, length * RADIUS)) for camera in cameras]
@@ -123,26 +148,37 @@ def test_views_that_contradict_one_another_are_flagged(tight):
     views = [picture(share) for share in (shares[0], other, shares[2], shares[3])]
     found = reconstruct(views, RIG)
     assert found.verdict == Verdict.failed
-    assert re.search(r"(misfit|unexplained share|unsupported share) 0\.\d+ is above", " ".join(found.reasons))
+    assert re.search(
+        r"(misfit|unexplained share|unsupported share) 0\.\d+ is above", " ".join(found.reasons)
+    )
 
 
 @pytest.mark.slow
 def test_a_wrong_length_is_flagged(tight):
     _, shares = tight
-    assert reconstruct([picture(share) for share in shares], RIG, length=0.8).verdict == Verdict.failed
+    assert (
+        reconstruct([picture(share) for share in shares], RIG, length=0.8).verdict == Verdict.failed
+    )
 
 
 def test_what_is_wrong_is_named():
     dark = [np.zeros((224, 224, 3), np.uint8)] * 4
-    with pytest.raises(ReconstructionError, match="view 'front': image must show a rod brighter than its ground"):
+    with pytest.raises(
+        ReconstructionError, match="view 'front': image must show a rod brighter than its ground"
+    ):
         reconstruct(dark, RIG)
-    with pytest.raises(ReconstructionError, match="view 'front' must be 224 x 224 pixels as its camera; got 100 x 224"):
+    with pytest.raises(
+        ReconstructionError,
+        match="view 'front' must be 224 x 224 pixels as its camera; got 100 x 224",
+    ):
         reconstruct([view[:, :100] for view in dark], RIG)
     with pytest.raises(ValueError, match="one view for each of at least 2 cameras; got 3 for 4"):
         reconstruct(dark[:3], RIG)
     with pytest.raises(ValueError, match=r"length must be positive; got 0"):
         reconstruct(dark, RIG, length=0.0)
-    with pytest.raises(ValueError, match=r"radius must be 0\.0005 to 0\.05 of the length; got 0\.2 of 1\.0"):
+    with pytest.raises(
+        ValueError, match=r"radius must be 0\.0005 to 0\.05 of the length; got 0\.2 of 1\.0"
+    ):
         reconstruct(dark, RIG, radius=0.2)
     with pytest.raises(ValueError, match="clamp must be three finite numbers"):
         reconstruct(dark, RIG, clamp=(0.0, 0.0))
@@ -171,9 +207,15 @@ def bench(tmp_path):
     text = '[bench]\nabout = "of a test"\nunit = "L"\n'
     for camera, ending in zip(RIG, ("png", "jpg", "PNG", "png"), strict=True):
         image = Image.fromarray(picture(coverage(line, camera)))
-        image.save(folder / f"{camera.name}.{ending}", **({"quality": 95} if ending == "jpg" else {}))
-        rotation, translation = json.loads(camera.model_dump_json(include={"rotation", "translation"})).values()
-        text += CAMERA.format(name=camera.name, width=224, rotation=rotation, translation=translation)
+        image.save(
+            folder / f"{camera.name}.{ending}", **({"quality": 95} if ending == "jpg" else {})
+        )
+        rotation, translation = json.loads(
+            camera.model_dump_json(include={"rotation", "translation"})
+        ).values()
+        text += CAMERA.format(
+            name=camera.name, width=224, rotation=rotation, translation=translation
+        )
     calibration = tmp_path / "calibration.toml"
     calibration.write_text(text)
     return folder, calibration, line
@@ -204,7 +246,14 @@ def test_the_command_writes_centreline_overlay_and_report(bench, tmp_path):
 def test_the_command_says_what_is_wrong(bench, tmp_path):
     folder, calibration, _ = bench
     (folder / "side.jpg").unlink()
-    command = ["reconstruct", str(folder), "--calibration", str(calibration), "--out", str(tmp_path / "out")]
+    command = [
+        "reconstruct",
+        str(folder),
+        "--calibration",
+        str(calibration),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     result = runner.invoke(app, command)
     assert result.exit_code == 1
     assert "must hold one picture side.png or side.jpg" in result.output
@@ -215,7 +264,9 @@ def test_a_wrong_calibration_names_field_rule_and_value(bench):
     folder, calibration, _ = bench
     text = calibration.read_text()
     calibration.write_text(text.replace("width = 224", "width = 0", 1))
-    with pytest.raises(ReconstructionError, match=r"bench\.cameras\.0\.width: .*greater than or equal to 1; got 0"):
+    with pytest.raises(
+        ReconstructionError, match=r"bench\.cameras\.0\.width: .*greater than or equal to 1; got 0"
+    ):
         reconstruct_folder(folder, calibration, length=1.0)
     calibration.write_text("width = ")
     with pytest.raises(ReconstructionError, match=r"calibration\.toml: not TOML"):

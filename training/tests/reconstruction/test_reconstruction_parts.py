@@ -25,13 +25,18 @@ DOWN = np.array([0.0, 0.0, -1.0])
 def helix(turns=2.0, opening=0.9, count=150):
     s = np.linspace(0.0, 1.0, 20 * (count - 1) + 1)
     tilt, turn = opening * np.sin(0.5 * np.pi * s), 2.0 * np.pi * turns * s
-    tangent = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1)
+    tangent = np.stack(
+        [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)], axis=1
+    )
     steps = 0.5 * (tangent[1:] + tangent[:-1]) * (s[1] - s[0])
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])[::20]
 
 
 def empty_views():
-    return [View.of(camera, np.zeros((224, 224)), length=1.0, clamp=(0, 0, 0)) for camera in load_rig("rod-4")]
+    return [
+        View.of(camera, np.zeros((224, 224)), length=1.0, clamp=(0, 0, 0))
+        for camera in load_rig("rod-4")
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +91,9 @@ def test_dirt_is_no_rod_and_no_rod_is_an_error():
     random = np.random.default_rng(0)
     with pytest.raises(ReconstructionError, match="must show a rod brighter than its ground"):
         silhouette(to_linear(0.2 + 0.01 * random.standard_normal((64, 64))))
-    with pytest.raises(ValueError, match=r"shape \(y, x\), \(y, x, 1\) or \(y, x, 3\); got \(64,\)"):
+    with pytest.raises(
+        ValueError, match=r"shape \(y, x\), \(y, x, 1\) or \(y, x, 3\); got \(64,\)"
+    ):
         to_linear(np.zeros(64))
 
 
@@ -94,13 +101,17 @@ def test_views_project_as_cameras_do(line):
     for camera, view in zip(load_rig("rod-4"), empty_views(), strict=True):
         np.testing.assert_allclose(view.project(line)[0], camera.project(line)[0], atol=1e-9)
         smaller = view.shrunk(2)
-        np.testing.assert_allclose(smaller.project(line)[0], (camera.project(line)[0] + 0.5) / 2 - 0.5, atol=1e-9)
+        np.testing.assert_allclose(
+            smaller.project(line)[0], (camera.project(line)[0] + 0.5) / 2 - 0.5, atol=1e-9
+        )
         step = 1e-6
         for axis in range(3):
             moved = line + step * np.eye(3)[axis]
             back = line - step * np.eye(3)[axis]
             difference = (view.project(moved)[0] - view.project(back)[0]) / (2 * step)
-            np.testing.assert_allclose(view.gradient(line)[..., axis], difference, rtol=1e-6, atol=1e-5)
+            np.testing.assert_allclose(
+                view.gradient(line)[..., axis], difference, rtol=1e-6, atol=1e-5
+            )
 
 
 def test_a_spline_is_at_uniform_arc_length(line):
@@ -115,7 +126,10 @@ def test_the_drawing_changes_as_its_derivatives_say():
     """Along a straight rod, where the nearest sample of a pixel does not jump as the rod moves."""
     view = empty_views()[1]
     points = np.linspace((0.0, 0.0, 0.0), (0.02, 0.01, -0.9), 400)
-    bright, tilted = 1.0 + 0.2 * np.sin(np.linspace(0, 3, 400)), 0.3 * np.cos(np.linspace(0, 3, 400))
+    bright, tilted = (
+        1.0 + 0.2 * np.sin(np.linspace(0, 3, 400)),
+        0.3 * np.cos(np.linspace(0, 3, 400)),
+    )
 
     def value(shift=0.0, grow=0.0, blur=0.0, light=0.0, slope=0.0):
         image = tube_image(
@@ -142,7 +156,9 @@ def test_the_drawing_changes_as_its_derivatives_say():
     step = 1e-5
     inner = (front.sample > 5) & (front.sample < 390)
     for name, derivative in derivatives.items():
-        difference = (value(**{name: step})[0] - value(**{name: -step})[0])[image.pixel] / (2 * step)
+        difference = (value(**{name: step})[0] - value(**{name: -step})[0])[image.pixel] / (
+            2 * step
+        )
         known = inner & np.isfinite(difference)
         assert known.sum() > 500
         scale = np.abs(difference[known]).max()

@@ -26,12 +26,17 @@ def circle(turns):
 def helix(radius, turns):
     """A helix of length 1: |kappa| = radius w^2 with w = 2 pi turns, the speed being 1."""
     w = 2 * np.pi * turns
-    return np.stack([radius * np.cos(w * S), radius * np.sin(w * S), np.sqrt(1 - (radius * w) ** 2) * S], axis=-1)[None]
+    return np.stack(
+        [radius * np.cos(w * S), radius * np.sin(w * S), np.sqrt(1 - (radius * w) ** 2) * S],
+        axis=-1,
+    )[None]
 
 
-# Of order h^2 for differences, (2 pi)^2 h^2 / 4 here, most at the ends; cubic splines are wrong only at their ends,
-# quintic ones by their most freedom, 0.7 n.
-@pytest.mark.parametrize(("method", "tolerance"), list(zip(METHODS, (2e-3, 2e-4, 2e-4), strict=True)))
+# Of order h^2 for differences, (2 pi)^2 h^2 / 4 here, most at the ends; cubic splines are wrong
+# only at their ends, quintic ones by their most freedom, 0.7 n.
+@pytest.mark.parametrize(
+    ("method", "tolerance"), list(zip(METHODS, (2e-3, 2e-4, 2e-4), strict=True))
+)
 def test_a_circle(method, tolerance):
     curvature = method(circle(1.0))
     assert curvature.shape == (1, 150)
@@ -63,16 +68,24 @@ def test_the_cubic_spline_is_that_of_scipy():
     """Up to the choice of lambda, which scipy searches for and we take from a list."""
     noisy = with_white_noise(helix(0.05, 2.0), 0.003, (5,)).astype(np.float64)
     splines = [make_smoothing_spline(S, noisy[0, :, axis]) for axis in range(3)]
-    first, second = (np.stack([spline(S, order) for spline in splines], axis=-1) for order in (1, 2))
-    expected = np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3
+    first, second = (
+        np.stack([spline(S, order) for spline in splines], axis=-1) for order in (1, 2)
+    )
+    expected = (
+        np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3
+    )
     assert np.abs(cubic_spline_curvature(noisy)[0] - expected).max() < 0.03 * expected.max()
 
 
 def test_every_rod_is_smoothed_by_itself():
-    rods = with_white_noise(np.concatenate([circle(1.0), circle(3.0), helix(0.02, 3.0)]), 0.01, (0,))
+    rods = with_white_noise(
+        np.concatenate([circle(1.0), circle(3.0), helix(0.02, 3.0)]), 0.01, (0,)
+    )
     together = quintic_spline_curvature(rods)
     for place in range(3):
-        assert np.allclose(quintic_spline_curvature(rods[[place]])[0], together[place], rtol=1e-6, atol=1e-6)
+        assert np.allclose(
+            quintic_spline_curvature(rods[[place]])[0], together[place], rtol=1e-6, atol=1e-6
+        )
 
 
 def test_errors():

@@ -21,11 +21,16 @@ pytestmark = pytest.mark.physics
 
 
 class SmallNet(CurvatureNet):
-    """The network with an eighth of its hidden units: its checkpoints of 200 MB would take most of the time."""
+    """The network with an eighth of its hidden units: its checkpoints of 200 MB would take most of
+    the time.
+    """
 
     def __init__(self):
         super().__init__()
-        self.head[1], self.head[3] = nn.Linear(self.head[1].in_features, 64), nn.Linear(64, self.head[3].out_features)
+        self.head[1], self.head[3] = (
+            nn.Linear(self.head[1].in_features, 64),
+            nn.Linear(64, self.head[3].out_features),
+        )
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,14 +43,18 @@ def small():
 @pytest.fixture
 def config(rods, tmp_path):
     """36 rods or so, in three steps an epoch."""
-    return CurvatureTraining(dataset=str(rods.root), out=tmp_path / "out", steps=6, batch_size=15, threads=1)
+    return CurvatureTraining(
+        dataset=str(rods.root), out=tmp_path / "out", steps=6, batch_size=15, threads=1
+    )
 
 
 @pytest.fixture(scope="module")
 def trained(rods, tmp_path_factory):
     """One run that is long enough to learn something."""
     out = tmp_path_factory.mktemp("run")
-    config = CurvatureTraining(dataset=str(rods.root), out=out, steps=60, batch_size=8, noise=0.001, threads=1)
+    config = CurvatureTraining(
+        dataset=str(rods.root), out=out, steps=60, batch_size=8, noise=0.001, threads=1
+    )
     return config, train_curvature(config)
 
 
@@ -76,8 +85,12 @@ def test_the_report_measures_the_model_that_is_saved(trained, rods):
     assert np.array_equal(test.centerline, rods.arrays["centerline"][slots])
     assert 0.0009 < (noisy - test.centerline).std() < 0.0011
     strains = estimate_strains(load_model(config.out / "model.pt"), noisy)
-    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(report["test_loss"], rel=1e-5)
-    estimate, truth = (np.hypot(values[..., 1], values[..., 2]) for values in (strains, test.strains))
+    assert np.sqrt(np.mean((strains - test.strains) ** 2)) == pytest.approx(
+        report["test_loss"], rel=1e-5
+    )
+    estimate, truth = (
+        np.hypot(values[..., 1], values[..., 2]) for values in (strains, test.strains)
+    )
     errors = np.linalg.norm(estimate - truth, axis=1) / np.linalg.norm(truth, axis=1)
     assert report["methods"][0]["relative_median"] == pytest.approx(np.median(errors), rel=1e-5)
     assert report["rods"] == dict(rods.manifest.split_counts)
@@ -87,24 +100,36 @@ def test_the_report_measures_the_model_that_is_saved(trained, rods):
 
 def test_few_test_rods_are_told(trained):
     assert len(trained[1]["notes"]) == 1
-    assert trained[1]["notes"][0].startswith(f"There are only {trained[1]['rods']['test']} test rods")
+    assert trained[1]["notes"][0].startswith(
+        f"There are only {trained[1]['rods']['test']} test rods"
+    )
 
 
 @pytest.mark.physics
-def test_a_run_of_the_same_config_and_seed_gives_the_same_weights_also_where_it_was_resumed(config, tmp_path):
+def test_a_run_of_the_same_config_and_seed_gives_the_same_weights_also_where_it_was_resumed(
+    config, tmp_path
+):
     straight = train_curvature(config)
     stopped = replace(config, out=tmp_path / "stopped", steps=4)
     assert train_curvature(stopped)["steps"] == 4  # within the second epoch
     resumed = train_curvature(replace(config, out=stopped.out), resume=True)
-    assert [(epoch["step"], epoch["train_loss"], epoch["validation_loss"]) for epoch in resumed["history"]] == [
-        (epoch["step"], epoch["train_loss"], epoch["validation_loss"]) for epoch in straight["history"]
+    assert [
+        (epoch["step"], epoch["train_loss"], epoch["validation_loss"])
+        for epoch in resumed["history"]
+    ] == [
+        (epoch["step"], epoch["train_loss"], epoch["validation_loss"])
+        for epoch in straight["history"]
     ]
     for name, tensor in weights(config).items():
         assert torch.equal(tensor, weights(stopped)[name])
     other = replace(config, out=tmp_path / "other", seed=1)
-    assert train_curvature(other)["history"][0]["train_loss"] != straight["history"][0]["train_loss"]
+    assert (
+        train_curvature(other)["history"][0]["train_loss"] != straight["history"][0]["train_loss"]
+    )
     assert not torch.equal(weights(config)["head.3.weight"], weights(other)["head.3.weight"])
-    with pytest.raises(ValueError, match=r"noise must be that of the run that is resumed, 0\.005, and is 0\.1"):
+    with pytest.raises(
+        ValueError, match=r"noise must be that of the run that is resumed, 0\.005, and is 0\.1"
+    ):
         train_curvature(replace(stopped, noise=0.1), resume=True)
     with pytest.raises(ValueError, match="there is nothing to resume"):
         train_curvature(replace(config, out=tmp_path / "nothing"), resume=True)
@@ -131,7 +156,9 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
 
     def run(name, **splits):
         made = make_rods(axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 0.0} | splits)
-        return train_curvature(CurvatureTraining(dataset=str(made.root), out=tmp_path / name, steps=1, threads=1))
+        return train_curvature(
+            CurvatureTraining(dataset=str(made.root), out=tmp_path / name, steps=1, threads=1)
+        )
 
     only_train = run("train", train=1.0)
     assert only_train["rods"] == {"train": 6, "validation": 0, "test": 6}
@@ -144,7 +171,10 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
     ]
     only_test = run("test", test=1.0)
     assert only_test["rods"] == {"train": 6, "validation": 0, "test": 6}
-    assert only_test["notes"][0] == "The train split is empty: the network was trained on the test split."
+    assert (
+        only_test["notes"][0]
+        == "The train split is empty: the network was trained on the test split."
+    )
 
 
 @pytest.mark.physics
@@ -157,7 +187,9 @@ def test_evaluation_of_a_part_is_told_and_the_number_of_threads_put_back(config)
 
 
 def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
-    with pytest.raises(ValueError, match="kind of the dataset must be rod_hang to train on curvature"):
+    with pytest.raises(
+        ValueError, match="kind of the dataset must be rod_hang to train on curvature"
+    ):
         train_curvature(replace(config, dataset=str(clips.root)))
     nothing = make_rods(rejected=tuple(range(60)))
     with pytest.raises(ValueError, match="has no valid sample to train on"):
@@ -173,7 +205,10 @@ def test_what_cannot_be_trained_on_is_refused(config, clips, make_rods):
         ({"decay": 1.0}, "decay must be between 0 and 1"),
         ({"averaging": 1.0}, "averaging must be from 0"),
         ({"seed": -1}, "seed must be from 0"),
-        ({"learning_rate": float("nan")}, "learning_rate must be more than 0 and finite, and is nan"),
+        (
+            {"learning_rate": float("nan")},
+            "learning_rate must be more than 0 and finite, and is nan",
+        ),
     ],
 )
 def test_a_config_is_checked_where_it_is_built(config, changes, message):

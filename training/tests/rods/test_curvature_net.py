@@ -8,11 +8,19 @@ def test_it_is_the_network_of_table_5_1():
     assert net(torch.zeros(2, 150, 3)).shape == (2, 150, 3)
     convolutions = 3 * (3 * 64 + 64 * 64 + 64 * 128 + 3 * 128 * 128) + 2 * 64 + 4 * 128
     heads = (146 * 128 + 1) * 512 + (512 + 1) * 450
-    assert sum(parameter.numel() for parameter in net.parameters()) == convolutions + heads == 9_985_154
+    assert (
+        sum(parameter.numel() for parameter in net.parameters())
+        == convolutions + heads
+        == 9_985_154
+    )
     kinds = [type(layer).__name__ for layer in net.features]
     block = ["Conv1d", "ReLU"] * 2 + ["MaxPool1d"]
     assert kinds == 3 * block
-    assert [(layer.kernel_size, layer.stride) for layer in net.features if isinstance(layer, torch.nn.MaxPool1d)] == [
+    assert [
+        (layer.kernel_size, layer.stride)
+        for layer in net.features
+        if isinstance(layer, torch.nn.MaxPool1d)
+    ] == [
         (3, 1),
         (2, 1),
         (2, 1),

@@ -25,7 +25,8 @@ Plane sum(const std::array<Plane, 3>& planes, double a, double b, double c) {
 // Where the samples are, in units of a cell from the window's upper left corner.
 class Samples {
  public:
-  Samples(Window window, int grid) : grid_(grid), left_(window.left - 0.5), top_(window.top - 0.5), shift_(grid) {
+  Samples(Window window, int grid)
+      : grid_(grid), left_(window.left - 0.5), top_(window.top - 0.5), shift_(grid) {
     for (int cell = 0; cell < grid; ++cell) shift_[cell] = ((5 * cell) % grid + 0.5) / grid;
   }
 
@@ -39,8 +40,8 @@ class Samples {
   std::vector<double> shift_;
 };
 
-// The barycentric coordinates of a triangle in the image, each 1 at its own corner. Those of a triangle that is seen
-// edge-on are NaN, and no sample is in it.
+// The barycentric coordinates of a triangle in the image, each 1 at its own corner. Those of a
+// triangle that is seen edge-on are NaN, and no sample is in it.
 std::array<Plane, 3> barycentric(const std::array<double, 3>& x, const std::array<double, 3>& y) {
   const double area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
   const double scale = area == 0.0 ? std::numeric_limits<double>::quiet_NaN() : 1.0 / area;
@@ -56,7 +57,8 @@ struct Corners {
   std::array<double, 3> x, y, nearness;
 };
 
-Corners corners(const Samples& samples, std::span<const Projected> vertices, const Triangle& triangle) {
+Corners corners(const Samples& samples, std::span<const Projected> vertices,
+                const Triangle& triangle) {
   Corners found;
   const std::array<std::int32_t, 3> index = {triangle.a, triangle.b, triangle.c};
   for (int k = 0; k < 3; ++k) {
@@ -83,10 +85,12 @@ struct LocalPlane {
 };
 
 LocalPlane local(const Plane& plane, int left, int top) {
-  return {static_cast<float>(plane.along), static_cast<float>(plane.down), static_cast<float>(plane(left, top))};
+  return {static_cast<float>(plane.along), static_cast<float>(plane.down),
+          static_cast<float>(plane(left, top))};
 }
 
-// Samples so far: `stride` is the width and some unused cells, so that whole registers can be written.
+// Samples so far: `stride` is the width and some unused cells, so that whole registers can be
+// written.
 struct Buffer {
   std::vector<float> nearest;  // 1 / depth
   std::vector<std::int32_t> seen;
@@ -94,10 +98,12 @@ struct Buffer {
   std::size_t stride;
 };
 
-// Draw one triangle on the cells of `rows` rows and `columns` columns from (left, top) on. What is not in the triangle
-// fails its three tests, so that it does no harm to draw some cells more than asked for.
-RASTER_KERNEL void draw(const LocalPlane& a, const LocalPlane& b, const LocalPlane& c, const LocalPlane& near,
-                        std::int32_t number, int left, int top, int columns, int rows, Buffer& buffer) {
+// Draw one triangle on the cells of `rows` rows and `columns` columns from (left, top) on. What is
+// not in the triangle fails its three tests, so that it does no harm to draw some cells more than
+// asked for.
+RASTER_KERNEL void draw(const LocalPlane& a, const LocalPlane& b, const LocalPlane& c,
+                        const LocalPlane& near, std::int32_t number, int left, int top, int columns,
+                        int rows, Buffer& buffer) {
   for (int first = 0; first < columns; first += wide) {
     const float* const shift = buffer.column_shift.data() + left + first;
     float a_here[wide], b_here[wide], c_here[wide], near_here[wide];
@@ -111,14 +117,15 @@ RASTER_KERNEL void draw(const LocalPlane& a, const LocalPlane& b, const LocalPla
     for (int row = 0; row < rows; ++row) {
       const float x = buffer.row_shift[top + row], y = static_cast<float>(row);
       const float a_row = a.along * x + a.down * y + a.at, b_row = b.along * x + b.down * y + b.at;
-      const float c_row = c.along * x + c.down * y + c.at, near_row = near.along * x + near.down * y + near.at;
+      const float c_row = c.along * x + c.down * y + c.at,
+                  near_row = near.along * x + near.down * y + near.at;
       const std::size_t at = (top + row) * buffer.stride + left + first;
       float* const __restrict nearest = buffer.nearest.data() + at;
       std::int32_t* const __restrict seen = buffer.seen.data() + at;
       for (int k = 0; k < wide; ++k) {
         const float depth = near_here[k] + near_row;
-        const bool hit = (a_here[k] + a_row >= 0.0f) & (b_here[k] + b_row >= 0.0f) & (c_here[k] + c_row >= 0.0f) &
-                         (depth > nearest[k]);
+        const bool hit = (a_here[k] + a_row >= 0.0f) & (b_here[k] + b_row >= 0.0f) &
+                         (c_here[k] + c_row >= 0.0f) & (depth > nearest[k]);
         nearest[k] = hit ? depth : nearest[k];
         seen[k] = hit ? number : seen[k];
       }
@@ -128,14 +135,15 @@ RASTER_KERNEL void draw(const LocalPlane& a, const LocalPlane& b, const LocalPla
 
 }  // namespace
 
-std::vector<std::int32_t> visible(std::span<const Projected> vertices, std::span<const Triangle> triangles,
-                                  Window window, int grid) {
+std::vector<std::int32_t> visible(std::span<const Projected> vertices,
+                                  std::span<const Triangle> triangles, Window window, int grid) {
   const int columns = window.width * grid, rows = window.height * grid;
   const Samples samples(window, grid);
   const std::size_t stride = columns + wide, size = stride * rows;
-  Buffer buffer{std::vector<float>(size, 0.0f), std::vector<std::int32_t>(size, -1), std::vector<float>(stride),
-                std::vector<float>(rows), stride};
-  for (std::size_t i = 0; i < stride; ++i) buffer.column_shift[i] = static_cast<float>(samples.shift(i));
+  Buffer buffer{std::vector<float>(size, 0.0f), std::vector<std::int32_t>(size, -1),
+                std::vector<float>(stride), std::vector<float>(rows), stride};
+  for (std::size_t i = 0; i < stride; ++i)
+    buffer.column_shift[i] = static_cast<float>(samples.shift(i));
   for (int j = 0; j < rows; ++j) buffer.row_shift[j] = static_cast<float>(samples.shift(j));
   for (std::size_t number = 0; number < triangles.size(); ++number) {
     const auto [x, y, nearness] = corners(samples, vertices, triangles[number]);
@@ -144,8 +152,9 @@ std::vector<std::int32_t> visible(std::span<const Projected> vertices, std::span
     if (left == right || top == bottom) continue;
     const auto inside = barycentric(x, y);
     const Plane near = sum(inside, nearness[0], nearness[1], nearness[2]);
-    draw(local(inside[0], left, top), local(inside[1], left, top), local(inside[2], left, top), local(near, left, top),
-         static_cast<std::int32_t>(number), left, top, right - left, bottom - top, buffer);
+    draw(local(inside[0], left, top), local(inside[1], left, top), local(inside[2], left, top),
+         local(near, left, top), static_cast<std::int32_t>(number), left, top, right - left,
+         bottom - top, buffer);
   }
   std::vector<std::int32_t> seen(static_cast<std::size_t>(columns) * rows);
   for (int j = 0; j < rows; ++j)
@@ -158,14 +167,16 @@ namespace {
 constexpr int lanes = 8;  // channels that are looked up together
 
 // sRGB to linear light, above the linear toe a polynomial.
-#define RASTER_DECODED(c)           \
-  ((c) <= 0.04045f                  \
-       ? (c) * (1.0f / 12.92f)      \
-       : 0.00101080102f +           \
-             (c) * (0.0301503654f + \
-                    (c) * (0.538876185f + (c) * (0.611357191f + (c) * (-0.241147234f + (c) * 0.0597738063f)))))
+#define RASTER_DECODED(c)                 \
+  ((c) <= 0.04045f                        \
+       ? (c) * (1.0f / 12.92f)            \
+       : 0.00101080102f +                 \
+             (c) * (0.0301503654f +       \
+                    (c) * (0.538876185f + \
+                           (c) * (0.611357191f + (c) * (-0.241147234f + (c) * 0.0597738063f)))))
 
-// One place on the textures: its texel, of least row and column, and how far it is to the next ones.
+// One place on the textures: its texel, of least row and column, and how far it is to the next
+// ones.
 struct Place {
   std::uint32_t texel;
   float along, down;
@@ -175,12 +186,15 @@ Place place(const Textures& textures, double u, double v) {
   const int size = textures.size;
   const double x = std::min(std::max(u * size - 0.5, 0.0), size - 1.0);
   const double y = std::min(std::max(v * size - 0.5, 0.0), size - 1.0);
-  const int i = std::min(static_cast<int>(x), size - 2), j = std::min(static_cast<int>(y), size - 2);
-  return {static_cast<std::uint32_t>(j) * size + i, static_cast<float>(x - i), static_cast<float>(y - j)};
+  const int i = std::min(static_cast<int>(x), size - 2),
+            j = std::min(static_cast<int>(y), size - 2);
+  return {static_cast<std::uint32_t>(j) * size + i, static_cast<float>(x - i),
+          static_cast<float>(y - j)};
 }
 
 // Write to `sums` the sum of the textures over places, decoded.
-RASTER_KERNEL void sum_lookups(const Textures& textures, const Place* places, int count, float* __restrict sums) {
+RASTER_KERNEL void sum_lookups(const Textures& textures, const Place* places, int count,
+                               float* __restrict sums) {
   const int channels = textures.channels;
   const std::size_t right = channels, below = static_cast<std::size_t>(textures.size) * channels;
   std::fill_n(sums, channels, 0.0f);
@@ -191,7 +205,8 @@ RASTER_KERNEL void sum_lookups(const Textures& textures, const Place* places, in
       const float* const __restrict at = texel + first;
       float* const __restrict sum = sums + first;
       for (int k = 0; k < lanes; ++k) {
-        const float t00 = at[k], t10 = at[k + right], t01 = at[k + below], t11 = at[k + below + right];
+        const float t00 = at[k], t10 = at[k + right], t01 = at[k + below],
+                    t11 = at[k + below + right];
         const float lower = t00 + along * (t10 - t00), upper = t01 + along * (t11 - t01);
         const float color = lower + down * (upper - lower);
         sum[k] += RASTER_DECODED(color);
@@ -205,13 +220,13 @@ RASTER_KERNEL void sum_lookups(const Textures& textures, const Place* places, in
 float decoded(float srgb) { return RASTER_DECODED(srgb); }
 
 Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> vertices,
-              std::span<const Triangle> triangles, std::span<const TextureCoordinate> coordinates, std::int32_t end,
-              const Textures& textures, Window window, int grid) {
+              std::span<const Triangle> triangles, std::span<const TextureCoordinate> coordinates,
+              std::int32_t end, const Textures& textures, Window window, int grid) {
   const Samples samples(window, grid);
   const int columns = window.width * grid, colors = 3 * textures.count;
   const std::size_t pixels = static_cast<std::size_t>(window.width) * window.height;
-  Albedo result{std::vector<float>(pixels), std::vector<float>(pixels * colors), std::vector<std::int32_t>(end),
-                std::vector<float>(colors), 0.0};
+  Albedo result{std::vector<float>(pixels), std::vector<float>(pixels * colors),
+                std::vector<std::int32_t>(end), std::vector<float>(colors), 0.0};
   std::vector<double> weighted(colors, 0.0);
   double weight = 0.0;
   // Texture coordinates over depth, and 1 / depth, are linear in the image.
@@ -223,9 +238,12 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
     const Triangle& triangle = triangles[number];
     const auto [x, y, q] = corners(samples, vertices, triangle);
     const auto inside = barycentric(x, y);
-    result.area += 0.5 * std::abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) / (grid * grid);
-    const TextureCoordinate &a = coordinates[triangle.a], &b = coordinates[triangle.b], &c = coordinates[triangle.c];
-    lookups[number] = {sum(inside, a.u * q[0], b.u * q[1], c.u * q[2]), sum(inside, a.v * q[0], b.v * q[1], c.v * q[2]),
+    result.area += 0.5 * std::abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])) /
+                   (grid * grid);
+    const TextureCoordinate &a = coordinates[triangle.a], &b = coordinates[triangle.b],
+                            &c = coordinates[triangle.c];
+    lookups[number] = {sum(inside, a.u * q[0], b.u * q[1], c.u * q[2]),
+                       sum(inside, a.v * q[0], b.v * q[1], c.v * q[2]),
                        sum(inside, q[0], q[1], q[2])};
   }
   std::vector<float> sums(textures.channels);
@@ -241,7 +259,8 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
           ++covered;
           if (count > 0 && (i + j) % 2 != 0) continue;
           const Lookup& lookup = lookups[number];
-          const double x = i + samples.shift(j), y = j + samples.shift(i), depth = 1.0 / lookup.near(x, y);
+          const double x = i + samples.shift(j), y = j + samples.shift(i),
+                       depth = 1.0 / lookup.near(x, y);
           places[count++] = place(textures, lookup.u(x, y) * depth, lookup.v(x, y) * depth);
         }
       }
@@ -258,7 +277,8 @@ Albedo albedo(std::span<const std::int32_t> seen, std::span<const Projected> ver
     }
   }
   if (weight > 0.0)
-    for (int color = 0; color < colors; ++color) result.overall[color] = static_cast<float>(weighted[color] / weight);
+    for (int color = 0; color < colors; ++color)
+      result.overall[color] = static_cast<float>(weighted[color] / weight);
   return result;
 }
 

@@ -34,7 +34,9 @@ from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore
 
-DOCUMENTS = tuple(f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/names"))
+DOCUMENTS = tuple(
+    f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/names")
+)
 """Modules of documents, which are in the content key as a whole."""
 LONG_WAY_DOWN = np.linspace((0.0, 0.0, 0.0), (0.0, 0.0, -1.1), 150)  # a tenth too long for the rig
 
@@ -65,7 +67,12 @@ def _task(record: str, *, row: int = 0, preview: bool = False, **look: Any) -> d
         "quality": "draft",
         "color_seed": 5,
     }
-    return {"stage": "render", "render": render | look, "record": {"digest": record, "row": row}, "preview": preview}
+    return {
+        "stage": "render",
+        "render": render | look,
+        "record": {"digest": record, "row": row},
+        "preview": preview,
+    }
 
 
 def _files(store: DirectoryStore) -> set[str]:
@@ -73,7 +80,11 @@ def _files(store: DirectoryStore) -> set[str]:
 
 
 def test_a_rod_becomes_a_chunk_and_a_preview(
-    actor: RenderActor, store: DirectoryStore, record: str, curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]
+    actor: RenderActor,
+    store: DirectoryStore,
+    record: str,
+    curl: npt.NDArray[np.float64],
+    rig: tuple[Camera, ...],
 ) -> None:
     result = TaskResult.model_validate(actor.render(_task(record, preview=True)))
     assert result.outcome == "succeeded"
@@ -86,14 +97,18 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
     data = decode_chunk(store.read(chunk.digest, offset=chunk.offset, length=chunk.length))
     views = np.frombuffer(data, dtype=np.uint8).reshape(1, 4, 224, 224, 3)[0]
     renderer = RodRenderer(quality=Quality.draft)
-    assert np.array_equal(views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5))
+    assert np.array_equal(
+        views, renderer.render(curl.astype(np.float32), rig, color=silicone_color(5), seed=5)
+    )
 
     assert result.output.preview is not None
     with Image.open(io.BytesIO(store.read(result.output.preview))) as preview:
         assert np.array_equal(np.asarray(preview), np.concatenate(list(views), axis=1))
 
 
-def test_two_actors_give_the_same_digests(actor: RenderActor, store: DirectoryStore, record: str) -> None:
+def test_two_actors_give_the_same_digests(
+    actor: RenderActor, store: DirectoryStore, record: str
+) -> None:
     first = actor.render(_task(record))
     before = _files(store)
     other = RenderActor(str(store.root))
@@ -104,7 +119,9 @@ def test_two_actors_give_the_same_digests(actor: RenderActor, store: DirectorySt
 
 def test_radius_and_seed_matter(actor: RenderActor, record: str) -> None:
     looks: list[dict[str, Any]] = [{}, {"radius": 0.01}, {"color_seed": 6}, {"quality": "standard"}]
-    chunks = [actor.render(_task(record, **look))["output"]["chunks"]["views"]["digest"] for look in looks]
+    chunks = [
+        actor.render(_task(record, **look))["output"]["chunks"]["views"]["digest"] for look in looks
+    ]
     assert len(set(chunks)) == 4
 
 
@@ -125,7 +142,9 @@ def test_a_centreline_of_nan_is_rejected(actor: RenderActor, record: str) -> Non
     assert result.reason is Reason.invalid_sample
 
 
-def test_what_is_not_the_samples_fault_is_raised(actor: RenderActor, store: DirectoryStore, record: str) -> None:
+def test_what_is_not_the_samples_fault_is_raised(
+    actor: RenderActor, store: DirectoryStore, record: str
+) -> None:
     with pytest.raises(FileNotFoundError):
         actor.render(_task("0" * 64))
     with pytest.raises(ValueError, match=r"record\.row must be below 3"):
@@ -176,7 +195,8 @@ def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> 
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
 
 
-# --- cloth ----------------------------------------------------------------------------------------------------
+# --- cloth
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -187,7 +207,9 @@ def trajectory(store: DirectoryStore, make_sheet: Callable[..., Any]) -> Callabl
         sheet = make_sheet(5, reach=reach)
         track = np.repeat(sheet.track + np.float32([shift, 0.0, 0.0]), 75, axis=0)
         file = io.BytesIO()
-        np.savez(file, positions=track[None], rest=sheet.rest[None], triangles=sheet.triangles[None])
+        np.savez(
+            file, positions=track[None], rest=sheet.rest[None], triangles=sheet.triangles[None]
+        )
         return store.publish(file.getvalue())
 
     return publish
@@ -207,7 +229,12 @@ def _clip(record: str, *, preview: bool = False, frames: int = 3, **look: Any) -
         "light_seed": 9,
         "crease_seed": 4,
     }
-    task = {"stage": "render", "render": render | look, "record": {"digest": record, "row": 0}, "preview": preview}
+    task = {
+        "stage": "render",
+        "render": render | look,
+        "record": {"digest": record, "row": 0},
+        "preview": preview,
+    }
     return task | more
 
 
@@ -226,7 +253,9 @@ def _output(result: dict[str, Any]) -> RenderOutput:
 def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
     actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str]
 ) -> None:
-    output = _output(actor.render(_clip(trajectory(), preview=True, creases=0.5, substrate="ceramic")))
+    output = _output(
+        actor.render(_clip(trajectory(), preview=True, creases=0.5, substrate="ceramic"))
+    )
     video = _video(store, output.chunks["video"], 3)
     assert len({frame.tobytes() for frame in video}) == 3
     light, floor = drawn_light("drawn", 9), drawn_substrate("ceramic", 9)
@@ -253,7 +282,9 @@ def test_a_trajectory_becomes_a_clip_a_preview_and_labels(
 def test_every_function_that_renders_is_in_the_build(
     actor: RenderActor, record: str, trajectory: Callable[..., str]
 ) -> None:
-    """But for what decides on nothing: the list of kinds finds a module by its name, and a store by its digest."""
+    """But for what decides on nothing: the list of kinds finds a module by its name, and a store by
+    its digest.
+    """
     cloth = trajectory()
     tasks = {
         "rod_hang": (_task(record), _task(record)),
@@ -262,27 +293,45 @@ def test_every_function_that_renders_is_in_the_build(
     for kind, (first, task) in tasks.items():
         actor.render(first)  # to import, and to close the renderer of the other kind, is no work
         ran: set[str] = set()
-        sys.setprofile(lambda frame, event, _, ran=ran: ran.add(frame.f_code.co_filename) if event == "call" else None)
+        sys.setprofile(
+            lambda frame, event, _, ran=ran: (
+                ran.add(frame.f_code.co_filename) if event == "call" else None
+            )
+        )
         actor.render(task)
         sys.setprofile(None)
-        ours = {Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")}
+        ours = {
+            Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")
+        }
         built = {path.resolve() for path in sources(roots(kind), cut=UNCOUNTED).values()}
         documents = {path for path in ours if path.as_posix().endswith(DOCUMENTS)}
-        uncounted = {path for path in ours if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")}
+        uncounted = {
+            path
+            for path in ours
+            if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")
+        }
         uncounted |= {path for path in ours if path.parts[-3:-1] == ("stickslip_schemas", "store")}
         assert len(ours) > 8
         assert ours - uncounted - documents <= built, ours - built
 
 
 def test_a_clip_has_the_same_bytes_however_its_shading_was_made(
-    actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+    actor: RenderActor,
+    store: DirectoryStore,
+    trajectory: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Alone; with others; from a shading in the store; by an actor that has rendered something else."""
+    """Alone.
+
+    With others; from a shading in the store; by an actor that has rendered something else.
+    """
     cloth = trajectory()
     alone = _output(actor.render(_clip(cloth, frames=1)))
     other = RenderActor(str(store.root))
     other.render(_clip(cloth, frames=1, viewpoint="right", substrate="polyester-mirror"))
-    several = _output(other.render(_clip(cloth, frames=1, textures=["floral", "plaid"], preview=True)))
+    several = _output(
+        other.render(_clip(cloth, frames=1, textures=["floral", "plaid"], preview=True))
+    )
     assert several.clips[Texture.plaid].output.chunks == alone.chunks
     assert several.clips[Texture.floral].output.preview is not None
     third = RenderActor(str(store.root))
@@ -303,7 +352,10 @@ def test_nothing_is_shaded_again_for_another_texture(
 
     monkeypatch.setattr(ClothScene, "shading", count)
     cloth = trajectory()
-    clips = [_output(actor.render(_clip(cloth, frames=2, texture=texture))).chunks for texture in ("dots", "checker")]
+    clips = [
+        _output(actor.render(_clip(cloth, frames=2, texture=texture))).chunks
+        for texture in ("dots", "checker")
+    ]
     assert len(traced) == 2
     assert clips[0] != clips[1]
     actor.render(_clip(cloth, frames=2, light_seed=10))
@@ -340,14 +392,25 @@ def test_rods_and_cloths_take_turns(
     built: list[str] = []
     for renderer in (RodRenderer, ClothScene):
 
-        def count(self: Any, *arguments: Any, _init: Any = renderer.__init__, **options: Any) -> None:
+        def count(
+            self: Any, *arguments: Any, _init: Any = renderer.__init__, **options: Any
+        ) -> None:
             built.append(type(self).__name__)
             _init(self, *arguments, **options)
 
         monkeypatch.setattr(renderer, "__init__", count)
     cloth = trajectory()
     first = actor.render(_clip(cloth, frames=1))
-    actor.render(_clip(cloth, frames=1, viewpoint="right", material="11oz-black-denim", substrate="any", creases=1.0))
+    actor.render(
+        _clip(
+            cloth,
+            frames=1,
+            viewpoint="right",
+            material="11oz-black-denim",
+            substrate="any",
+            creases=1.0,
+        )
+    )
     assert built == ["ClothScene"]  # built once for all looks of a mesh
     rod = actor.render(_task(record))
     again = actor.render(_clip(cloth, frames=1))
@@ -361,7 +424,9 @@ def test_rods_and_cloths_take_turns(
 def test_a_cloth_that_leaves_the_frame_at_any_time_is_rejected(
     actor: RenderActor, store: DirectoryStore, trajectory: Callable[..., str]
 ) -> None:
-    away = trajectory(reach=0.9)  # its first frame, the only one that the clip shows, is in the frame
+    away = trajectory(
+        reach=0.9
+    )  # its first frame, the only one that the clip shows, is in the frame
     before = _files(store)
     result = TaskResult.model_validate(actor.render(_clip(away, frames=1)))
     assert (result.outcome, result.reason) == ("rejected", Reason.out_of_frame)
@@ -369,6 +434,8 @@ def test_a_cloth_that_leaves_the_frame_at_any_time_is_rejected(
     assert _files(store) == before
 
 
-def test_a_trajectory_of_nan_is_rejected(actor: RenderActor, trajectory: Callable[..., str]) -> None:
+def test_a_trajectory_of_nan_is_rejected(
+    actor: RenderActor, trajectory: Callable[..., str]
+) -> None:
     result = TaskResult.model_validate(actor.render(_clip(trajectory(shift=np.nan))))
     assert (result.outcome, result.reason) == ("rejected", Reason.invalid_sample)

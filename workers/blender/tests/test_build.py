@@ -17,7 +17,10 @@ def test_the_rasteriser_is_in_every_build(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_data_files_are_in_the_build() -> None:
     files = sources(roots("cloth_drag"), cut=UNCOUNTED)
-    assert {"stickslip_blender/cloth/fabrics.toml", "stickslip_blender/cloth/substrates.toml"} <= set(files)
+    assert {
+        "stickslip_blender/cloth/fabrics.toml",
+        "stickslip_blender/cloth/substrates.toml",
+    } <= set(files)
 
 
 def test_every_kind_has_a_build_of_its_own_files() -> None:

@@ -27,37 +27,65 @@ STEADY_SECONDS = 60.0
 
 def main(arguments: list[str] | None = None) -> int:
     blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
-    blender, stored = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
-    blender.add_argument("--blender-python", type=Path, default=blender_python, help="default: %(default)s")
-    stored.add_argument("--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX")
+    blender, stored = (
+        argparse.ArgumentParser(add_help=False),
+        argparse.ArgumentParser(add_help=False),
+    )
+    blender.add_argument(
+        "--blender-python", type=Path, default=blender_python, help="default: %(default)s"
+    )
+    stored.add_argument(
+        "--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX"
+    )
     parser = argparse.ArgumentParser(prog="python -m stickslip_workers", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     both = [stored, blender]
 
-    dispatch = commands.add_parser("dispatch", help="lease tasks from a coordinator and run them on Ray", parents=both)
+    dispatch = commands.add_parser(
+        "dispatch", help="lease tasks from a coordinator and run them on Ray", parents=both
+    )
     urls = "base URL of the coordinator; repeatable, the next where one is away"
     dispatch.add_argument("--url", required=True, action="append", help=urls)
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
-    dispatch.add_argument("--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)")
-    dispatch.add_argument("--tls-certificate", type=Path, help="trust a coordinator with this very certificate")
-    dispatch.add_argument("--max-cpus", type=int, help="the most CPUs of the cluster to use (default: all)")
-    dispatch.add_argument("--render-gpus", type=float, default=1.0, help="GPUs for a render (default: %(default)s)")
+    dispatch.add_argument(
+        "--key-file", type=Path, help="file with the key of the worker API (DATA/worker-key)"
+    )
+    dispatch.add_argument(
+        "--tls-certificate", type=Path, help="trust a coordinator with this very certificate"
+    )
+    dispatch.add_argument(
+        "--max-cpus", type=int, help="the most CPUs of the cluster to use (default: all)"
+    )
+    dispatch.add_argument(
+        "--render-gpus", type=float, default=1.0, help="GPUs for a render (default: %(default)s)"
+    )
     where = dispatch.add_mutually_exclusive_group()
-    where.add_argument("--ray-address", help="the Ray cluster (default: RAY_ADDRESS, else one for this machine alone)")
-    where.add_argument("--ray-data", type=Path, help="use the head that `head` runs for this data directory")
+    where.add_argument(
+        "--ray-address",
+        help="the Ray cluster (default: RAY_ADDRESS, else one for this machine alone)",
+    )
+    where.add_argument(
+        "--ray-data", type=Path, help="use the head that `head` runs for this data directory"
+    )
     dispatch.add_argument("--once", action="store_true", help="end when the cluster is gone")
     dispatch.set_defaults(run=_dispatch)
 
-    head = commands.add_parser("head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`")
+    head = commands.add_parser(
+        "head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`"
+    )
     head.add_argument("--ray-data", type=Path, required=True, help="data directory that it is for")
     head.add_argument("--cpus", type=int, help="CPUs to use (default: all)")
     head.set_defaults(run=_head)
 
-    replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator", parents=both)
+    replay = commands.add_parser(
+        "replay", help="run one task here, without Ray and coordinator", parents=both
+    )
     replay.add_argument("task", type=Path, help="the task as JSON")
     replay.set_defaults(run=_replay)
 
-    certify = commands.add_parser("certify", help="run the physical protocols of a preset with this build")
+    certify = commands.add_parser(
+        "certify", help="run the physical protocols of a preset with this build"
+    )
     certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
     certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json")
     few = "measure a few points only; such a certificate does not count"
@@ -71,11 +99,18 @@ def main(arguments: list[str] | None = None) -> int:
     drawn.add_argument("--out", type=Path, required=True, help="directory for the pictures")
     drawn.set_defaults(run=_preview)
 
-    commands.add_parser("describe", help="print the builds of this environment").set_defaults(run=_describe)
+    commands.add_parser("describe", help="print the builds of this environment").set_defaults(
+        run=_describe
+    )
 
     options = parser.parse_args(arguments)
     if options.command == "dispatch" and not options.once:
-        command = [sys.executable, "-m", "stickslip_workers", *(sys.argv[1:] if arguments is None else arguments)]
+        command = [
+            sys.executable,
+            "-m",
+            "stickslip_workers",
+            *(sys.argv[1:] if arguments is None else arguments),
+        ]
         return run_for_ever([*command, "--once"], Backoff(first=1.0, most=30.0))
     return int(options.run(options))
 
@@ -104,19 +139,28 @@ def _store(place: str) -> str:
 
 
 def _dispatch(options: argparse.Namespace) -> int:
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
+    )
     logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
     if not options.blender_python.exists():
-        logging.error("blender-python must be an interpreter; %s does not exist", options.blender_python)
+        logging.error(
+            "blender-python must be an interpreter; %s does not exist", options.blender_python
+        )
         return 2
     if options.key_file is not None and not options.key_file.is_file():
-        logging.error("key-file must be a file with the coordinator's worker key; %s does not exist", options.key_file)
+        logging.error(
+            "key-file must be a file with the coordinator's worker key; %s does not exist",
+            options.key_file,
+        )
         return 2
     settings = Settings(
         urls=tuple(options.url),
         store=options.store,
         name=options.name,
-        key=None if options.key_file is None else options.key_file.read_text(encoding="ascii").strip(),
+        key=None
+        if options.key_file is None
+        else options.key_file.read_text(encoding="ascii").strip(),
         tls_certificate=options.tls_certificate,
         max_cpus=options.max_cpus,
         render_gpus=options.render_gpus,
@@ -180,7 +224,9 @@ def run_for_ever(command: list[str], backoff: Backoff) -> int:
             backoff.succeeded()
         backoff.failed()
         wait = max(backoff.next_try - time.monotonic(), 0.0)
-        sys.stderr.write(f"the dispatcher ended with status {status}; it starts again in {wait:.1f} s\n")
+        sys.stderr.write(
+            f"the dispatcher ended with status {status}; it starts again in {wait:.1f} s\n"
+        )
         deadline = time.monotonic() + wait
         while not stopped and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -202,7 +248,9 @@ def _replay(options: argparse.Namespace) -> int:
         sys.stderr.write(f"error: {options.task} cannot be read: {error.strerror}\n")
         return 2
     except ValidationError as error:
-        sys.stderr.write(f"error: {options.task} is not a task as GET /v1/tasks/ID returns it: {error}\n")
+        sys.stderr.write(
+            f"error: {options.task} is not a task as GET /v1/tasks/ID returns it: {error}\n"
+        )
         return 2
     over = threading.Event()
     threading.Thread(target=_show_frames, args=(over,), daemon=True).start()
@@ -250,7 +298,9 @@ def _preview(options: argparse.Namespace) -> int:
 
     try:
         scene = Scene.model_validate_json(options.scene.read_bytes())
-        names = preview(scene, open_store(options.store), options.out, options.blender_python.absolute())
+        names = preview(
+            scene, open_store(options.store), options.out, options.blender_python.absolute()
+        )
     except (ValueError, OSError, RuntimeError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

@@ -1,7 +1,7 @@
 """Builds: digests of the code of each kind and stage, for content keys.
 
-A build covers the files that a stage imports (see `stickslip_schemas.plan.builds`), the compiled core where it is
-used, and the versions of the libraries that the output depends on.
+A build covers the files that a stage imports (see `stickslip_schemas.plan.builds`), the compiled
+core where it is used, and the versions of the libraries that the output depends on.
 """
 
 from importlib import import_module, metadata
@@ -35,29 +35,43 @@ def roots(stage: str, name: str) -> tuple[str, ...]:
     if stage == "simulate":
         return (f"{_STAGES}.run", scene_module(name))
     if stage == "pack":
-        return (f"{_STAGES}.run", f"{_STAGES}.pack", f"{_STAGES}.publish", f"stickslip_schemas.kinds.{name}")
+        return (
+            f"{_STAGES}.run",
+            f"{_STAGES}.pack",
+            f"{_STAGES}.publish",
+            f"stickslip_schemas.kinds.{name}",
+        )
     raise ValueError(f"stage must be simulate or pack; got {stage!r}")
 
 
 def build(stage: str, name: str) -> str:
     """Return the digest of all code that the output of a stage for a kind depends on."""
-    libraries = {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
+    libraries = (
+        {library: metadata.version(library) for library in _LIBRARIES} if stage == "pack" else {}
+    )
     core = "" if stage == "pack" else _core(kind(name).kernel())
     files = digests(sources(roots(stage, name), cut=UNCOUNTED))
-    return content_key(f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries})
+    return content_key(
+        f"build/{stage}", {"kind": name, "sources": files, "core": core, "libraries": libraries}
+    )
 
 
 def solver_build(module: str) -> str:
-    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled core.
+    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled
+    core.
 
     The level of its kernels is not part of it: levels differ by less than a certificate can see.
     """
-    return content_key("build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=UNCOUNTED))})
+    return content_key(
+        "build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=UNCOUNTED))}
+    )
 
 
 def kind_builds(name: str) -> dict[str, str]:
     """Return the builds of the stages that run in this interpreter."""
-    return {"sim_core": solver_build(kind(name).solver)} | {stage: build(stage, name) for stage in ("simulate", "pack")}
+    return {"sim_core": solver_build(kind(name).solver)} | {
+        stage: build(stage, name) for stage in ("simulate", "pack")
+    }
 
 
 def _core(kernel: str = "") -> str:

@@ -1,5 +1,7 @@
-"""What a Ray task does. Ray gets this module by value, so that it also runs in Blender's environment, which does not
-have stickslip_workers: it may import nothing of ours.
+"""What a Ray task does.
+
+Ray gets this module by value, so that it also runs in Blender's environment, which does not have
+stickslip_workers: it may import nothing of ours.
 """
 
 import importlib
@@ -15,12 +17,18 @@ _held: dict[tuple[str, str], tuple[Any, Any]] = {}
 
 
 def run(
-    factory: str, store: str, builds: dict[str, Any], method: str, arguments: list[Any], tells_frames: bool
+    factory: str,
+    store: str,
+    builds: dict[str, Any],
+    method: str,
+    arguments: list[Any],
+    tells_frames: bool,
 ) -> Iterator[Any]:
-    """Yield where the call runs, perhaps (frames done, frames in total), and at last the list of answers.
+    """Yield where the call runs, perhaps (frames done, frames in total), and at last the list of
+    answers.
 
-    What `factory` (`module:Class`) makes stays in the process for the calls that follow. Where its builds are not
-    `builds`, the call ends after the first message.
+    What `factory` (`module:Class`) makes stays in the process for the calls that follow. Where its
+    builds are not `builds`, the call ends after the first message.
     """
     import ray
 

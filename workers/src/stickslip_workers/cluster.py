@@ -1,4 +1,6 @@
-"""The Ray cluster, of which the dispatcher is a driver, and a head for one machine, as `stickslip up` has it."""
+"""The Ray cluster, of which the dispatcher is a driver, and a head for one machine, as `stickslip
+up` has it.
+"""
 
 import contextlib
 import logging
@@ -20,8 +22,8 @@ from stickslip_schemas.base import sha256
 log = logging.getLogger(__name__)
 
 RECONNECT_SECONDS, OWN_RECONNECT_SECONDS = "15", "2"
-"""How long Ray looks for a head that is gone; then it ends the driver, and another one is started [s]. The next head of
-this machine has another port."""
+"""How long Ray looks for a head that is gone; then it ends the driver, and another one is started
+[s]. The next head of this machine has another port."""
 
 RETRY_SECONDS = 1.0
 """Time between two attempts to connect [s]."""
@@ -35,7 +37,10 @@ class Place:
 
     def connect(self) -> None:
         """Wait until Ray answers, and become a driver of it."""
-        os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_AUTO_CONNECT": "0"}  # a late call starts no cluster
+        os.environ |= {
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_ENABLE_AUTO_CONNECT": "0",
+        }  # a late call starts no cluster
         if isinstance(self.where, Path):
             # With 0, Ray does not take another address of this machine for loopback.
             os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
@@ -50,14 +55,20 @@ class Place:
 
         while True:
             try:
-                address = self.where if isinstance(self.where, str) else (self.where / "address").read_text()
+                address = (
+                    self.where
+                    if isinstance(self.where, str)
+                    else (self.where / "address").read_text()
+                )
                 host, _, port = address.rpartition(":")
                 if host:  # Ray itself would wait for long where nobody listens
                     socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
                 handler = signal.getsignal(signal.SIGTERM)
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
                 if threading.current_thread() is threading.main_thread():
-                    signal.signal(signal.SIGTERM, handler)  # Ray has put its own in place, which exits at once
+                    signal.signal(
+                        signal.SIGTERM, handler
+                    )  # Ray has put its own in place, which exits at once
                 return
             except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
                 log.info("no Ray at %s yet: %s", self.where, error)
@@ -79,15 +90,19 @@ class Place:
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # everything listens on loopback, as on those systems
-    "RAY_enable_pipe_based_agent_to_parent_health_check": "1",  # agents end with their raylet, at once
+    # agents end with their raylet, at once
+    "RAY_enable_pipe_based_agent_to_parent_health_check": "1",
     "RAY_worker_register_timeout_seconds": "600",  # Python may import slowly
     "RAY_enable_metrics_collection": "0",
     "RAY_event_stats": "0",
     "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
     "RAY_prestart_worker_first_driver": "0",
-    "RAY_num_workers_soft_limit": "0",  # Ray also starts so many for calls that wait, and they come too late
-    "RAY_idle_worker_killing_time_threshold_ms": "86400000",  # Blender takes seconds to start: idle processes stay
-    "RAY_raylet_report_resources_period_milliseconds": "1000",  # small tasks cost less where Ray looks seldom
+    # Ray also starts so many for calls that wait, and they come too late
+    "RAY_num_workers_soft_limit": "0",
+    # Blender takes seconds to start: idle processes stay
+    "RAY_idle_worker_killing_time_threshold_ms": "86400000",
+    # small tasks cost less where Ray looks seldom
+    "RAY_raylet_report_resources_period_milliseconds": "1000",
     "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
     "RAY_memory_monitor_refresh_ms": "1000",
 }
@@ -95,28 +110,38 @@ SETTINGS = {
 
 
 def own_directory(data: Path) -> Path:
-    """Return the directory of the head of a data directory. Sockets below it must have paths of at most 107 bytes."""
+    """Return the directory of the head of a data directory.
+
+    Sockets below it must have paths of at most 107 bytes.
+    """
     root = Path("/tmp") / f"stickslip-ray-{os.getuid()}"
     root.mkdir(mode=0o700, exist_ok=True)
     there = root.lstat()
     if there.st_uid != os.getuid() or not stat.S_ISDIR(there.st_mode) or there.st_mode & 0o077:
-        raise PermissionError(f"{root} must be a directory of this user, which others cannot enter, and no link")
+        raise PermissionError(
+            f"{root} must be a directory of this user, which others cannot enter, and no link"
+        )
     return root / sha256(str(data).encode())[:8]
 
 
 def run_head(directory: Path, cpus: int | None) -> None:
-    """Run `ray start --head --block` on loopback, with a token; write `token` and `address` to a directory before.
+    """Run `ray start --head --block` on loopback, with a token.
 
-    The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then (ray-project/ray#65983). It
-    does not wait for ports that it already knows. One of them is no option of `ray start`, so a private function of Ray
-    adds it. It also ends the head with its raylet: a raylet that has lost an agent exits with 0, which `--block` takes
-    for an ordinary end.
+    Write `token` and `address` to a directory before.
+
+    The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then
+    (ray-project/ray#65983). It does not wait for ports that it already knows. One of them is no
+    option of `ray start`, so a private function of Ray adds it. It also ends the head with its
+    raylet: a raylet that has lost an agent exits with 0, which `--block` takes for an ordinary end.
     """
     shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
     directory.mkdir(exist_ok=True)
     (directory / "token").touch(mode=0o600)
     (directory / "token").write_text(secrets.token_hex(32))
-    os.environ |= SETTINGS | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(directory / "token")}
+    os.environ |= SETTINGS | {
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN_PATH": str(directory / "token"),
+    }
     from ray._private import services
     from ray.scripts.scripts import main as ray
 
@@ -131,21 +156,36 @@ def run_head(directory: Path, cpus: int | None) -> None:
             command = [*command, f"--dashboard_agent_listen_port={ports[0]}"]
         started = start(command, *arguments, **options)
         if is_raylet:  # this process ends with it, and the kernel ends its other children then
-            threading.Thread(target=lambda: os._exit(started.process.wait() or 1), daemon=True).start()
+            threading.Thread(
+                target=lambda: os._exit(started.process.wait() or 1), daemon=True
+            ).start()
         return started
 
     services.start_ray_process = start_ray_process
-    told = ("dashboard-agent-listen-port", "dashboard-agent-grpc-port", "runtime-env-agent-port", "metrics-export-port")
+    told = (
+        "dashboard-agent-listen-port",
+        "dashboard-agent-grpc-port",
+        "runtime-env-agent-port",
+        "metrics-export-port",
+    )
     options = {
         "port": port,
         "num-cpus": cpus or len(os.sched_getaffinity(0)),
         "node-ip-address": "127.0.0.1",
         "temp-dir": directory,
-        "object-store-memory": 128 * 2**20,  # tasks and results are small: bulk data goes through the store
+        "object-store-memory": 128
+        * 2**20,  # tasks and results are small: bulk data goes through the store
         "include-dashboard": "false",
         "include-log-monitor": "false",
         **dict(zip(told, ports, strict=True)),
     }
     (directory / "address").write_text(f"127.0.0.1:{port}")
-    sys.argv = ["ray", "start", "--head", "--block", "--no-monitor", *(f"--{o}={v}" for o, v in options.items())]
+    sys.argv = [
+        "ray",
+        "start",
+        "--head",
+        "--block",
+        "--no-monitor",
+        *(f"--{o}={v}" for o, v in options.items()),
+    ]
     ray()

@@ -34,7 +34,8 @@ from stickslip_workers.builds import solver_build
 from stickslip_workers.settings import RENDER_ACTOR
 from stickslip_workers.stages.run import failed, run_tasks
 
-# Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what it likes.
+# Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what
+# it likes.
 _RENDER = """
 import importlib, json, sys
 factory, store, task, answer = sys.argv[1:]
@@ -47,7 +48,9 @@ with open(answer, "w") as file:
 """
 
 
-def replay(task: AnyTask, *, store: str, blender_python: Path, render_actor: str = RENDER_ACTOR) -> TaskResult:
+def replay(
+    task: AnyTask, *, store: str, blender_python: Path, render_actor: str = RENDER_ACTOR
+) -> TaskResult:
     """Run a task and return its result; a render runs in Blender's interpreter."""
     if not isinstance(task, RenderTask):
         return run_tasks([task], open_store(store))[0]
@@ -66,22 +69,31 @@ FRAMES = 24
 
 
 def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list[str]:
-    """Draw the start and the motions of a scene; return the names of the pictures: of each camera, and an animation.
+    """Draw the start and the motions of a scene.
+
+    Return the names of the pictures: of each camera, and an animation.
 
     Cloth is not simulated: it stays as it starts. A sheet that starts hung is drawn flat.
 
-    `store` has the files that it names; `out`, a directory, is made where it does not exist. Raises ValueError, whose
-    message begins with the place of the wrong value, OSError, or RuntimeError where the drawing failed.
+    `store` has the files that it names; `out`, a directory, is made where it does not exist. Raises
+    ValueError, whose message begins with the place of the wrong value, OSError, or RuntimeError
+    where the drawing failed.
     """
     given = scene.looks.cameras
     views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
     cameras = load_rig(given) if isinstance(given, str) else views
     with TemporaryDirectory(prefix="stickslip-preview-") as folder:
-        pictures = {place: Path(folder, referred(name) or "") for place, name in scene.files() if place[0] == "looks"}
+        pictures = {
+            place: Path(folder, referred(name) or "")
+            for place, name in scene.files()
+            if place[0] == "looks"
+        }
         for path in pictures.values():
             path.write_bytes(store.read(path.name))
         request = {
-            "scene": with_values(scene.staged(), {place: str(path) for place, path in pictures.items()}),
+            "scene": with_values(
+                scene.staged(), {place: str(path) for place, path in pictures.items()}
+            ),
             "sheet": scene.textured,
             "segments": scene_segments(scene.sheets, scene.bodies),
             "cameras": [camera.model_dump(mode="json") for camera in cameras],
@@ -90,7 +102,14 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
         np.savez(record, allow_pickle=False, **_record(scene, with_arrays(scene, store.read)))
         document.write_text(json.dumps(request), encoding="utf-8")
         out.mkdir(parents=True, exist_ok=True)
-        command = [str(blender_python), "-m", "stickslip_blender.preview", str(record), str(document), str(out)]
+        command = [
+            str(blender_python),
+            "-m",
+            "stickslip_blender.preview",
+            str(record),
+            str(document),
+            str(out),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"the drawing failed: {done.stderr[-2000:]}")
@@ -105,7 +124,9 @@ def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any
     made = cloth_scene.scene(document)
     times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
     start = SimpleNamespace(positions=np.repeat(made.start[None], FRAMES, axis=0))
-    tracks = {name: np.stack([np.asarray(at(time)) for time in times]) for name, at in made.tracks.items()}
+    tracks = {
+        name: np.stack([np.asarray(at(time)) for time in times]) for name, at in made.tracks.items()
+    }
     return {**made.arrays(cast(ClothRun, start)), **made.record, **tracks}
 
 
@@ -117,10 +138,13 @@ Say = Callable[[str], None]
 def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     """Certify a preset: write `certificate.json` into `out`.
 
-    A protocol that raises has not passed; the others run all the same. Raises ValueError for an unknown preset.
+    A protocol that raises has not passed; the others run all the same. Raises ValueError for an
+    unknown preset.
     """
     if preset not in protocols.CERTIFICATION:
-        raise ValueError(f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}")
+        raise ValueError(
+            f"preset: must be one of {', '.join(protocols.CERTIFICATION)}, got {preset!r}"
+        )
     certification = protocols.CERTIFICATION[preset]
     environment = _environment()
     reports: list[ProtocolReport] = []
@@ -128,10 +152,14 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         say(f"{number}/{len(certification.protocols)} {name} ...")
         cpu, wall = time.process_time(), time.monotonic()
         try:
-            result = protocols.run(name, preset, **(certification.quick.get(name, {}) if quick else {}))
+            result = protocols.run(
+                name, preset, **(certification.quick.get(name, {}) if quick else {})
+            )
             document = result.as_dict()
             for shown, curve in zip(document["curves"], result.curves, strict=True):
-                shown["dense_x"], shown["dense_master"] = (v.tolist() for v in dense_master(result.protocol, curve))
+                shown["dense_x"], shown["dense_master"] = (
+                    v.tolist() for v in dense_master(result.protocol, curve)
+                )
             report = ProtocolReport.model_validate(document)
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
         except Exception as error:  # any error becomes part of the certificate
@@ -144,7 +172,9 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
         preset=preset,
         numbers=dict(certification.numbers()),
         sim_core=solver_build(certification.solver),
-        protocol_sources=content_key("protocols", digests(sources(["stickslip_sim_core.protocols"]))),
+        protocol_sources=content_key(
+            "protocols", digests(sources(["stickslip_sim_core.protocols"]))
+        ),
         extent="quick" if quick else "full",
         protocols=tuple(reports),
         passed=all(report.passed for report in reports),

@@ -1,4 +1,6 @@
-"""The client of the worker API: requests and the back-off between them, the leases held, and their heartbeat."""
+"""The client of the worker API: requests and the back-off between them, the leases held, and their
+heartbeat.
+"""
 
 import contextlib
 import logging
@@ -24,12 +26,15 @@ Answer = TypeVar("Answer", bound=BaseModel)
 
 PROMPT = httpx.Timeout(30, connect=5)
 PATIENT = httpx.Timeout(300, connect=5)
-"""Timeout of a lease and a report: for a version of a million samples, the coordinator lists or checks all files."""
+"""Timeout of a lease and a report: for a version of a million samples, the coordinator lists or
+checks all files.
+"""
 
 REPORTS_A_REQUEST = 512
 
 REPORT_SECONDS = 1.0
-"""How long a result waits for others to be reported with, while there is other work to go on with."""
+"""How long a result waits for others to be reported with, while there is other work to go on with.
+"""
 
 START_BEAT_SECONDS = 2.0
 """Time between two heartbeats of a dispatcher that starts, which tell how far it is [s]."""
@@ -39,7 +44,9 @@ LAST_BEAT_SECONDS = 5.0
 
 
 class CoordinatorError(Exception):
-    """The coordinator refuses this dispatcher: a newer one has its name, or a request would fail every time."""
+    """The coordinator refuses this dispatcher: a newer one has its name, or a request would fail
+    every time.
+    """
 
 
 class UnreachableError(CoordinatorError):
@@ -61,9 +68,13 @@ def pinned(certificate: Path) -> ssl.SSLContext:
 class CoordinatorClient:
     """Client of the worker API. Thread-safe."""
 
-    def __init__(self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None) -> None:
+    def __init__(
+        self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None
+    ) -> None:
         # trust_env=False: the coordinator is not reached through a proxy of the environment.
-        headers = {"Content-Type": "application/json"} | ({} if key is None else {"Authorization": f"Bearer {key}"})
+        headers = {"Content-Type": "application/json"} | (
+            {} if key is None else {"Authorization": f"Bearer {key}"}
+        )
         verify = True if tls_certificate is None else pinned(tls_certificate)
         self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
         self._urls = deque(url.rstrip("/") for url in urls)
@@ -84,10 +95,19 @@ class CoordinatorClient:
     def close(self) -> None:
         self._http.close()
 
-    def _post(self, path: str, document: BaseModel, answer: type[Answer], *, timeout: httpx.Timeout = PROMPT) -> Answer:
+    def _post(
+        self,
+        path: str,
+        document: BaseModel,
+        answer: type[Answer],
+        *,
+        timeout: httpx.Timeout = PROMPT,
+    ) -> Answer:
         url = self._urls[0]
         try:
-            response = self._http.post(url + path, content=document.model_dump_json(), timeout=timeout)
+            response = self._http.post(
+                url + path, content=document.model_dump_json(), timeout=timeout
+            )
         except httpx.TransportError as error:
             if self._urls[0] == url:  # no other thread has turned from it
                 self._urls.rotate(-1)
@@ -102,7 +122,9 @@ class CoordinatorClient:
 
 
 class Backoff:
-    """Doubles the wait after each failure, with jitter so that many dispatchers do not return at once."""
+    """Doubles the wait after each failure, with jitter so that many dispatchers do not return at
+    once.
+    """
 
     def __init__(self, *, first: float = 0.2, most: float = 5.0) -> None:
         self._first, self._most, self._delay = first, most, first
@@ -134,7 +156,9 @@ class LeaseBook:
         """Add leases; they take the place of older ones of the same tasks."""
         with self._lock:
             for lease in leases:
-                self._states[lease.task_id] = api.LeaseState(task_id=lease.task_id, token=lease.token, started=False)
+                self._states[lease.task_id] = api.LeaseState(
+                    task_id=lease.task_id, token=lease.token, started=False
+                )
                 self._reports.pop(lease.task_id, None)
 
     def note(self, leases: Iterable[api.Lease], **changes: object) -> None:
@@ -142,14 +166,18 @@ class LeaseBook:
         with self._lock:
             for lease in leases:
                 if self.holds(lease):
-                    self._states[lease.task_id] = self._states[lease.task_id].model_copy(update=changes)
+                    self._states[lease.task_id] = self._states[lease.task_id].model_copy(
+                        update=changes
+                    )
 
     def settle(self, lease: api.Lease | api.LeaseState, result: TaskResult | None) -> None:
         """Keep the result of a lease that is still held, or its return, until it is reported."""
         with self._lock:
             if self.holds(lease):
                 self.due = min(self.due, time.monotonic() + REPORT_SECONDS)
-                self._reports[lease.task_id] = api.Report(task_id=lease.task_id, token=lease.token, result=result)
+                self._reports[lease.task_id] = api.Report(
+                    task_id=lease.task_id, token=lease.token, result=result
+                )
 
     def give_back(self, *, started: bool) -> None:
         """Return the leases that have no result, those of started tasks only if `started`."""
@@ -179,13 +207,15 @@ class LeaseBook:
 
 
 class Session(threading.Thread):
-    """Registers the dispatcher, and renews its leases three times in the duration of a lease, and more often at the
-    start.
+    """Registers the dispatcher, and renews its leases three times in the duration of a lease, and
+    more often at the start.
 
     It is a daemon and never keeps the process alive.
     """
 
-    def __init__(self, coordinator: CoordinatorClient, registration: Callable[[], api.WorkerRegistration]) -> None:
+    def __init__(
+        self, coordinator: CoordinatorClient, registration: Callable[[], api.WorkerRegistration]
+    ) -> None:
         super().__init__(name="session", daemon=True)
         self._coordinator = coordinator
         self._registration = registration
@@ -207,7 +237,9 @@ class Session(threading.Thread):
         return self._worker_id if self._opened == self._wanted else None
 
     def renew(self) -> None:
-        """Register anew: the coordinator does not know the session, or the dispatcher has more to say about itself."""
+        """Register anew: the coordinator does not know the session, or the dispatcher has more to
+        say about itself.
+        """
         self._wanted += 1
         self._wake.set()
 
@@ -218,16 +250,24 @@ class Session(threading.Thread):
         if drop := set(self._coordinator.heartbeat(message).drop):
             log.info("dropping %d tasks", len(drop))
             self.book.remove(state for state in states if state.task_id in drop)
-        return self._interval if condition.state == "ready" else min(START_BEAT_SECONDS, self._interval)
+        return (
+            self._interval
+            if condition.state == "ready"
+            else min(START_BEAT_SECONDS, self._interval)
+        )
 
     def report(self, worker_id: str) -> bool:
         """Send all results that wait; return whether there were any."""
         reports = self.book.reports()
         for first in range(0, len(reports), REPORTS_A_REQUEST):
             batch = reports[first : first + REPORTS_A_REQUEST]
-            for verdict in self._coordinator.report(api.ReportBatch(worker_id=worker_id, reports=batch)).verdicts:
+            for verdict in self._coordinator.report(
+                api.ReportBatch(worker_id=worker_id, reports=batch)
+            ).verdicts:
                 if verdict.verdict == "stale":
-                    log.warning("the report of task %s came too late and was refused", verdict.task_id)
+                    log.warning(
+                        "the report of task %s came too late and was refused", verdict.task_id
+                    )
             self.book.remove(batch)
         self.book.due = math.inf
         return bool(reports)
@@ -237,7 +277,9 @@ class Session(threading.Thread):
         self._wake.set()
 
     def close(self) -> None:
-        """Give all leases back and say why it ends, if the coordinator listens, and end the session."""
+        """Give all leases back and say why it ends, if the coordinator listens, and end the
+        session.
+        """
         self.book.give_back(started=True)
         with contextlib.suppress(CoordinatorError):
             if (worker_id := self.worker_id) is not None:
@@ -271,9 +313,16 @@ class Session(threading.Thread):
             self._wake.clear()
 
     def _open(self) -> None:
-        """Register. What was leased in an earlier session is lost; the coordinator gives it out again."""
+        """Register.
+
+        What was leased in an earlier session is lost; the coordinator gives it out again.
+        """
         wanted = self._wanted
         session = self._coordinator.register(self._registration())
         self.book.remove(self.book.states())
-        self._worker_id, self._interval, self._opened = session.worker_id, session.lease_seconds / 3, wanted
+        self._worker_id, self._interval, self._opened = (
+            session.worker_id,
+            session.lease_seconds / 3,
+            wanted,
+        )
         log.info("registered as %s", session.worker_id)

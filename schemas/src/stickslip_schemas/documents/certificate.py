@@ -1,7 +1,8 @@
-"""The certificate: what one build of the core, with the numbers of one preset, measured on the physical protocols.
+"""The certificate: what one build of the core, with the numbers of one preset, measured on the
+physical protocols.
 
-Its digest is over everything but `environment` and the densely drawn curves: the same build and preset on another day
-give the same certificate.
+Its digest is over everything but `environment` and the densely drawn curves: the same build and
+preset on another day give the same certificate.
 """
 
 import math
@@ -28,31 +29,45 @@ class CurveReport(Document):
     measured: Numbers
     master: Numbers
     errors: Numbers = Field(description="measured over master less one; null is infinite")
-    limit: Numbers = Field(default=(), description="extrapolated to cells of no size, of a protocol on three meshes")
-    order: Numbers = Field(
-        default=(), description="power of the cell's size with which errors fall; null: none was found, and 2 was taken"
+    limit: Numbers = Field(
+        default=(), description="extrapolated to cells of no size, of a protocol on three meshes"
     )
-    limit_errors: Numbers = Field(default=(), description="limit over master less one; null is infinite")
+    order: Numbers = Field(
+        default=(),
+        description="power of the cell's size with which errors fall; null: none was found, and 2 was taken",
+    )
+    limit_errors: Numbers = Field(
+        default=(), description="limit over master less one; null is infinite"
+    )
     cells: tuple[Numbers, ...] = Field(
-        default=(), description="by mesh, the coarsest first, and point: cells along the sheet; the last is that of x"
+        default=(),
+        description="by mesh, the coarsest first, and point: cells along the sheet; the last is that of x",
     )
     errors_by_mesh: tuple[Numbers, ...] = Field(
         default=(), description="errors with these cells; the last are `errors`"
     )
-    dense_x: Numbers = Field(default=(), description="where the master curve is drawn densely; for pictures only")
+    dense_x: Numbers = Field(
+        default=(), description="where the master curve is drawn densely; for pictures only"
+    )
     dense_master: Numbers = ()
 
     @model_validator(mode="after")
     def _one_length(self) -> Self:
         lengths = {len(self.x), len(self.measured), len(self.master), len(self.errors)}
         if len(lengths) > 1:
-            raise ValueError(f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}")
+            raise ValueError(
+                f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}"
+            )
         refined = {len(self.limit), len(self.order), len(self.limit_errors)}
         refined |= {len(row) for rows in (self.cells, self.errors_by_mesh) for row in rows}
         if self.cells and (refined != lengths or self.errors_by_mesh[-1:] != (self.errors,)):
-            raise ValueError("limit, order, cells and errors_by_mesh must have the length of x, and end with errors")
+            raise ValueError(
+                "limit, order, cells and errors_by_mesh must have the length of x, and end with errors"
+            )
         if len(self.cells) != len(self.errors_by_mesh) or bool(self.limit) != bool(self.cells):
-            raise ValueError("cells and errors_by_mesh must have the same meshes, and limit must come with them")
+            raise ValueError(
+                "cells and errors_by_mesh must have the same meshes, and limit must come with them"
+            )
         if len(self.dense_x) != len(self.dense_master):
             raise ValueError("dense_x and dense_master must have one length")
         return self
@@ -67,9 +82,13 @@ class ProtocolReport(Document):
     tolerance: Float = Field(ge=0, description="largest |relative error| that passes")
     error: Float | None = Field(ge=0, description="largest |relative error|; null is infinite")
     limit_tolerance: Float | None = Field(
-        default=None, ge=0, description="largest |relative error| of a limit that passes; null without three meshes"
+        default=None,
+        ge=0,
+        description="largest |relative error| of a limit that passes; null without three meshes",
     )
-    limit_error: Float | None = Field(default=None, ge=0, description="largest |relative error| of a limit")
+    limit_error: Float | None = Field(
+        default=None, ge=0, description="largest |relative error| of a limit"
+    )
     passed: Bool
     settings: dict[str, Any]
     build_hash: Sha256 = Field(description="of the compiled core")
@@ -80,13 +99,19 @@ class ProtocolReport(Document):
     def _consistent(self) -> Self:
         largest = _largest(error for curve in self.curves for error in curve.errors)
         if self.error != largest:
-            raise ValueError(f"error must be the largest of the curves' errors, {largest}, and it is {self.error}")
+            raise ValueError(
+                f"error must be the largest of the curves' errors, {largest}, and it is {self.error}"
+            )
         within = self.error is not None and self.error <= self.tolerance
         if self.limit_tolerance is not None:
             largest = _largest(error for curve in self.curves for error in curve.limit_errors)
             if self.limit_error != largest:
-                raise ValueError(f"limit_error must be the largest of the limits' errors, {largest}")
-            within = within and self.limit_error is not None and self.limit_error <= self.limit_tolerance
+                raise ValueError(
+                    f"limit_error must be the largest of the limits' errors, {largest}"
+                )
+            within = (
+                within and self.limit_error is not None and self.limit_error <= self.limit_tolerance
+            )
         elif self.limit_error is not None or any(curve.limit for curve in self.curves):
             raise ValueError("limit_tolerance must be given with limits")
         if self.passed != (within and not self.message):
@@ -106,12 +131,20 @@ class Certificate(Document):
     format: Literal["stickslip-certificate/1"] = "stickslip-certificate/1"
     preset: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")
     numbers: dict[str, Any] = Field(description="the settings that the preset stands for")
-    sim_core: Sha256 = Field(description="build of the solver that was measured (`Builds.sim_core`)")
-    protocol_sources: Sha256 = Field(description="digest of the sources that measured and of the master curves")
-    extent: Literal["full", "quick"] = Field(description="quick: few points, to try things out; certifies nothing")
+    sim_core: Sha256 = Field(
+        description="build of the solver that was measured (`Builds.sim_core`)"
+    )
+    protocol_sources: Sha256 = Field(
+        description="digest of the sources that measured and of the master curves"
+    )
+    extent: Literal["full", "quick"] = Field(
+        description="quick: few points, to try things out; certifies nothing"
+    )
     protocols: tuple[ProtocolReport, ...] = Field(min_length=1)
     passed: Bool
-    environment: dict[str, str] = Field(description="where and how it was made; not part of the content")
+    environment: dict[str, str] = Field(
+        description="where and how it was made; not part of the content"
+    )
 
     @property
     def digest(self) -> str:

@@ -47,11 +47,16 @@ class FieldError(BaseModel):
 
     pointer: str = Field(description="JSON pointer [RFC 6901] into the document as it was sent")
     rule: str = Field(description="the rule that does not hold, in words")
-    value: str = Field(description="the offending value as JSON, cut to 200 characters; empty where it is missing")
+    value: str = Field(
+        description="the offending value as JSON, cut to 200 characters; empty where it is missing"
+    )
 
 
 class Problem(BaseModel):
-    """A problem document [RFC 9457]. `type` is `urn:stickslip:problem:` with the code, which `title` says in words."""
+    """A problem document [RFC 9457].
+
+    `type` is `urn:stickslip:problem:` with the code, which `title` says in words.
+    """
 
     type: str
     title: str
@@ -63,18 +68,24 @@ class Problem(BaseModel):
     errors: list[FieldError] = Field(default_factory=list)
 
 
-def field_errors(error: ValidationError, document: Any, of: Any, *, at_most: int | None = None) -> list[FieldError]:
-    """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote it.
+def field_errors(
+    error: ValidationError, document: Any, of: Any, *, at_most: int | None = None
+) -> list[FieldError]:
+    """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote
+    it.
 
-    `of` is the type that the document was to be, a model or a union of models: misspelt words are compared with its
-    fields and values. This takes time for each error: `at_most` bounds it for a document of many.
+    `of` is the type that the document was to be, a model or a union of models: misspelt words are
+    compared with its fields and values. This takes time for each error: `at_most` bounds it for a
+    document of many.
     """
     items = (item for item in error.errors(include_url=False) if not _is_echo(item))
     return [_field_error(item, document, of) for item in islice(items, at_most)]
 
 
 def _is_echo(item: ErrorDetails) -> bool:
-    """Return whether a list is said to be too short only because its items have errors of their own."""
+    """Return whether a list is said to be too short only because its items have errors of their
+    own.
+    """
     return item["type"] == "too_short" and item["ctx"]["actual_length"] != len(item["input"])
 
 
@@ -86,12 +97,18 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
         case "missing":
             rule = "this field is required"
         case "extra_forbidden":
-            known = sorted({name for model in models_at(of, location[:-1]) for name in model.model_fields})
+            known = sorted(
+                {name for model in models_at(of, location[:-1]) for name in model.model_fields}
+            )
             hint = did_you_mean(str(location[-1]), known) or "."
             rule = f"there is no such field{hint} Fields: {', '.join(known)}"
         case "union_tag_invalid" | "union_tag_not_found":
             tag = item["ctx"]["discriminator"].strip("'")
-            tags = [model.model_fields[tag] for model in models_at(of, location) if tag in model.model_fields]
+            tags = [
+                model.model_fields[tag]
+                for model in models_at(of, location)
+                if tag in model.model_fields
+            ]
             known = [word for field in tags for word in literals(field.annotation)]
             is_missing = item["type"] == "union_tag_not_found" and isinstance(value, Mapping)
             if isinstance(value, Mapping):
@@ -107,7 +124,9 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
             rule = f"must have at least {item['ctx']['min_length']} item(s)"
         case "enum" | "literal_error":
             known = re.findall(r"'([^']*)'", item["ctx"]["expected"])
-            rule = f"must be one of {', '.join(known)}" + (did_you_mean(value, known) if isinstance(value, str) else "")
+            rule = f"must be one of {', '.join(known)}" + (
+                did_you_mean(value, known) if isinstance(value, str) else ""
+            )
     rule += unit_of(item, of)
     return FieldError(
         pointer=_pointer(location, document, missing=is_missing or item["type"] == "broken_rule"),
@@ -117,7 +136,9 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
 
 
 def _pointer(location: Sequence[int | str], document: Any, *, missing: bool) -> str:
-    """Walk `location` through `document`, leaving out what pydantic put there itself (tags of unions)."""
+    """Walk `location` through `document`, leaving out what pydantic put there itself (tags of
+    unions).
+    """
     parts: list[int | str] = []
     here = document
     for position, part in enumerate(location):

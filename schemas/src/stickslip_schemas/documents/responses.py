@@ -6,7 +6,16 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import Field
 
-from stickslip_schemas.base import ArtifactRef, Document, Int, JobState, Reason, Sha256, Stage, TaskState
+from stickslip_schemas.base import (
+    ArtifactRef,
+    Document,
+    Int,
+    JobState,
+    Reason,
+    Sha256,
+    Stage,
+    TaskState,
+)
 from stickslip_schemas.documents.worker_api import WorkerCondition
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.plan.builds import Builds
@@ -22,7 +31,8 @@ class StageProgress(Document):
     cached: int
     cpu_seconds: float = Field(description="CPU time of the tasks that this job ran [s]")
     frames: tuple[int, int] | None = Field(
-        default=None, description="progress of the running simulations: frames done, frames in total"
+        default=None,
+        description="progress of the running simulations: frames done, frames in total",
     )
 
     @property
@@ -32,7 +42,11 @@ class StageProgress(Document):
     @property
     def done(self) -> int:
         """Number of tasks that have ended without being cancelled."""
-        return sum(count for state, count in self.counts.items() if state.is_over and state is not TaskState.cancelled)
+        return sum(
+            count
+            for state, count in self.counts.items()
+            if state.is_over and state is not TaskState.cancelled
+        )
 
 
 class Eta(Document):
@@ -50,7 +64,9 @@ class Progress(Document):
     total: int
     planned: int = Field(description="planned samples; `done` and `total` count only their tasks")
     stages: dict[Stage, StageProgress]
-    eta: Eta | None = Field(description="null before the first measurement, and when nothing remains")
+    eta: Eta | None = Field(
+        description="null before the first measurement, and when nothing remains"
+    )
 
 
 class DatasetRef(Document):
@@ -71,7 +87,9 @@ class Job(Document):
     reason: Reason | None
     message: str
     project: str = Field(description="project of the key that submitted it; empty: none")
-    priority: int = Field(description="within a project, tasks of the job with the highest number run first")
+    priority: int = Field(
+        description="within a project, tasks of the job with the highest number run first"
+    )
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -93,9 +111,13 @@ class Validation(Document):
     spec: AnyJobSpec
     spec_digest: Sha256
     sample_count: int
-    simulation_count: int = Field(description="different simulations; samples that differ in their look share one")
+    simulation_count: int = Field(
+        description="different simulations; samples that differ in their look share one"
+    )
     render_count: int
-    task_count: int = Field(description="tasks of all stages: simulations, renders, shards, and one that publishes")
+    task_count: int = Field(
+        description="tasks of all stages: simulations, renders, shards, and one that publishes"
+    )
     expected_splits: dict[str, int] = Field(
         description="expected samples by split; splits are drawn, so the numbers of a dataset differ slightly"
     )
@@ -109,7 +131,9 @@ class Validation(Document):
     estimate: Estimate = Field(
         description="time of all tasks, without cached results, from what this service or the package has measured"
     )
-    certificate: Sha256 | None = Field(description="certificate that covers the dataset; null: none")
+    certificate: Sha256 | None = Field(
+        description="certificate that covers the dataset; null: none"
+    )
     refusal: str | None = Field(
         description="reason why a job of this spec would be refused now; null: it would be accepted"
     )
@@ -182,7 +206,9 @@ class SampleState(Document):
 class JobPatch(Document):
     """Changes to a job."""
 
-    priority: Int = Field(ge=-100, le=100, description="tasks of the job with the highest number run first")
+    priority: Int = Field(
+        ge=-100, le=100, description="tasks of the job with the highest number run first"
+    )
 
 
 class RunningTask(Document):
@@ -192,7 +218,9 @@ class RunningTask(Document):
     stage: Stage
     job: str | None
     since: datetime | None = Field(description="start time; null while it waits at the worker")
-    frames: tuple[int, int] | None = Field(description="progress of a simulation: frames done, frames in total")
+    frames: tuple[int, int] | None = Field(
+        description="progress of a simulation: frames done, frames in total"
+    )
 
 
 class WorkerEntry(Document):

@@ -43,7 +43,10 @@ class SimulateOutput(Document):
 
 
 class RenderTask(Document):
-    """Make the pictures of one sample, or of all samples that share a shading; `preview` asks for small ones, too."""
+    """Make the pictures of one sample, or of all samples that share a shading.
+
+    `preview` asks for small ones, too.
+    """
 
     stage: Literal["render"] = "render"
     render: AnyRender
@@ -57,7 +60,8 @@ class RenderTask(Document):
 
 
 class RenderOutput(Document):
-    """Encoded chunks by array name, the digest of the preview if there is one, and labels (colour, ...).
+    """Encoded chunks by array name, the digest of the preview if there is one, and labels (colour,
+    ...).
 
     With `textures` in the task there are only `clips`.
     """
@@ -75,7 +79,9 @@ class PackSlot(Document):
     slot: Int = Field(ge=0)
     sample_key: Sha256
     split: Int
-    labels: dict[str, Any] = Field(description="parameters and what the stages added, by array name")
+    labels: dict[str, Any] = Field(
+        description="parameters and what the stages added, by array name"
+    )
     record: RecordRef | None = None
     chunks: dict[str, ChunkRef] = Field(default_factory=dict)
     rejection: Rejection | None = None
@@ -96,11 +102,15 @@ class PackTask(Document):
 
 
 class PackOutput(Document):
-    """The shard's files, in the store, and its labels, which go into files with those of other shards."""
+    """The shard's files, in the store, and its labels, which go into files with those of other
+    shards.
+    """
 
     stage: Literal["pack"] = "pack"
     files: tuple[FileEntry, ...] = Field(description="of the arrays that are no labels")
-    labels: Sha256 = Field(description="artifact: a shard whose chunks are the labels, in the order of the layout")
+    labels: Sha256 = Field(
+        description="artifact: a shard whose chunks are the labels, in the order of the layout"
+    )
 
 
 class PublishSection(ManifestSection):
@@ -117,8 +127,12 @@ class PublishTask(Document):
     dataset: str
     version: Int = Field(ge=1)
     builds: Builds
-    sections: tuple[Sha256, ...] = Field(min_length=1, description="artifacts, each a `PublishSection`, by slot")
-    certificate: Sha256 | None = Field(default=None, description="digest of the certificate that vouches for it")
+    sections: tuple[Sha256, ...] = Field(
+        min_length=1, description="artifacts, each a `PublishSection`, by slot"
+    )
+    certificate: Sha256 | None = Field(
+        default=None, description="digest of the certificate that vouches for it"
+    )
 
 
 class PublishOutput(Document):
@@ -132,7 +146,9 @@ class PublishOutput(Document):
 
 AnyTask = SimulateTask | RenderTask | PackTask | PublishTask
 Task = Annotated[AnyTask, Field(discriminator="stage")]
-Output = Annotated[SimulateOutput | RenderOutput | PackOutput | PublishOutput, Field(discriminator="stage")]
+Output = Annotated[
+    SimulateOutput | RenderOutput | PackOutput | PublishOutput, Field(discriminator="stage")
+]
 
 
 class TaskResult(Document):
@@ -143,7 +159,8 @@ class TaskResult(Document):
     message: str = ""
     output: Output | None = None
     damaged_inputs: tuple[Sha256, ...] = Field(
-        default=(), description="artifacts that the task needed and that are damaged or not in the store"
+        default=(),
+        description="artifacts that the task needed and that are damaged or not in the store",
     )
     cpu_seconds: Float = Field(default=0.0, ge=0)
     wall_seconds: Float = Field(default=0.0, ge=0)
@@ -161,8 +178,14 @@ class TaskResult(Document):
             raise ValueError("reason is there exactly when the outcome is not succeeded")
         if self.outcome != "failed" and self.damaged_inputs:
             raise ValueError("damaged_inputs are those of a task that has failed")
-        if self.outcome == "rejected" and self.reason is not None and not self.reason.is_deterministic:
-            raise ValueError(f"a sample is rejected for a reason of its own, and {self.reason} is not one")
+        if (
+            self.outcome == "rejected"
+            and self.reason is not None
+            and not self.reason.is_deterministic
+        ):
+            raise ValueError(
+                f"a sample is rejected for a reason of its own, and {self.reason} is not one"
+            )
         return self
 
 
@@ -173,10 +196,15 @@ results_adapter = TypeAdapter(list[TaskResult])
 
 
 def input_digests(task: AnyTask, read: Callable[[Sha256], bytes]) -> tuple[Sha256, ...]:
-    """Return the artifacts that a task needs; `read` reads artifacts that list others, which may be damaged or lost."""
+    """Return the artifacts that a task needs.
+
+    `read` reads artifacts that list others, which may be damaged or lost.
+    """
     if isinstance(task, RenderTask):
         pictures = map(referred, task.textures or (task.render.variant,))
-        return tuple(dict.fromkeys([task.record.digest, *filter(None, pictures), *task.render.artifacts]))
+        return tuple(
+            dict.fromkeys([task.record.digest, *filter(None, pictures), *task.render.artifacts])
+        )
     if isinstance(task, PublishTask):
         digests = list(task.sections)
         for digest in task.sections:
@@ -187,4 +215,8 @@ def input_digests(task: AnyTask, read: Callable[[Sha256], bytes]) -> tuple[Sha25
     if isinstance(task, SimulateTask):
         return task.simulation.artifacts
     records = [slot.record.digest for slot in task.slots if slot.record is not None]
-    return tuple(dict.fromkeys([*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]))
+    return tuple(
+        dict.fromkeys(
+            [*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]
+        )
+    )

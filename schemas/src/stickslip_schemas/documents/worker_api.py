@@ -18,11 +18,16 @@ class WorkerCondition(Document):
 
     state: Literal["starting", "ready"] = "ready"
     slots: Int = Field(ge=0, le=MAX_SLOTS, description="number of tasks that run at once")
-    reason: str = Field(default="", max_length=1000, description="why it is not ready, or what is wrong; for people")
+    reason: str = Field(
+        default="", max_length=1000, description="why it is not ready, or what is wrong; for people"
+    )
 
 
 class WorkerRegistration(Document):
-    """Registration of a dispatcher. A second one with the same `name` revokes the leases of the first."""
+    """Registration of a dispatcher.
+
+    A second one with the same `name` revokes the leases of the first.
+    """
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
     builds: dict[str, Builds] = Field(
@@ -30,7 +35,9 @@ class WorkerRegistration(Document):
         json_schema_extra={"propertyNames": {"enum": list(KINDS)}},
     )
     condition: WorkerCondition
-    versions: dict[str, str] = Field(default_factory=dict, description="for people: sim_core, blender, ray, ...")
+    versions: dict[str, str] = Field(
+        default_factory=dict, description="for people: sim_core, blender, ray, ..."
+    )
 
     @field_validator("builds")
     @classmethod
@@ -64,7 +71,9 @@ class Lease(Document):
     token: Int
     attempt: Int = Field(ge=1)
     limit_seconds: Float | None = Field(
-        default=None, gt=0, description="timeout of the call [s]; null: no similar task has been measured"
+        default=None,
+        gt=0,
+        description="timeout of the call [s]; null: no similar task has been measured",
     )
     task: Task
 
@@ -119,7 +128,10 @@ class ReportBatch(Document):
 
 
 class ReportVerdict(Document):
-    """`accepted`; `duplicate` (this very report was accepted before); `stale` (the lease was not the worker's)."""
+    """`accepted`.
+
+    `duplicate` (this very report was accepted before); `stale` (the lease was not the worker's).
+    """
 
     task_id: str
     verdict: Literal["accepted", "duplicate", "stale"]

@@ -1,11 +1,11 @@
 """Chunks and shards as bytes [Zarr v3, sharding_indexed codec].
 
-A chunk is `zstd(ZSTD_LEVEL) -> crc32c`. Trajectories and clips are `transpose -> blosc -> crc32c`, each with its
-`Packing`. In a clip, the same row of all frames is together, one colour after the other, for most of it is
-as it was in the frame before.
+A chunk is `zstd(ZSTD_LEVEL) -> crc32c`. Trajectories and clips are `transpose -> blosc -> crc32c`,
+each with its `Packing`. In a clip, the same row of all frames is together, one colour after the
+other, for most of it is as it was in the frame before.
 
-A shard is its chunks one after the other, then the index: one (offset, length) pair of little-endian uint64 per chunk,
-then the index's own crc32c.
+A shard is its chunks one after the other, then the index: one (offset, length) pair of
+little-endian uint64 per chunk, then the index's own crc32c.
 """
 
 import threading
@@ -35,15 +35,21 @@ class Packing(NamedTuple):
 
 TRAJECTORY = Packing("zstd", 5, "shuffle")
 CLIP = Packing("lz4hc", 9, "noshuffle")
-"""Written once, read many times: it takes a fifth more space than zstd 11, and less than half the time to decode."""
+"""Written once, read many times: it takes a fifth more space than zstd 11, and less than half the
+time to decode.
+"""
 MISSING = 2**64 - 1
 """Offset and length of a chunk that is not in the shard."""
 
 _CLIP_ORDER = (1, 3, 0, 2)
-"""Rows, colours, frames, columns: it takes less space than any other order, and is the quickest to read."""
+"""Rows, colours, frames, columns: it takes less space than any other order, and is the quickest to
+read.
+"""
 
 _scratch = threading.local()
-"""The last buffer of a thread to decode into: memory that is new to the process costs a tenth of the decoding."""
+"""The last buffer of a thread to decode into: memory that is new to the process costs a tenth of
+the decoding.
+"""
 
 _CRC_BYTES = 4
 _RESIDUE = 0x48674BC7
@@ -60,7 +66,10 @@ def encode_chunk(data: bytes | np.ndarray) -> bytes:
 
 
 def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:
-    """Return the decoded bytes of a chunk, into all of `out` where it is given; raise CorruptChunkError."""
+    """Return the decoded bytes of a chunk, into all of `out` where it is given.
+
+    Raise CorruptChunkError.
+    """
     frame = _without_crc(chunk, "chunk")
     if out is not None and (size := _content_size(frame)) != out.nbytes:
         # The decoder would fill a part of `out` and leave the rest as it was, without a word.
@@ -101,10 +110,12 @@ def _turned(array: ArrayLayout, values: np.ndarray) -> np.ndarray:
 
 
 def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
-    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None: not at all.
+    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None:
+    not at all.
 
-    Those of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate over time are neighbours,
-    and bytes of one significance are put together: float32 positions then take half the space of a plain chunk.
+    Those of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate over
+    time are neighbours, and bytes of one significance are put together: float32 positions then take
+    half the space of a plain chunk.
     """
     if array.is_clip:
         return (0, *(1 + axis for axis in _CLIP_ORDER))
@@ -112,8 +123,12 @@ def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
 
 
 def in_order_of_chunks(array: ArrayLayout, values: np.ndarray) -> bool:
-    """Return whether samples (samples, *sample shape) of an array lie in memory in the order that chunks have."""
-    return bool((values.transpose(axes_order(array)) if array.is_clip else values).flags.c_contiguous)
+    """Return whether samples (samples, *sample shape) of an array lie in memory in the order that
+    chunks have.
+    """
+    return bool(
+        (values.transpose(axes_order(array)) if array.is_clip else values).flags.c_contiguous
+    )
 
 
 def empty_in_order(array: ArrayLayout, count: int) -> np.ndarray:
@@ -134,12 +149,17 @@ def packing(array: ArrayLayout) -> Packing | None:
 
 
 def check_chunk(chunk: bytes) -> None:
-    """Raise CorruptChunkError where the checksum of an encoded chunk does not hold; nothing is decoded."""
+    """Raise CorruptChunkError where the checksum of an encoded chunk does not hold; nothing is
+    decoded.
+    """
     _without_crc(chunk, "chunk")
 
 
 def encode_shard(chunks: Sequence[bytes | None]) -> bytes:
-    """Return the shard of encoded `chunks` in C order of the chunk grid; None is a chunk that is missing."""
+    """Return the shard of encoded `chunks` in C order of the chunk grid.
+
+    None is a chunk that is missing.
+    """
     index = np.full((len(chunks), 2), MISSING, dtype="<u8")
     offset = 0
     for position, chunk in enumerate(chunks):

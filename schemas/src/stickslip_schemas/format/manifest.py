@@ -1,11 +1,12 @@
 """The manifest of a dataset version: its contents, its origin, and the digests that verify it.
 
-Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file but these three. In
-a version of many samples it has those of its **sections** instead, `manifest/0.json` and so on, each of which lists the
-keys, rejections and files of some thousand samples: a tree of digests, so that nobody reads all lists to open a
-version. `Contents` reads both forms. The attribute `manifest_sha256` of the root's `zarr.json` is the SHA-256 of the
-manifest. `manifest.sha256` has those of both, in the form that `sha256sum --check` reads. So a bit that flips in any of
-these files shows.
+Three files vouch for all others and for one another. `manifest.json` has the SHA-256 of every file
+but these three. In a version of many samples it has those of its **sections** instead,
+`manifest/0.json` and so on, each of which lists the keys, rejections and files of some thousand
+samples: a tree of digests, so that nobody reads all lists to open a version. `Contents` reads both
+forms. The attribute `manifest_sha256` of the root's `zarr.json` is the SHA-256 of the manifest.
+`manifest.sha256` has those of both, in the form that `sha256sum --check` reads. So a bit that flips
+in any of these files shows.
 """
 
 import json
@@ -25,7 +26,10 @@ from stickslip_schemas.spec.jobs import JobSpec, Quality
 
 
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
-    """Return the arrays of the dataset of `spec`; raise UnknownKindError where nobody registered its class."""
+    """Return the arrays of the dataset of `spec`.
+
+    Raise UnknownKindError where nobody registered its class.
+    """
     return (*registered(spec).arrays(), *COMMON_ARRAYS)
 
 
@@ -82,7 +86,9 @@ class Rejection(Document):
 
 
 class ManifestSection(Document):
-    """What a version has of consecutive shards: their samples and the files of their arrays that are no labels."""
+    """What a version has of consecutive shards: their samples and the files of their arrays that
+    are no labels.
+    """
 
     first: Int = Field(ge=0, description="slot of the first sample")
     sample_keys: tuple[Sha256, ...] = Field(min_length=1, description="by slot")
@@ -108,16 +114,21 @@ class Psnr(Document):
     clips: Int = Field(description="valid clips that were measured and show the region")
     median: float = Field(description="[dB]")
     worst: float = Field(description="exceeded by 99 % of the clips [dB]")
-    deviation: float = Field(description="median of the standard deviations of a clip's estimate [dB]")
+    deviation: float = Field(
+        description="median of the standard deviations of a clip's estimate [dB]"
+    )
 
 
 class Pictures(Document):
     """Quality of the pictures of a version."""
 
     quality: Quality
-    psnr: dict[str, Psnr] = Field(description="by region: cloth, its landed part, its edge; none for what is no cloth")
+    psnr: dict[str, Psnr] = Field(
+        description="by region: cloth, its landed part, its edge; none for what is no cloth"
+    )
     frame_share: float | None = Field(
-        default=None, description="share of the frame that is cloth, mean of the valid samples; null: no cloth"
+        default=None,
+        description="share of the frame that is cloth, mean of the valid samples; null: no cloth",
     )
     device: str = Field(
         default="cpu",
@@ -126,7 +137,10 @@ class Pictures(Document):
 
 
 class Manifest(Document):
-    """Everything about a version that is not in its arrays. A version exists when its manifest is committed."""
+    """Everything about a version that is not in its arrays.
+
+    A version exists when its manifest is committed.
+    """
 
     format: Literal["stickslip-dataset/3"] = FORMAT
     dataset: str
@@ -140,7 +154,9 @@ class Manifest(Document):
     cameras: tuple[Camera, ...] = Field(
         description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
     )
-    pictures: Pictures | None = Field(default=None, description="quality of the pictures; null: there are none")
+    pictures: Pictures | None = Field(
+        default=None, description="quality of the pictures; null: there are none"
+    )
     sample_count: int = Field(ge=1, description="slots, the rejected ones included")
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")
@@ -149,8 +165,12 @@ class Manifest(Document):
         default=(),
         description="files that list samples and the files of their shards, by slot; none in a small version",
     )
-    rejections: tuple[Rejection, ...] = Field(description="empty where there are sections, which have them")
-    sample_keys: tuple[Sha256, ...] = Field(description="by slot; empty where there are sections, which have them")
+    rejections: tuple[Rejection, ...] = Field(
+        description="empty where there are sections, which have them"
+    )
+    sample_keys: tuple[Sha256, ...] = Field(
+        description="by slot; empty where there are sections, which have them"
+    )
     files: tuple[FileEntry, ...] = Field(
         description="every file of the version, by path, but the three that vouch for it (this one, the root's "
         "zarr.json and manifest.sha256), the sections, and what the sections list"
@@ -160,12 +180,19 @@ class Manifest(Document):
     def _has_its_sections(self) -> Self:
         if not self.sections:
             return self
-        expected = [section_path(number) for number in range(-(-self.sample_count // section_samples(self.spec)))]
+        expected = [
+            section_path(number)
+            for number in range(-(-self.sample_count // section_samples(self.spec)))
+        ]
         found = [section.path for section in self.sections]
         if found != expected:
-            raise ValueError(f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got {found[:5]}")
+            raise ValueError(
+                f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got {found[:5]}"
+            )
         if self.sample_keys or self.rejections:
-            raise ValueError("sample_keys and rejections must be empty, for there are sections, which have them")
+            raise ValueError(
+                "sample_keys and rejections must be empty, for there are sections, which have them"
+            )
         return self
 
     @property
@@ -175,9 +202,12 @@ class Manifest(Document):
 
 
 class Contents:
-    """What a manifest lists. Sections are read when they are asked for, and checked against their digests.
+    """What a manifest lists.
 
-    Methods raise BrokenSectionError for a section that is not what the manifest says, and what `read` raises.
+    Sections are read when they are asked for, and checked against their digests.
+
+    Methods raise BrokenSectionError for a section that is not what the manifest says, and what
+    `read` raises.
     """
 
     KEPT = 2
@@ -186,10 +216,14 @@ class Contents:
     def __init__(self, manifest: Manifest, read: Callable[[FileEntry], bytes]) -> None:
         self.manifest = manifest
         self._read = read
-        self._samples = section_samples(manifest.spec) if manifest.sections else manifest.sample_count
+        self._samples = (
+            section_samples(manifest.spec) if manifest.sections else manifest.sample_count
+        )
         # Caches that threads may share.
         self.section = lru_cache(self.KEPT)(self._section)
-        self._files_of = lru_cache(1)(lambda number: {file.path: file for file in self.section(number).files})
+        self._files_of = lru_cache(1)(
+            lambda number: {file.path: file for file in self.section(number).files}
+        )
 
     def number_of(self, slot: int) -> int:
         """Return the number of the section of a sample; 0 where all is in the manifest itself."""
@@ -200,20 +234,29 @@ class Contents:
             yield self.section(number)
 
     def files(self) -> Iterator[FileEntry]:
-        """Yield every file of the version, but the three that vouch for it: also the sections themselves."""
+        """Yield every file of the version, but the three that vouch for it: also the sections
+        themselves.
+        """
         yield from self.manifest.files
         yield from self.manifest.sections
         for section in self.sections() if self.manifest.sections else ():
             yield from section.files
 
     def file(self, path: str) -> FileEntry | None:
-        """Return the file at a path of the version; None if it lists none. At most one section is read."""
+        """Return the file at a path of the version; None if it lists none.
+
+        At most one section is read.
+        """
         found = self._own_files.get(path)
         shard = _SHARD.match(path)
         if found is not None or shard is None or not self.manifest.sections:
             return found
         slot = int(shard[1]) * self.manifest.spec.samples_per_shard
-        return self._files_of(self.number_of(slot)).get(path) if slot < self.manifest.sample_count else None
+        return (
+            self._files_of(self.number_of(slot)).get(path)
+            if slot < self.manifest.sample_count
+            else None
+        )
 
     @cached_property
     def _own_files(self) -> dict[str, FileEntry]:
@@ -228,7 +271,10 @@ class Contents:
             yield from section.sample_keys
 
     def _section(self, number: int) -> ManifestSection:
-        """Return a section; a manifest without sections is like one with one section, but for the files."""
+        """Return a section.
+
+        A manifest without sections is like one with one section, but for the files.
+        """
         manifest = self.manifest
         if not manifest.sections:
             return ManifestSection.model_construct(
@@ -237,11 +283,15 @@ class Contents:
         entry = manifest.sections[number]
         data = self._read(entry)
         if (found := sha256(data)) != entry.sha256:
-            raise BrokenSectionError(f"{entry.path} has SHA-256 {found}, and {MANIFEST_NAME} says {entry.sha256}")
+            raise BrokenSectionError(
+                f"{entry.path} has SHA-256 {found}, and {MANIFEST_NAME} says {entry.sha256}"
+            )
         try:
             section = ManifestSection.model_validate_json(data)
         except ValueError as error:
-            raise BrokenSectionError(f"{entry.path} is no section of a manifest: {error}") from error
+            raise BrokenSectionError(
+                f"{entry.path} is no section of a manifest: {error}"
+            ) from error
         slots = number * self._samples, min((number + 1) * self._samples, manifest.sample_count)
         if (section.first, section.end) != slots:
             raise BrokenSectionError(
@@ -252,7 +302,9 @@ class Contents:
 
 
 def seal_text(manifest: Sha256, group: Sha256) -> bytes:
-    """Return the bytes of `manifest.sha256`, from the digests of the manifest and of the root's `zarr.json`."""
+    """Return the bytes of `manifest.sha256`, from the digests of the manifest and of the root's
+    `zarr.json`.
+    """
     return f"{manifest}  {MANIFEST_NAME}\n{group}  {GROUP_NAME}\n".encode()
 
 
@@ -264,18 +316,27 @@ def with_manifest_digest(group: bytes, manifest: Sha256) -> bytes:
 
 
 def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
-    """Return the digest of the manifest; raise BrokenSealError where one of the three files is not as it was made."""
+    """Return the digest of the manifest.
+
+    Raise BrokenSealError where one of the three files is not as it was made.
+    """
     digests = {MANIFEST_NAME: sha256(manifest), GROUP_NAME: sha256(group)}
     stated = _stated(seal)
     for name, found in digests.items():
         if stated.get(name) != found:
-            raise BrokenSealError(f"{name} has SHA-256 {found}, and {SEAL_NAME} says {stated.get(name)}")
+            raise BrokenSealError(
+                f"{name} has SHA-256 {found}, and {SEAL_NAME} says {stated.get(name)}"
+            )
     if seal != seal_text(*digests.values()):
-        raise BrokenSealError(f"{SEAL_NAME} must have one line each for {', '.join(digests)}, and no other line")
+        raise BrokenSealError(
+            f"{SEAL_NAME} must have one line each for {', '.join(digests)}, and no other line"
+        )
     try:
         named = json.loads(group)["attributes"][MANIFEST_ATTRIBUTE]
     except (ValueError, KeyError, TypeError) as error:
-        raise BrokenSealError(f"{GROUP_NAME} must have the attribute {MANIFEST_ATTRIBUTE}") from error
+        raise BrokenSealError(
+            f"{GROUP_NAME} must have the attribute {MANIFEST_ATTRIBUTE}"
+        ) from error
     if named != digests[MANIFEST_NAME]:
         raise BrokenSealError(
             f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, {digests[MANIFEST_NAME]}, "
@@ -289,4 +350,6 @@ def _stated(seal: bytes) -> dict[str, str]:
         lines = [line.split("  ") for line in seal.decode("ascii").splitlines()]
         return {name: digest for digest, name in lines}
     except ValueError as error:
-        raise BrokenSealError(f"{SEAL_NAME} must have lines as of sha256sum: a digest and a name") from error
+        raise BrokenSealError(
+            f"{SEAL_NAME} must have lines as of sha256sum: a digest and a name"
+        ) from error

@@ -1,4 +1,5 @@
-"""Picture files: custom textures that are read, and previews that are written (PNG, and WebP that moves).
+"""Picture files: custom textures that are read, and previews that are written (PNG, and WebP that
+moves).
 
 Pillow is an extra: each function that needs it imports it.
 """
@@ -27,18 +28,25 @@ Pictures = npt.NDArray[np.uint8]
 
 
 class UnfitPictureError(ValueError):
-    """A file is no picture that a cloth can be printed with; the message has the rule and what was found."""
+    """A file is no picture that a cloth can be printed with.
+
+    The message has the rule and what was found.
+    """
 
 
 def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
-    """Return a picture file as 8-bit sRGB, shape (side, side, 3), row 0 on top; raise UnfitPictureError.
+    """Return a picture file as 8-bit sRGB, shape (side, side, 3), row 0 on top.
+
+    Raise UnfitPictureError.
 
     Sizes are looked at before anything is decoded, so that a small file cannot ask for much memory.
     """
     from PIL import Image, ImageOps
 
     if len(data) > MAX_BYTES:
-        raise UnfitPictureError(f"a texture must have at most {MAX_BYTES} bytes, and it has {len(data)}")
+        raise UnfitPictureError(
+            f"a texture must have at most {MAX_BYTES} bytes, and it has {len(data)}"
+        )
     low, high = SIDES
     try:
         with warnings.catch_warnings():
@@ -54,8 +62,12 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
                 f"a texture must be one picture in grey or colour with 8 bits a channel, and its mode is {picture.mode}"
                 + (", animated" if getattr(picture, "is_animated", False) else "")
             )
-        if picture.format == "PNG" and data[24] > 8:  # Pillow would cut the lower bits of RGB off without a word
-            raise UnfitPictureError(f"a texture must have at most 8 bits a channel, and it has {data[24]}")
+        if (
+            picture.format == "PNG" and data[24] > 8
+        ):  # Pillow would cut the lower bits of RGB off without a word
+            raise UnfitPictureError(
+                f"a texture must have at most 8 bits a channel, and it has {data[24]}"
+            )
         upright = ImageOps.exif_transpose(picture)
         if upright.mode in ("RGBA", "LA") or "transparency" in upright.info:
             upright = upright.convert("RGBA")
@@ -65,7 +77,9 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
     except UnfitPictureError:
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UnfitPictureError(f"a texture must be a whole PNG or JPEG file: {error}"[:300]) from error
+        raise UnfitPictureError(
+            f"a texture must be a whole PNG or JPEG file: {error}"[:300]
+        ) from error
 
 
 def png(picture: Pictures) -> bytes:
@@ -78,7 +92,8 @@ def png(picture: Pictures) -> bytes:
 
 
 def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) -> bytes:
-    """Return pictures (n, height, width, 3) as an animated WebP that repeats forever, 120 ms a picture.
+    """Return pictures (n, height, width, 3) as an animated WebP that repeats forever, 120 ms a
+    picture.
 
     With `side`, pictures are reduced to that width [px].
     """
@@ -87,13 +102,22 @@ def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) ->
     frames = [_reduced(picture, (width, height)) for picture in pictures]
     file = io.BytesIO()
     frames[0].save(
-        file, format="WEBP", save_all=True, append_images=frames[1:], duration=120, loop=0, quality=quality, method=2
+        file,
+        format="WEBP",
+        save_all=True,
+        append_images=frames[1:],
+        duration=120,
+        loop=0,
+        quality=quality,
+        method=2,
     )
     return file.getvalue()
 
 
 def labelled(pictures: Pictures, text: str, side: int) -> Pictures:
-    """Return pictures (n, height, width, 3) reduced to squares of `side` pixels, with a text above them."""
+    """Return pictures (n, height, width, 3) reduced to squares of `side` pixels, with a text above
+    them.
+    """
     from PIL import Image, ImageDraw
 
     small = [np.asarray(_reduced(picture, (side, side))) for picture in pictures]
@@ -112,8 +136,14 @@ def _reduced(picture: Pictures, size: tuple[int, int]) -> "Image.Image":
 
 
 def sheet(tiles: Sequence[Pictures], columns: int) -> Pictures:
-    """Arrange pictures (n, height, width, 3), all of one shape, in rows; the last row is filled with white."""
+    """Arrange pictures (n, height, width, 3), all of one shape, in rows.
+
+    The last row is filled with white.
+    """
     columns = min(columns, len(tiles))
     filled = [*tiles, *[np.full_like(tiles[0], 255)] * (-len(tiles) % columns)]
-    rows = [np.concatenate(filled[first : first + columns], axis=2) for first in range(0, len(filled), columns)]
+    rows = [
+        np.concatenate(filled[first : first + columns], axis=2)
+        for first in range(0, len(filled), columns)
+    ]
     return np.concatenate(rows, axis=1)

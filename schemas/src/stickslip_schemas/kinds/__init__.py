@@ -15,7 +15,9 @@ def _spec_type(kind: str) -> type[JobSpec]:
     (found,) = (
         value
         for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, JobSpec) and value.__module__ == module.__name__
+        if isinstance(value, type)
+        and issubclass(value, JobSpec)
+        and value.__module__ == module.__name__
     )
     return found
 
@@ -32,7 +34,9 @@ if TYPE_CHECKING:  # checkers know what all kinds have in common
 else:
     _BY_KIND = Field(discriminator="kind")
     AnyJobSpec = Annotated[Union[tuple(KINDS.values())], _BY_KIND]  # noqa: UP007
-    AnySimulation = Annotated[Union[tuple(spec.simulation_type for spec in KINDS.values())], _BY_KIND]  # noqa: UP007
+    AnySimulation = Annotated[
+        Union[tuple(spec.simulation_type for spec in KINDS.values())], _BY_KIND
+    ]  # noqa: UP007
     AnyRender = Annotated[Union[tuple(spec.render_type for spec in KINDS.values())], _BY_KIND]  # noqa: UP007
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
@@ -46,7 +50,9 @@ class UnknownKindError(ValueError):
 def registered(spec: JobSpec) -> JobSpec:
     """Return a spec as it is if its class is that of its kind; raise UnknownKindError."""
     if KINDS.get(spec.kind) is not type(spec):
-        raise UnknownKindError(f"kind must be one of {', '.join(KINDS)}; got {spec.kind!r} of {type(spec).__name__}")
+        raise UnknownKindError(
+            f"kind must be one of {', '.join(KINDS)}; got {spec.kind!r} of {type(spec).__name__}"
+        )
     return spec
 
 

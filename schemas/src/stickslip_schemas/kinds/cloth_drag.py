@@ -1,4 +1,6 @@
-"""A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3], seen by the rig `drag`."""
+"""A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3], seen by the rig
+`drag`.
+"""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
@@ -6,7 +8,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from stickslip_schemas.base import Document, Float, Int, Sha256, Stage
-from stickslip_schemas.kinds.cloth.arrays import clip_arrays, codes, fabric_arrays, over_time, solver_arrays
+from stickslip_schemas.kinds.cloth.arrays import (
+    clip_arrays,
+    codes,
+    fabric_arrays,
+    over_time,
+    solver_arrays,
+)
 from stickslip_schemas.kinds.cloth.spec import (
     VIEWPOINT,
     ClipRender,
@@ -18,7 +26,16 @@ from stickslip_schemas.kinds.cloth.spec import (
     definitions,
 )
 from stickslip_schemas.spec.arrays import ArrayLayout, array
-from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.axes import (
+    SHORTHAND,
+    TAGGED,
+    LinspaceAxis,
+    ListAxis,
+    RandomAxis,
+    Seed,
+    SobolAxis,
+    quantity,
+)
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, SeedRule, Simulation
 from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, name_schema
@@ -27,40 +44,63 @@ RIG = "drag"
 """The cameras; their names are those of the viewpoints."""
 
 SELF_FRICTION = 0.5
-"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011] measured none; this is the
-middle of the two, of cloth on cloth, with which the thesis simulates shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
+"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011]
+measured none; this is the middle of the two, of cloth on cloth, with which the thesis simulates
+shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
 VIEWPOINTS = tuple(camera.name for camera in load_rig(RIG))
-"""The first is calibrated on the real stage. The last twelve, to test with, are it, turned about what it looks at by 5,
-10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes of the label `viewpoint`."""
+"""The first is calibrated on the real stage. The last twelve, to test with, are it, turned about
+what it looks at by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes
+of the label `viewpoint`."""
 
-Mu = Annotated[float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")]
+Mu = Annotated[
+    float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")
+]
 Factor = Annotated[
-    float, quantity("Factor"), Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric")
+    float,
+    quantity("Factor"),
+    Field(strict=True, ge=0.1, le=10, description="multiplies the number of the fabric"),
 ]
-MuAxis = Annotated[ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], TAGGED, SHORTHAND]
+MuAxis = Annotated[
+    ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], TAGGED, SHORTHAND
+]
 FactorAxis = Annotated[
-    ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor], TAGGED, SHORTHAND
+    ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor],
+    TAGGED,
+    SHORTHAND,
 ]
-MaterialAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND]
+MaterialAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND
+]
 ViewpointAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(VIEWPOINTS)]], SHORTHAND, VIEWPOINT
+    ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(VIEWPOINTS)]],
+    SHORTHAND,
+    VIEWPOINT,
 ]
 
 
 class ClothDragAxes(Document):
     """What a clip of dragged cloth depends on."""
 
-    material: MaterialAxis = Field(description="a measured fabric, or a custom one under `materials`")
+    material: MaterialAxis = Field(
+        description="a measured fabric, or a custom one under `materials`"
+    )
     mu: MuAxis = Field(description="friction coefficient between cloth and floor")
-    density: FactorAxis | None = Field(default=None, description="factor of the fabric's mass per area")
-    bending: FactorAxis | None = Field(default=None, description="factor of the fabric's bending rigidity")
-    stretching: FactorAxis | None = Field(default=None, description="factor of the fabric's stretching stiffness")
+    density: FactorAxis | None = Field(
+        default=None, description="factor of the fabric's mass per area"
+    )
+    bending: FactorAxis | None = Field(
+        default=None, description="factor of the fabric's bending rigidity"
+    )
+    stretching: FactorAxis | None = Field(
+        default=None, description="factor of the fabric's stretching stiffness"
+    )
     texture: TextureAxis
     viewpoint: ViewpointAxis
     lighting: LampAxis = None
     substrate: SubstrateAxis | None = Field(
-        default=None, description="finish of the floor, or a custom one under `substrates`; by default `matt`"
+        default=None,
+        description="finish of the floor, or a custom one under `substrates`; by default `matt`",
     )
 
 
@@ -73,7 +113,9 @@ class ClothDragSimulation(Simulation):
 
     kind: Literal["cloth_drag"] = "cloth_drag"
     material: str
-    fabric: FabricNumbers | None = Field(description="numbers of a custom material; null: a measured one")
+    fabric: FabricNumbers | None = Field(
+        description="numbers of a custom material; null: a measured one"
+    )
     density: float = 1.0
     bending: float = 1.0
     stretching: float = 1.0
@@ -122,7 +164,9 @@ class ClothDragSpec(ClipSpec):
     preset: PresetName = Field(
         default=PresetName.certified,
         description="named solver settings",
-        json_schema_extra={"x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"},
+        json_schema_extra={
+            "x-cost": "`certified` and `fast` have certificates; `fine` takes shorter steps"
+        },
     )
     mesh: Int = Field(
         default=41,
@@ -153,12 +197,17 @@ class ClothDragSpec(ClipSpec):
 
     @property
     def usual_costs(self) -> Costs:
-        """Usual CPU times; a drag takes 8 s at mesh 21, as vertices^1.15, and by fabric 0.3 to 3 times as much."""
+        """Usual CPU times.
+
+        A drag takes 8 s at mesh 21, as vertices^1.15, and by fabric 0.3 to 3 times as much.
+        """
         preset = {PresetName.fast: 0.7, PresetName.fine: 1.7}.get(self.preset, 1.0)
         return self.clip_costs(8.0 * preset * (self.mesh / 21) ** 2.3, unsure=3.0)
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and preset, or the clip."""
+        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and
+        preset, or the clip.
+        """
         if stage is Stage.render:
             return super().cost_group(stage, point)
         group = f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
@@ -175,16 +224,34 @@ class ClothDragSpec(ClipSpec):
         return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        about = {name: field.description or "" for name, field in ClothDragAxes.model_fields.items()}
+        about = {
+            name: field.description or "" for name, field in ClothDragAxes.model_fields.items()
+        }
         return (
             *clip_arrays(self),
             codes("material", self.names("material")),
             array("mu", "friction coefficient"),
-            *(array(name, about[name]) for name in ("density", "bending", "stretching") if name in self.named_axes),
+            *(
+                array(name, about[name])
+                for name in ("density", "bending", "stretching")
+                if name in self.named_axes
+            ),
             *fabric_arrays(),
-            array("bias_side", "side to which gravity leaned during the drop, +1 or -1 along x", "int8", fill=0),
-            array("landed_side", "side of the holders on which the cloth landed, +1 or -1 along x", "int8", fill=0),
-            array("bias", "what broke the symmetry: horizontal over vertical gravity during the drop"),
+            array(
+                "bias_side",
+                "side to which gravity leaned during the drop, +1 or -1 along x",
+                "int8",
+                fill=0,
+            ),
+            array(
+                "landed_side",
+                "side of the holders on which the cloth landed, +1 or -1 along x",
+                "int8",
+                fill=0,
+            ),
+            array(
+                "bias", "what broke the symmetry: horizontal over vertical gravity during the drop"
+            ),
             *solver_arrays(self),
             over_time(self, "contact_force", "force of the floor on the cloth [N]", of={"xyz": 3}),
             over_time(self, "holder_force", "force of the holders on the cloth [N]", of={"xyz": 3}),
@@ -195,13 +262,27 @@ class ClothDragSpec(ClipSpec):
 def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
     """Return the mesh and its motion.
 
-    Rest shape and triangles are the same for all samples of a dataset, and every sample has them all the same: a
-    repeated row costs some bytes, an array without the dimension `sample` would be an exception in every reader.
+    Rest shape and triangles are the same for all samples of a dataset, and every sample has them
+    all the same: a repeated row costs some bytes, an array without the dimension `sample` would be
+    an exception in every reader.
     """
     vertex, corners = {"vertex": spec.mesh**2}, {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
     positions = "positions of the vertices [m]; the floor is z = 0"
     return (
-        over_time(spec, "positions", positions, of=vertex | {"xyz": 3}, per_sample=True, is_trajectory=True),
-        array("rest", "the flat cloth (warp, weft) [m]", "float32", vertex | {"uv": 2}, is_recorded=True),
+        over_time(
+            spec,
+            "positions",
+            positions,
+            of=vertex | {"xyz": 3},
+            per_sample=True,
+            is_trajectory=True,
+        ),
+        array(
+            "rest",
+            "the flat cloth (warp, weft) [m]",
+            "float32",
+            vertex | {"uv": 2},
+            is_recorded=True,
+        ),
         array("triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
     )

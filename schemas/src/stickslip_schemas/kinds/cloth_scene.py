@@ -20,11 +20,31 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from stickslip_schemas.base import Document, Sha256, Stage, referred
-from stickslip_schemas.kinds.cloth.arrays import clip_arrays, parameter_label, scene_arrays, scene_segments
-from stickslip_schemas.kinds.cloth.spec import VIEWPOINT, ClipRender, ClipSpec, LampAxis, SubstrateAxis, TextureAxis
+from stickslip_schemas.kinds.cloth.arrays import (
+    clip_arrays,
+    parameter_label,
+    scene_arrays,
+    scene_segments,
+)
+from stickslip_schemas.kinds.cloth.spec import (
+    VIEWPOINT,
+    ClipRender,
+    ClipSpec,
+    LampAxis,
+    SubstrateAxis,
+    TextureAxis,
+)
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
-from stickslip_schemas.scene.parameters import LOOKS_AXES, ParameterName, Value, found, refuse, refuse_as, with_values
+from stickslip_schemas.scene.parameters import (
+    LOOKS_AXES,
+    ParameterName,
+    Value,
+    found,
+    refuse,
+    refuse_as,
+    with_values,
+)
 from stickslip_schemas.scene.parts import MeshBody
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.spec.axes import (
@@ -49,15 +69,22 @@ OF_SCENE = "scene"
 Number = Annotated[float, quantity("Number"), Field(strict=True)]
 Choice = Annotated[Value, quantity("Value")]
 ParameterAxis = Annotated[
-    ListAxis[Choice] | LinspaceAxis[Number] | RandomAxis[Number] | SobolAxis[Number], TAGGED, SHORTHAND
+    ListAxis[Choice] | LinspaceAxis[Number] | RandomAxis[Number] | SobolAxis[Number],
+    TAGGED,
+    SHORTHAND,
 ]
 
 
 class _BuiltIn(BeforeValidator):
     """Accepts the name of a built-in scene, in validation and in the JSON schema."""
 
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        document, name = handler(core), {"type": "string", "description": "the name of a built-in scene"}
+    def __get_pydantic_json_schema__(
+        self, core: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        document, name = (
+            handler(core),
+            {"type": "string", "description": "the name of a built-in scene"},
+        )
         return document if handler.mode == "serialization" else {"anyOf": [name, document]}
 
 
@@ -71,7 +98,8 @@ class ClothSceneAxes(Document):
     viewpoint: Annotated[ListAxis[Annotated[CustomName, quantity("Camera")]], SHORTHAND, VIEWPOINT]
     lighting: LampAxis = None
     substrate: SubstrateAxis | None = Field(
-        default=None, description="finish of the floor, or a custom one under `substrates`; by default the scene's"
+        default=None,
+        description="finish of the floor, or a custom one under `substrates`; by default the scene's",
     )
 
 
@@ -100,7 +128,9 @@ class ClothSceneRender(ClipRender):
     """How a scene is seen."""
 
     kind: Literal["cloth_scene"] = "cloth_scene"
-    rig: str | None = Field(default=None, description="null: `camera`, or one that frames all that moves")
+    rig: str | None = Field(
+        default=None, description="null: `camera`, or one that frames all that moves"
+    )
     rig_digest: Sha256 | None = None
     scene: Staged
 
@@ -115,7 +145,11 @@ class ClothSceneRender(ClipRender):
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:
-        return tuple(filter(None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")))
+        return tuple(
+            filter(
+                None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")
+            )
+        )
 
 
 class ClothSceneSpec(ClipSpec):
@@ -127,17 +161,21 @@ class ClothSceneSpec(ClipSpec):
     render_seeds = (SeedRule("light_seed", "light", None), SeedRule("crease_seed", "creases", None))
 
     kind: Literal["cloth_scene"]
-    scene: Annotated[Scene, _BuiltIn(lambda scene: load_scene(scene) if isinstance(scene, str) else scene)] = Field(
-        description="the name of a built-in scene, or the document of a scene"
-    )
+    scene: Annotated[
+        Scene, _BuiltIn(lambda scene: load_scene(scene) if isinstance(scene, str) else scene)
+    ] = Field(description="the name of a built-in scene, or the document of a scene")
     set: dict[str, JsonValue] = Field(
-        default_factory=dict, max_length=64, description="other values of the scene for all samples, by path"
+        default_factory=dict,
+        max_length=64,
+        description="other values of the scene for all samples, by path",
     )
     axes: ClothSceneAxes
 
     @field_validator("set")
     @classmethod
-    def _can_be_set(cls, values: dict[str, JsonValue], info: ValidationInfo) -> dict[str, JsonValue]:
+    def _can_be_set(
+        cls, values: dict[str, JsonValue], info: ValidationInfo
+    ) -> dict[str, JsonValue]:
         if isinstance(scene := info.data.get("scene"), Scene):
             for path, value in values.items():
                 try:
@@ -153,20 +191,27 @@ class ClothSceneSpec(ClipSpec):
         for name, axis in (self.axes.__pydantic_extra__ or {}).items():
             known = self.stage.parameters
             if name not in known:
-                rule = f"must be one of {', '.join((*known, *LOOKS_AXES))}{did_you_mean(name, known)}"
+                rule = (
+                    f"must be one of {', '.join((*known, *LOOKS_AXES))}{did_you_mean(name, known)}"
+                )
                 refuse(self, ("axes", name), rule, name)
             for place, value in extremes(axis):
                 if not known[name].allows(value):
-                    refuse(self, ("axes", name, *place), f"must be within {known[name].range}", value)
+                    refuse(
+                        self, ("axes", name, *place), f"must be within {known[name].range}", value
+                    )
         for corner in self._corners():
             try:
-                self.stage.checked({place: v for name, v in corner.items() for place in self.stage.places(name)})
+                self.stage.checked(
+                    {place: v for name, v in corner.items() for place in self.stage.places(name)}
+                )
             except ValidationError as error:
                 refuse_as(error, self.stage, ("axes",), corner)
         return self
 
     def _corners(self) -> Iterator[dict[str, Any]]:
-        """Yield points that stand for all others: names, and ends of numbers, one by one and two together.
+        """Yield points that stand for all others: names, and ends of numbers, one by one and two
+        together.
 
         Rules between two numbers are linear, so what holds at all ends holds between them.
         """
@@ -183,7 +228,9 @@ class ClothSceneSpec(ClipSpec):
     def stage(self) -> Scene:
         """The scene with the values of `set`."""
         document = self.scene.model_dump(mode="json")
-        return Scene.model_validate(with_values(document, {found(document, path): v for path, v in self.set.items()}))
+        return Scene.model_validate(
+            with_values(document, {found(document, path): v for path, v in self.set.items()})
+        )
 
     @cached_property
     def _places(self) -> dict[str, tuple[str, ...]]:
@@ -195,15 +242,25 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
-        """The axes by name: all parameters of the scene, then looks. A parameter without an axis has its default."""
+        """The axes by name: all parameters of the scene, then looks.
+
+        A parameter without an axis has its default.
+        """
         given = self.axes.__pydantic_extra__ or {}
-        default = {name: self.stage.default(name) for name in self.stage.parameters if name not in given}
-        unvaried = {name: ListAxis[Any](type="list", values=(value,)) for name, value in default.items()}
+        default = {
+            name: self.stage.default(name) for name in self.stage.parameters if name not in given
+        }
+        unvaried = {
+            name: ListAxis[Any](type="list", values=(value,)) for name, value in default.items()
+        }
         if self.combine == "zip":
             unvaried = {}
         parameters: dict[str, AnyAxis] = {**given, **unvaried}
         looks = {name: getattr(self.axes, name) for name in LOOKS_AXES}
-        return {**dict(sorted(parameters.items())), **{name: axis for name, axis in looks.items() if axis is not None}}
+        return {
+            **dict(sorted(parameters.items())),
+            **{name: axis for name, axis in looks.items() if axis is not None},
+        }
 
     @property
     def instants(self) -> int:  # type: ignore[override]
@@ -222,11 +279,15 @@ class ClothSceneSpec(ClipSpec):
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         return (
-            dict.fromkeys(self._places[axis], value) if axis in self._places else super().document_fields(axis, value)
+            dict.fromkeys(self._places[axis], value)
+            if axis in self._places
+            else super().document_fields(axis, value)
         )
 
     def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
-        """Return the axes whose values enter a seed: parameters, and for light all that does not share a shading."""
+        """Return the axes whose values enter a seed: parameters, and for light all that does not
+        share a shading.
+        """
         left_out = ("texture",) if rule.purpose == "light" else LOOKS_AXES
         return tuple(axis for axis in self.named_axes if axis not in left_out)
 
@@ -236,7 +297,9 @@ class ClothSceneSpec(ClipSpec):
     def render_settings(self) -> dict[str, Any] | None:
         looks = self.stage.looks
         of_rig = (
-            {"rig": looks.cameras, "rig_digest": rig_digest(looks.cameras)} if isinstance(looks.cameras, str) else {}
+            {"rig": looks.cameras, "rig_digest": rig_digest(looks.cameras)}
+            if isinstance(looks.cameras, str)
+            else {}
         )
         light = {"lamp": looks.light} if isinstance(looks.light, LampNumbers) else {}
         floor = {"finish": looks.floor} if isinstance(looks.floor, FloorNumbers) else {}
@@ -261,25 +324,39 @@ class ClothSceneSpec(ClipSpec):
         }
 
     def built_in(self, axis: str) -> tuple[str, ...]:
-        """Return the names that an axis may use without a definition in the spec: those of the scene, too."""
+        """Return the names that an axis may use without a definition in the spec: those of the
+        scene, too.
+        """
         cameras = self.stage.looks.cameras
         if axis == "viewpoint" and not isinstance(cameras, dict):
-            return tuple(FRAMING if cameras is None else (camera.name for camera in load_rig(cameras)))
+            return tuple(
+                FRAMING if cameras is None else (camera.name for camera in load_rig(cameras))
+            )
         return (*super().built_in(axis), *self._own.get(axis, {}))
 
     def meaning(self, axis: str, name: str) -> Any:
         return super().meaning(axis, name) or self._own.get(axis, {}).get(name)
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras by name, but for those that frame what moves: each sample has its own of them."""
+        """Return the cameras by name, but for those that frame what moves: each sample has its own
+        of them.
+        """
         given = self.stage.looks.cameras
         rig = load_rig(given) if isinstance(given, str) else ()
-        return (*rig, *(view.camera(name) for name, view in {**self._own["viewpoint"], **self.viewpoints}.items()))
+        return (
+            *rig,
+            *(
+                view.camera(name)
+                for name, view in {**self._own["viewpoint"], **self.viewpoints}.items()
+            ),
+        )
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
         files = ((place, referred(name)) for place, name in self.scene.files())
-        return {"/".join(("/scene", *map(str, place))): digest for place, digest in files if digest} | super().artifacts
+        return {
+            "/".join(("/scene", *map(str, place))): digest for place, digest in files if digest
+        } | super().artifacts
 
     @property
     def certified_preset(self) -> str:
@@ -294,8 +371,14 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def usual_costs(self) -> Costs:
-        """Usual CPU times; cloth that rests costs a tenth of the middle, and cloth in full swing ten times as much."""
-        vertices, length = sum(sheet.mesh.shape[0] for sheet in self.stage.sheets.values()), self.stage.frames
+        """Usual CPU times.
+
+        Cloth that rests costs a tenth of the middle, and cloth in full swing ten times as much.
+        """
+        vertices, length = (
+            sum(sheet.mesh.shape[0] for sheet in self.stage.sheets.values()),
+            self.stage.frames,
+        )
         seconds = 1e-4 * vertices**1.37 * length / self.stage.frame_rate
         return self.clip_costs(seconds, unsure=10.0)
 
@@ -304,12 +387,21 @@ class ClothSceneSpec(ClipSpec):
         return self.stage.digest[:12]
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: the scene, names of fabrics, and numbers to one digit."""
+        """Return what the cost of a sample hangs on: the scene, names of fabrics, and numbers to
+        one digit.
+        """
         if stage is Stage.render:
             return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
-        shown = (f"{v:.1g}" if isinstance(v, float) else str(v) for v in (point.get(name) for name in self._places))
+        shown = (
+            f"{v:.1g}" if isinstance(v, float) else str(v)
+            for v in (point.get(name) for name in self._places)
+        )
         return ", ".join((self._cost_of_scene, *shown))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        labels = (parameter_label(self.stage, name) for name in self.stage.parameters if name in self.named_axes)
+        labels = (
+            parameter_label(self.stage, name)
+            for name in self.stage.parameters
+            if name in self.named_axes
+        )
         return (*clip_arrays(self), *labels, *scene_arrays(self, self.stage))

@@ -6,7 +6,16 @@ from pydantic import Field
 
 from stickslip_schemas.base import Document, Float, Sha256
 from stickslip_schemas.spec.arrays import ArrayLayout, array
-from stickslip_schemas.spec.axes import SHORTHAND, TAGGED, LinspaceAxis, ListAxis, RandomAxis, Seed, SobolAxis, quantity
+from stickslip_schemas.spec.axes import (
+    SHORTHAND,
+    TAGGED,
+    LinspaceAxis,
+    ListAxis,
+    RandomAxis,
+    Seed,
+    SobolAxis,
+    quantity,
+)
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
 from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render, SeedRule, Simulation
 
@@ -14,14 +23,22 @@ ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
 
 Gamma = Annotated[
-    float, quantity("Gamma"), Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness")
+    float,
+    quantity("Gamma"),
+    Field(strict=True, ge=0, le=1e5, description="weight over bending stiffness"),
 ]
 Phi = Annotated[
-    float, quantity("Phi"), Field(strict=True, ge=-40, le=40, description="an angle over the length of the rod [rad]")
+    float,
+    quantity("Phi"),
+    Field(strict=True, ge=-40, le=40, description="an angle over the length of the rod [rad]"),
 ]
 
-GammaAxis = Annotated[ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], TAGGED, SHORTHAND]
-PhiAxis = Annotated[ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], TAGGED, SHORTHAND]
+GammaAxis = Annotated[
+    ListAxis[Gamma] | LinspaceAxis[Gamma] | RandomAxis[Gamma] | SobolAxis[Gamma], TAGGED, SHORTHAND
+]
+PhiAxis = Annotated[
+    ListAxis[Phi] | LinspaceAxis[Phi] | RandomAxis[Phi] | SobolAxis[Phi], TAGGED, SHORTHAND
+]
 
 
 class RodHangAxes(Document):
@@ -63,12 +80,18 @@ class RodHangSpec(JobSpec):
 
     kind: Literal["rod_hang"]
     axes: RodHangAxes
-    poisson: Float = Field(default=0.5, gt=-1, le=0.5, description="Poisson's ratio nu; GJ/EI = 1/(1 + nu)")
-    views: Literal["rod-4"] | None = Field(default="rod-4", description="camera rig; null renders nothing")
+    poisson: Float = Field(
+        default=0.5, gt=-1, le=0.5, description="Poisson's ratio nu; GJ/EI = 1/(1 + nu)"
+    )
+    views: Literal["rod-4"] | None = Field(
+        default="rod-4", description="camera rig; null renders nothing"
+    )
     quality: Quality = Field(
         default=Quality.standard,
         description="quality of the pictures",
-        json_schema_extra={"x-cost": "CPU time of a view: preview 19 ms, draft 31 ms, standard 66 ms, high 240 ms"},
+        json_schema_extra={
+            "x-cost": "CPU time of a view: preview 19 ms, draft 31 ms, standard 66 ms, high 240 ms"
+        },
     )
 
     @property
@@ -77,7 +100,9 @@ class RodHangSpec(JobSpec):
 
     @property
     def needs_certificate(self) -> bool:
-        """Rods are made without a certificate, too: every shape is checked against its own equations."""
+        """Rods are made without a certificate, too: every shape is checked against its own
+        equations.
+        """
         return False
 
     def simulation_settings(self) -> dict[str, Any]:
@@ -108,17 +133,25 @@ class RodHangSpec(JobSpec):
             array("views", "sRGB pictures", "uint8", pixels, per_sample=True),
             array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
         )
-        distance = (
-            "least distance over L at which the centreline passes another part of itself; infinite where it does not"
-        )
+        distance = "least distance over L at which the centreline passes another part of itself; infinite where it does not"
         return (
-            *(array(name, text, "float32", points | of, is_recorded=True) for name, of, text in curves),
+            *(
+                array(name, text, "float32", points | of, is_recorded=True)
+                for name, of, text in curves
+            ),
             *(() if self.views is None else seen),
             array("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
             array("phi0", "natural twist times L [rad]"),
             array("phi1", "natural curvature times L [rad]"),
             array("energy", "elastic and gravity energy over EI/L"),
-            array("multistable", "another stable shape of the same rod was found", "bool", is_recorded=True),
+            array(
+                "multistable",
+                "another stable shape of the same rod was found",
+                "bool",
+                is_recorded=True,
+            ),
             array("self_contact_distance", distance, is_recorded=True),
-            array("reach", "largest distance over L from the vertical of the clamp", is_recorded=True),
+            array(
+                "reach", "largest distance over L from the vertical of the clamp", is_recorded=True
+            ),
         )

@@ -1,7 +1,8 @@
-"""Builds: digests of the code that makes data, over the modules that a stage imports, found by reading their sources.
+"""Builds: digests of the code that makes data, over the modules that a stage imports, found by
+reading their sources.
 
-A build is part of every content key. So a change of a file that a result depends on changes its key,
-and a change of any other file does not. Four rules say what is followed:
+A build is part of every content key. So a change of a file that a result depends on changes its
+key, and a change of any other file does not. Four rules say what is followed:
 
 - An import counts wherever it stands, also inside a function; `if TYPE_CHECKING:` does not count.
 - A name that a package's `__init__` only passes on leads to the module that defines it.
@@ -19,10 +20,12 @@ from stickslip_schemas.base import Document, Sha256, Stage, content_key, sha256
 
 
 class Builds(Document):
-    """Build digests of one kind; tasks are leased only to workers of the builds they were planned for.
+    """Build digests of one kind.
 
-    Each digest is over the files that the work of that stage imports, over compilers, libraries and settings, so equal
-    digests mean equal results.
+    Tasks are leased only to workers of the builds they were planned for.
+
+    Each digest is over the files that the work of that stage imports, over compilers, libraries and
+    settings, so equal digests mean equal results.
     """
 
     sim_core: Sha256
@@ -45,18 +48,20 @@ class Builds(Document):
 
 
 UNCOUNTED = ("stickslip_schemas.kinds", "stickslip_schemas.store", "stickslip_schemas.store.*")
-"""What builds cut. The list of kinds decides on nothing by itself, and it would make every build depend on every kind.
-The documents that it leads to are in the content keys as a whole. A store gives the bytes that a digest names, or
-none: no result depends on how."""
+"""What builds cut. The list of kinds decides on nothing by itself, and it would make every build
+depend on every kind. The documents that it leads to are in the content keys as a whole. A store
+gives the bytes that a digest names, or none: no result depends on how."""
 
 OURS = "stickslip_"
 """How the names of our packages begin."""
 
 
 def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Path]:
-    """Return the files that the modules `roots` are made of, by their paths below the folders of our packages.
+    """Return the files that the modules `roots` are made of, by their paths below the folders of
+    our packages.
 
-    Modules in `cut` are left out; `package.*` stands for all that is below a package. Raises ModuleNotFoundError.
+    Modules in `cut` are left out; `package.*` stands for all that is below a package. Raises
+    ModuleNotFoundError.
     """
     found: dict[str, Path] = {}
     waiting, seen = list(roots), set()
@@ -103,13 +108,19 @@ def _package_folder(package: str) -> Path:
 
 def _is_cut(name: str, cut: Collection[str]) -> bool:
     parents = name.split(".")
-    return name in cut or any(".".join([*parents[:length], "*"]) in cut for length in range(1, len(parents)))
+    return name in cut or any(
+        ".".join([*parents[:length], "*"]) in cut for length in range(1, len(parents))
+    )
 
 
 def _data_files(module: Path) -> list[Path]:
     """Return the files beside a module that it names."""
     words = {node.value for node in ast.walk(_parsed(module)) if isinstance(node, ast.Constant)}
-    beside = (file for file in sorted(module.parent.iterdir()) if file.is_file() and file.suffix not in (".py", ".pyi"))
+    beside = (
+        file
+        for file in sorted(module.parent.iterdir())
+        if file.is_file() and file.suffix not in (".py", ".pyi")
+    )
     return [file for file in beside if file.name in words]
 
 
@@ -136,7 +147,9 @@ def _home(module: str, name: str) -> str:
     path = module_file(module)
     if path is None or path.name != "__init__.py":
         return module
-    if (path.parent / name).is_dir() or any((path.parent / f"{name}{end}").is_file() for end in (".py", ".pyi")):
+    if (path.parent / name).is_dir() or any(
+        (path.parent / f"{name}{end}").is_file() for end in (".py", ".pyi")
+    ):
         return f"{module}.{name}"
     for node in _import_nodes(_parsed(path)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(OURS):

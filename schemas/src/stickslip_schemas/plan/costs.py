@@ -1,8 +1,9 @@
 """Numbers of samples and tasks of a spec, and what they cost.
 
-Costs are from tasks that a service has measured or, of other stages, from the records of the package. These were fitted
-to measured jobs of 1 to 768 samples on two shared virtual cores. Another machine, fabric or motion makes them larger or
-smaller: the 80 % intervals say by how much, and are guessed.
+Costs are from tasks that a service has measured or, of other stages, from the records of the
+package. These were fitted to measured jobs of 1 to 768 samples on two shared virtual cores. Another
+machine, fabric or motion makes them larger or smaller: the 80 % intervals say by how much, and are
+guessed.
 """
 
 from collections.abc import Collection, Mapping
@@ -36,7 +37,9 @@ class Counts:
     """Renders that differ in more than the axis of variants."""
     shards: int
     expected_splits: dict[str, int]
-    """Samples by split if each split got exactly its share; splits are drawn, so real numbers differ a little."""
+    """Samples by split if each split got exactly its share; splits are drawn, so real numbers
+    differ a little.
+    """
 
     @property
     def task_count(self) -> int:
@@ -46,8 +49,9 @@ class Counts:
 def count(spec: JobSpec) -> Counts:
     """Return the numbers of `spec`.
 
-    Two samples share a simulation where they agree in all axes that enter its document or its seeds, and a render where
-    they agree in those of the render, too. Time and memory grow with the longest axis, not with the grid.
+    Two samples share a simulation where they agree in all axes that enter its document or its
+    seeds, and a render where they agree in those of the render, too. Time and memory grow with the
+    longest axis, not with the grid.
     """
     physical = _axes_of(spec, spec.simulation_type, spec.simulation_seeds)
     seen = physical | _axes_of(spec, spec.render_type, spec.render_seeds)
@@ -57,9 +61,13 @@ def count(spec: JobSpec) -> Counts:
         sample_count=spec.sample_count,
         simulation_count=_distinct(spec, physical),
         render_count=0 if spec.render_settings() is None else _distinct(spec, seen),
-        shadings=0 if spec.render_settings() is None else _distinct(spec, seen - {spec.variant_axis}),
+        shadings=0
+        if spec.render_settings() is None
+        else _distinct(spec, seen - {spec.variant_axis}),
         shards=ceil(spec.sample_count / spec.samples_per_shard),
-        expected_splits={name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)},
+        expected_splits={
+            name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)
+        },
     )
 
 
@@ -68,14 +76,19 @@ def _axes_of(spec: JobSpec, document: type[Document], seeds: Collection[SeedRule
     entering = {axis for rule in seeds for axis in spec.seed_axes(rule)}
     fields = document.model_fields
     return entering | {
-        a for a in spec.named_axes if any(path.partition("/")[0] in fields for path in spec.fields_of(a))
+        a
+        for a in spec.named_axes
+        if any(path.partition("/")[0] in fields for path in spec.fields_of(a))
     }
 
 
 def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     """Return how many different values some axes take together over the grid."""
-    axes = [(place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names]
-    # A narrow range holds fewer numbers than it may be asked for, and zipped lists may repeat values.
+    axes = [
+        (place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names
+    ]
+    # A narrow range holds fewer numbers than it may be asked for, and zipped lists may repeat
+    # values.
     if spec.combine == "product":
         return prod(len(set(axis_values(axis))) for _, axis in axes)
     import numpy as np  # the extra `arrays`
@@ -84,9 +97,13 @@ def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     for place, axis in axes:
         values = axis_values(axis, dimension=place)
         codes = {value: code for code, value in enumerate(dict.fromkeys(values))}
-        if len(codes) == spec.sample_count:  # zipped axes have one length: this one tells all samples apart
+        if (
+            len(codes) == spec.sample_count
+        ):  # zipped axes have one length: this one tells all samples apart
             return spec.sample_count
-        _, rows = np.unique(rows * len(codes) + [codes[value] for value in values], return_inverse=True)
+        _, rows = np.unique(
+            rows * len(codes) + [codes[value] for value in values], return_inverse=True
+        )
     return int(rows.max()) + 1
 
 
@@ -110,7 +127,9 @@ class Estimate(Document):
     measured: tuple[Stage, ...] = Field(description="stages whose cost this service has measured")
 
 
-def estimated(spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval], slots: int) -> Estimate:
+def estimated(
+    spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval], slots: int
+) -> Estimate:
     """Return what a job costs; `measured` are the CPU times of stages that a service knows [s]."""
     usual = spec.usual_costs
     shaded = usual.start + counts.shadings * usual.shade + counts.render_count * usual.render
@@ -120,10 +139,17 @@ def estimated(spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval],
         Stage.pack: _within(counts.sample_count * PACK_SECONDS, UNSURE),
         Stage.publish: _within(counts.shards * PUBLISH_SECONDS, UNSURE),
     } | dict(measured)
-    totals = {name: sum(getattr(stage, name) for stage in stages.values()) for name in Interval.model_fields}
+    totals = {
+        name: sum(getattr(stage, name) for stage in stages.values())
+        for name in Interval.model_fields
+    }
     wall = Interval(**{name: total / slots for name, total in totals.items()}) if slots else None
     return Estimate(
-        cpu_seconds=Interval(**totals), wall_seconds=wall, slots=slots, stages=stages, measured=tuple(measured)
+        cpu_seconds=Interval(**totals),
+        wall_seconds=wall,
+        slots=slots,
+        stages=stages,
+        measured=tuple(measured),
     )
 
 

@@ -41,7 +41,9 @@ MAX_VERTICES = 100_000
 MAX_DOCUMENT_BYTES = 64 * 2**10
 """Of the document of a scene, as JSON."""
 MAX_TRACK = 2**31 // 12
-"""Vertices times frames of a sheet: a chunk of its positions, in single precision, has at most 2 GiB."""
+"""Vertices times frames of a sheet: a chunk of its positions, in single precision, has at most 2
+GiB.
+"""
 
 Friction = Annotated[Float, Field(ge=0, le=10)]
 
@@ -56,7 +58,9 @@ class Pair(Document):
 class Bias(Document):
     """A push that breaks symmetry: gravity leans by a horizontal share that the seed draws."""
 
-    size: Float = Field(ge=0, le=1, description="most of the horizontal gravity over the vertical, along x and y")
+    size: Float = Field(
+        ge=0, le=1, description="most of the horizontal gravity over the vertical, along x and y"
+    )
     until: Time = Field(description="when it ends [s]")
 
 
@@ -75,12 +79,17 @@ class End(Document):
 
 
 class Physics(Document):
-    """All of a scene that its trajectory depends on, besides a seed and the build. Lengths are in metres, z is up."""
+    """All of a scene that its trajectory depends on, besides a seed and the build.
+
+    Lengths are in metres, z is up.
+    """
 
     format: Literal["stickslip-scene/1"]
     duration: Float | None = Field(default=None, gt=0, le=10_000, description="[s]")
     end: End | None = Field(default=None, description="instead of `duration`")
-    frame_rate: Float = Field(default=30.0, gt=0, le=10_000, description="frames that are kept [1/s]")
+    frame_rate: Float = Field(
+        default=30.0, gt=0, le=10_000, description="frames that are kept [1/s]"
+    )
     gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="[m/s^2]")
     bias: Bias | None = None
     calm: Calm | None = None
@@ -89,12 +98,15 @@ class Physics(Document):
         description="who bears friction between sheets: both, vertices on triangles, or the first sheet's",
     )
     preset: PresetName = Field(default=PresetName.certified, description="named solver settings")
-    materials: Annotated[dict[CustomName, FabricNumbers], BY_NAME] = Field(default_factory=dict, max_length=64)
+    materials: Annotated[dict[CustomName, FabricNumbers], BY_NAME] = Field(
+        default_factory=dict, max_length=64
+    )
     sheets: Annotated[dict[CustomName, Sheet], BY_NAME] = Field(min_length=1, max_length=64)
     bodies: Annotated[dict[CustomName, Body], BY_NAME] = Field(default_factory=dict, max_length=64)
     friction: tuple[Pair, ...] = Field(default=(), description="of each two that may touch")
     default_friction: Friction | None = Field(
-        default=None, description="of pairs that `friction` does not name; null: it must name them all"
+        default=None,
+        description="of pairs that `friction` does not name; null: it must name them all",
     )
 
     @property
@@ -105,10 +117,14 @@ class Physics(Document):
     @property
     def holders(self) -> tuple[tuple[str, str], ...]:
         """Sheet and name of each holder, in the order of arrays."""
-        return tuple((sheet, holder) for sheet, given in self.sheets.items() for holder in given.holders)
+        return tuple(
+            (sheet, holder) for sheet, given in self.sheets.items() for holder in given.holders
+        )
 
     def pairs(self) -> Iterator[tuple[str, str]]:
-        """Yield each two that may touch: sheets with each other and with themselves, and sheets with bodies."""
+        """Yield each two that may touch: sheets with each other and with themselves, and sheets
+        with bodies.
+        """
         for one, other in combinations_with_replacement(self.sheets, 2):
             if one != other or self.sheets[one].self_contact:
                 yield one, other
@@ -130,14 +146,17 @@ class Physics(Document):
             if isinstance(sheet.start, FromFile) and sheet.start.file is not None:
                 yield ("sheets", name, "start", "file"), sheet.start.file
             motions += [
-                (("sheets", name, "holders", key, "motion"), held.motion) for key, held in sheet.holders.items()
+                (("sheets", name, "holders", key, "motion"), held.motion)
+                for key, held in sheet.holders.items()
             ]
         for name, body in self.bodies.items():
             if isinstance(body, MeshBody):
                 yield ("bodies", name, "file"), body.file
             if not isinstance(body, Plane):
                 motions.append((("bodies", name, "motion"), body.motion))
-        yield from (((*place, "path"), motion.path) for place, motion in motions if motion and motion.path)
+        yield from (
+            ((*place, "path"), motion.path) for place, motion in motions if motion and motion.path
+        )
 
     @model_validator(mode="after")
     def _known_materials(self) -> Self:
@@ -155,40 +174,78 @@ class Physics(Document):
     @model_validator(mode="after")
     def _within_bounds(self) -> Self:
         if (self.duration is None) == (self.end is None):
-            refuse(self, ("duration",), "one of duration [s] and end must be given, and not both", self.duration)
+            refuse(
+                self,
+                ("duration",),
+                "one of duration [s] and end must be given, and not both",
+                self.duration,
+            )
         if self.frames > MAX_FRAMES:
             rule = f"length [s] times frame_rate [1/s] must be at most {MAX_FRAMES} frames, and gives {self.frames}"
             refuse(self, ("frame_rate",), rule, self.frame_rate)
         vertices = sum(sheet.mesh.shape[0] for sheet in self.sheets.values())
         if vertices > MAX_VERTICES:
-            refuse(self, ("sheets",), f"must have at most {MAX_VERTICES} vertices together", vertices)
+            refuse(
+                self, ("sheets",), f"must have at most {MAX_VERTICES} vertices together", vertices
+            )
         for name, sheet in self.sheets.items():
             if not sheet.self_contact and len(self.sheets) > 1:
-                refuse(self, ("sheets", name, "self_contact"), "must be true where there are several sheets", False)
+                refuse(
+                    self,
+                    ("sheets", name, "self_contact"),
+                    "must be true where there are several sheets",
+                    False,
+                )
             count = sheet.mesh.shape[0]
             if count * self.frames > MAX_TRACK:
                 rule = f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and {self.frames}"
                 refuse(self, ("sheets", name, "mesh"), rule, count * self.frames)
             for key, held in sheet.holders.items():
                 if count and held.vertices and max(held.vertices) >= count:
-                    place = ("sheets", name, "holders", key, "vertices", held.vertices.index(max(held.vertices)))
-                    refuse(self, place, f"must be a vertex of the sheet, below {count}", max(held.vertices))
+                    place = (
+                        "sheets",
+                        name,
+                        "holders",
+                        key,
+                        "vertices",
+                        held.vertices.index(max(held.vertices)),
+                    )
+                    refuse(
+                        self,
+                        place,
+                        f"must be a vertex of the sheet, below {count}",
+                        max(held.vertices),
+                    )
         return self
 
     @model_validator(mode="after")
     def _friction_of_each_two(self) -> Self:
         if twice := sorted(set(self.sheets) & set(self.bodies)):
-            refuse(self, ("bodies", twice[0]), "sheets and bodies must have names of their own", twice[0])
+            refuse(
+                self,
+                ("bodies", twice[0]),
+                "sheets and bodies must have names of their own",
+                twice[0],
+            )
         there = {frozenset(pair) for pair in self.pairs()}
         named: set[frozenset[str]] = set()
         for place, pair in enumerate(self.friction):
             two = frozenset(pair.between)
             if two not in there:
-                refuse(self, ("friction", place, "between"), "must name two that may touch", list(pair.between))
+                refuse(
+                    self,
+                    ("friction", place, "between"),
+                    "must name two that may touch",
+                    list(pair.between),
+                )
             if two in named:
-                refuse(self, ("friction", place, "between"), "must name two once", list(pair.between))
+                refuse(
+                    self, ("friction", place, "between"), "must name two once", list(pair.between)
+                )
             named.add(two)
-        if self.default_friction is None and (missing := sorted(sorted(two) for two in there - named)):
+        if self.default_friction is None and (
+            missing := sorted(sorted(two) for two in there - named)
+        ):
             rule = "must name each two that may touch where there is no default_friction; missing: "
             refuse(self, ("friction",), f"{rule}{missing[0][0]} with {missing[0][-1]}", None)
         return self
@@ -218,9 +275,19 @@ class Staged(Physics):
             for name in getattr(self.looks, what):
                 if name not in there:
                     hint = did_you_mean(name, there)
-                    refuse(self, ("looks", what, name), f"must be one of {', '.join(there) or 'none'}{hint}", name)
+                    refuse(
+                        self,
+                        ("looks", what, name),
+                        f"must be one of {', '.join(there) or 'none'}{hint}",
+                        name,
+                    )
         if len(self.looks.sheets) == len(self.sheets):
-            refuse(self, ("looks", "sheets"), "must leave one sheet to the axis texture", list(self.looks.sheets))
+            refuse(
+                self,
+                ("looks", "sheets"),
+                "must leave one sheet to the axis texture",
+                list(self.looks.sheets),
+            )
         return self
 
 
@@ -230,7 +297,9 @@ class Scene(Staged):
     name: CustomName | None = Field(default=None, description="of the scene, for people")
     description: str = Field(default="", max_length=2000, description="for people")
     parameters: Annotated[dict[ParameterName, Parameter], BY_NAME] = Field(
-        default_factory=dict, max_length=32, description="what may vary, by the name of its axis and label"
+        default_factory=dict,
+        max_length=32,
+        description="what may vary, by the name of its axis and label",
     )
 
     @property

@@ -22,7 +22,9 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no word", key_node.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is no word", key_node.start_mark
+                )
             if key in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key {key!r} is there twice", key_node.start_mark
@@ -32,7 +34,9 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
 )
 
 
@@ -59,13 +63,20 @@ def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
 
 
 def load_scene(name: str) -> Scene:
-    """Return a built-in scene, whose files are references to artifacts; raise ValueError for an unknown name."""
+    """Return a built-in scene, whose files are references to artifacts.
+
+    Raise ValueError for an unknown name.
+    """
     if name not in scene_names():
-        raise ValueError(f"must be one of {', '.join(scene_names())}, or a scene{did_you_mean(name, scene_names())}")
+        raise ValueError(
+            f"must be one of {', '.join(scene_names())}, or a scene{did_you_mean(name, scene_names())}"
+        )
     return _loaded(name)[0]
 
 
 @cache
 def built_in_files() -> dict[str, bytes]:
-    """Return the files that built-in scenes name, by digest: a coordinator stores them when a job needs them."""
+    """Return the files that built-in scenes name, by digest: a coordinator stores them when a job
+    needs them.
+    """
     return {digest: data for name in scene_names() for digest, data in _loaded(name)[1].items()}

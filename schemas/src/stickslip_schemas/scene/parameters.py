@@ -30,18 +30,34 @@ class Parameter(Document):
     The document itself has the default at these places.
     """
 
-    unit: Annotated[str, StringConstraints(max_length=32)] = Field(default="1", description="of the numbers")
+    unit: Annotated[str, StringConstraints(max_length=32)] = Field(
+        default="1", description="of the numbers"
+    )
     low: Float | None = Field(default=None, description="least number that it may be")
     high: Float | None = Field(default=None, description="largest number that it may be")
-    values: tuple[Value, ...] | None = Field(default=None, min_length=1, description="all that it may be")
-    sets: tuple[Annotated[str, Field(min_length=1, max_length=300)], ...] = Field(min_length=1, max_length=64)
+    values: tuple[Value, ...] | None = Field(
+        default=None, min_length=1, description="all that it may be"
+    )
+    sets: tuple[Annotated[str, Field(min_length=1, max_length=300)], ...] = Field(
+        min_length=1, max_length=64
+    )
     description: str = Field(default="", max_length=300, description="for people")
 
-    def check(self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Path, str]) -> None:
-        """Check a parameter of a scene, whose `document` is JSON; `taken` has the places of parameters before it."""
+    def check(
+        self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Path, str]
+    ) -> None:
+        """Check a parameter of a scene, whose `document` is JSON.
+
+        `taken` has the places of parameters before it.
+        """
         here: Path = ("parameters", name)
         if name in LOOKS_AXES:
-            refuse(scene, here, f"must not have the name of an axis of all scenes: {', '.join(LOOKS_AXES)}", name)
+            refuse(
+                scene,
+                here,
+                f"must not have the name of an axis of all scenes: {', '.join(LOOKS_AXES)}",
+                name,
+            )
         defaults = []
         for number, path in enumerate(self.sets):
             place_here = (*here, "sets", number)
@@ -52,7 +68,9 @@ class Parameter(Document):
             value = at(document, place)
             is_number = isinstance(value, float) and not set(place) & {*_FIXED}
             sized = (
-                place[0] == "sheets" and place[2] == "mesh" and document["sheets"][place[1]]["mesh"]["type"] != "grid"
+                place[0] == "sheets"
+                and place[2] == "mesh"
+                and document["sheets"][place[1]]["mesh"]["type"] != "grid"
             )
             if not ((is_number and not sized) or place[-1] == "material"):
                 rule = "must lead to a number or a material, and not to what decides on shapes of arrays or on files"
@@ -65,26 +83,50 @@ class Parameter(Document):
             defaults.append(value)
         if len(set(defaults)) > 1:
             rule = "must find one value, the default, at all places"
-            refuse(scene, (*here, "sets"), f"{rule}; they have {', '.join(map(str, defaults))}", list(self.sets))
+            refuse(
+                scene,
+                (*here, "sets"),
+                f"{rule}; they have {', '.join(map(str, defaults))}",
+                list(self.sets),
+            )
         self._check_range(scene, here, defaults[0])
 
     def _check_range(self, scene: Any, here: Path, default: Value) -> None:
         if isinstance(default, str) or self.values is not None:
             for end in ("low", "high"):
                 if getattr(self, end) is not None:
-                    refuse(scene, (*here, end), "is for numbers without a list of values", getattr(self, end))
+                    refuse(
+                        scene,
+                        (*here, end),
+                        "is for numbers without a list of values",
+                        getattr(self, end),
+                    )
             for number, value in enumerate(self.values or ()):
                 if type(value) is not type(default):
                     kind = "name" if isinstance(default, str) else "number"
-                    refuse(scene, (*here, "values", number), f"must be a {kind}, as in the document", value)
+                    refuse(
+                        scene,
+                        (*here, "values", number),
+                        f"must be a {kind}, as in the document",
+                        value,
+                    )
         elif self.low is None or self.high is None or not self.low < self.high:
-            refuse(scene, (*here, "low"), f"low and high [{self.unit}] must be given, low below high", self.low)
+            refuse(
+                scene,
+                (*here, "low"),
+                f"low and high [{self.unit}] must be given, low below high",
+                self.low,
+            )
         if not self.allows(default):
-            refuse(scene, (*here, "sets", 0), f"must lead to a default within {self.range}", default)
+            refuse(
+                scene, (*here, "sets", 0), f"must lead to a default within {self.range}", default
+            )
 
     @property
     def extremes(self) -> list[tuple[Path, Value]]:
-        """Values that stand for all others, each with its place in the parameter: rules of numbers are ranges."""
+        """Values that stand for all others, each with its place in the parameter: rules of numbers
+        are ranges.
+        """
         listed: list[tuple[Path, Value | None]] = [
             (("values", at), value) for at, value in enumerate(self.values or ())
         ]
@@ -107,7 +149,9 @@ class Parameter(Document):
 
 
 def found(document: Mapping[str, Any], path: str) -> Path:
-    """Return the place that a dotted path leads to; `friction.A.B` finds the coefficient of two in any order.
+    """Return the place that a dotted path leads to.
+
+    `friction.A.B` finds the coefficient of two in any order.
 
     Raises LookupError, which says from where on it leads nowhere.
     """
@@ -116,12 +160,20 @@ def found(document: Mapping[str, Any], path: str) -> Path:
         for number, pair in enumerate(document["friction"]):
             if sorted(pair["between"]) == sorted(words[1:]):
                 return ("friction", number, "mu")
-        raise LookupError(f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}")
+        raise LookupError(
+            f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}"
+        )
     here: Any = document
     place: list[str | int] = []
     for word in words:
         step: str | int = int(word) if isinstance(here, list) and word.isdecimal() else word
-        known = range(len(here)) if isinstance(here, list) else list(here) if isinstance(here, dict) else []
+        known = (
+            range(len(here))
+            if isinstance(here, list)
+            else list(here)
+            if isinstance(here, dict)
+            else []
+        )
         if step not in known:
             names = [str(name) for name in known]
             where = ".".join(map(str, place)) or "the document"
@@ -148,7 +200,9 @@ def with_values(document: Any, values: Mapping[Path, Any]) -> Any:
 
 
 def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
-    """Raise a ValidationError that names a place in a document, the rule that it breaks, and its value."""
+    """Raise a ValidationError that names a place in a document, the rule that it breaks, and its
+    value.
+    """
     broken = PydanticCustomError("broken_rule", "{rule}", {"rule": rule})
     raise ValidationError.from_exception_data(
         type(model).__name__, [InitErrorDetails(type=broken, loc=place, input=value)]

@@ -32,25 +32,33 @@ Time = Annotated[Float, Field(ge=0, le=10_000)]
 
 
 def _below_the_scene(name: str) -> str:
-    """Return the name of a file: a reference to an artifact, or a path that stays in the folder of the scene."""
+    """Return the name of a file: a reference to an artifact, or a path that stays in the folder of
+    the scene.
+    """
     if name.startswith(ARTIFACT):
         if not is_sha256(name.removeprefix(ARTIFACT)):
             raise ValueError("a reference to a file must be sha256: and 64 hexadecimal digits")
         return name
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
-        raise ValueError("a file must be in the folder of the scene or below, with / between folders")
+        raise ValueError(
+            "a file must be in the folder of the scene or below, with / between folders"
+        )
     return name
 
 
 FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_below_the_scene)]
-"""A file of a scene: a path relative to the scene's folder, or `sha256:` and a digest once it is uploaded."""
+"""A file of a scene: a path relative to the scene's folder, or `sha256:` and a digest once it is
+uploaded.
+"""
 
 
 def _by_name(value: Any) -> Any:
     """Return a mapping in the order of its names: canonical JSON has no other order."""
     return (
-        dict(sorted(value.items())) if isinstance(value, dict) and all(isinstance(key, str) for key in value) else value
+        dict(sorted(value.items()))
+        if isinstance(value, dict) and all(isinstance(key, str) for key in value)
+        else value
     )
 
 
@@ -63,7 +71,9 @@ class Key(Document):
 
     time: Time = Field(description="[s]")
     move: Vector = Field(default=(0.0, 0.0, 0.0), description="displacement since the start [m]")
-    turn: Turn = Field(default=(0.0, 0.0, 0.0), description="rotation since the start, as a rotation vector [rad]")
+    turn: Turn = Field(
+        default=(0.0, 0.0, 0.0), description="rotation since the start, as a rotation vector [rad]"
+    )
 
 
 class Spin(Document):
@@ -95,23 +105,30 @@ class Motion(Document):
         default="smooth",
         description="smooth: without overshoot, at rest at the first and the last key; linear: at even speed between",
     )
-    ramp: Time = Field(default=0.0, description="time in which a linear motion changes its speed at each key [s]")
+    ramp: Time = Field(
+        default=0.0, description="time in which a linear motion changes its speed at each key [s]"
+    )
     about: Vector | None = Field(
-        default=None, description="point that turns are about [m]; by default the middle of what moves, at the start"
+        default=None,
+        description="point that turns are about [m]; by default the middle of what moves, at the start",
     )
 
     @model_validator(mode="after")
     def _is_one_motion(self) -> Self:
         given = [name for name in ("keys", "spin", "path") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"a motion must have one of keys, spin and path, and it has {', '.join(given) or 'none'}")
+            raise ValueError(
+                f"a motion must have one of keys, spin and path, and it has {', '.join(given) or 'none'}"
+            )
         if self.ramp and (self.spin is not None or self.interpolation == "smooth"):
             raise ValueError(
                 f"ramp is of linear keys and paths, and this motion is not linear; ramp is {self.ramp:g} s"
             )
         for before, after in pairwise(self.keys or ()):
             if not before.time < after.time:
-                raise ValueError(f"keys must ascend in time, and {after.time:g} s comes after {before.time:g} s")
+                raise ValueError(
+                    f"keys must ascend in time, and {after.time:g} s comes after {before.time:g} s"
+                )
         return self
 
 
@@ -131,7 +148,10 @@ class Plane(Document):
 
 class _Placed(Document):
     origin: Vector = Field(description="where its middle starts [m]")
-    turn: Turn = Field(default=(0.0, 0.0, 0.0), description="how it stands at the start, as a rotation vector [rad]")
+    turn: Turn = Field(
+        default=(0.0, 0.0, 0.0),
+        description="how it stands at the start, as a rotation vector [rad]",
+    )
     motion: Motion | None = Field(default=None, description="null: it stays")
 
 
@@ -163,7 +183,10 @@ class Box(_Placed):
     type: Literal["box"]
     size: tuple[Length, Length, Length] = Field(description="of its edges [m]")
     rounding: Float | None = Field(
-        default=None, gt=0, le=50, description="radius of its edges [m]; null: 5 mm, or half the least of size"
+        default=None,
+        gt=0,
+        le=50,
+        description="radius of its edges [m]; null: 5 mm, or half the least of size",
     )
 
     @model_validator(mode="after")
@@ -181,10 +204,18 @@ class MeshBody(Document):
 
     type: Literal["mesh"]
     file: FileName = Field(description="an OBJ file, a folder of them, or an NPZ file")
-    frame_rate: Float | None = Field(default=None, gt=0, le=10_000, description="of a folder of OBJ files [1/s]")
-    thickness: Float = Field(default=5e-4, ge=0, le=0.05, description="of a skin around the triangles [m]")
-    strength: Float = Field(default=1.0, ge=0, le=2, description="factor of all displacements since the first frame")
-    motion: Motion | None = Field(default=None, description="that all of it makes besides; null: none")
+    frame_rate: Float | None = Field(
+        default=None, gt=0, le=10_000, description="of a folder of OBJ files [1/s]"
+    )
+    thickness: Float = Field(
+        default=5e-4, ge=0, le=0.05, description="of a skin around the triangles [m]"
+    )
+    strength: Float = Field(
+        default=1.0, ge=0, le=2, description="factor of all displacements since the first frame"
+    )
+    motion: Motion | None = Field(
+        default=None, description="that all of it makes besides; null: none"
+    )
 
 
 Body = Annotated[Plane | Sphere | Cylinder | Capsule | Box | MeshBody, Field(discriminator="type")]
@@ -217,7 +248,9 @@ class Unstructured(Document):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of vertices and triangles: of rows of a triangular lattice, every second one shifted."""
+        """Numbers of vertices and triangles: of rows of a triangular lattice, every second one
+        shifted.
+        """
         columns = max(1, round(self.size[0] / self.spacing))
         rows = max(1, round(self.size[1] / (self.spacing * 0.75**0.5)))
         shifted = rows // 2  # rows 1, 3, ... but the last
@@ -230,9 +263,12 @@ class FileMesh(Document):
     """Any flat shape, from an OBJ file whose texture coordinates are the flat pattern."""
 
     type: Literal["file"]
-    file: FileName = Field(description="an OBJ file of triangles; its texture coordinates are the flat pattern [m]")
+    file: FileName = Field(
+        description="an OBJ file of triangles; its texture coordinates are the flat pattern [m]"
+    )
     counts: tuple[Int, Int] | None = Field(
-        default=None, description="numbers of vertices and triangles; filled in when the file is uploaded"
+        default=None,
+        description="numbers of vertices and triangles; filled in when the file is uploaded",
     )
 
     @property
@@ -248,19 +284,23 @@ class Flat(Document):
 
 
 class Hung(Document):
-    """It starts at rest under its holders, for which it is let down from flat before the scene begins."""
+    """It starts at rest under its holders, for which it is let down from flat before the scene
+    begins.
+    """
 
     type: Literal["hung"]
-    bias_until: Time = Field(default=0.0, description="until when the seeded push along its normal lasts [s]")
+    bias_until: Time = Field(
+        default=0.0, description="until when the seeded push along its normal lasts [s]"
+    )
 
 
 class Stretched(Document):
     """It starts flat and strained."""
 
     type: Literal["stretched"]
-    strain: tuple[Annotated[Float, Field(ge=-0.2, le=0.2)], Annotated[Float, Field(ge=-0.2, le=0.2)]] = Field(
-        description="along the warp and across; not equal, or the stiffness has no direction"
-    )
+    strain: tuple[
+        Annotated[Float, Field(ge=-0.2, le=0.2)], Annotated[Float, Field(ge=-0.2, le=0.2)]
+    ] = Field(description="along the warp and across; not equal, or the stiffness has no direction")
 
 
 class FromFile(Document):
@@ -268,25 +308,31 @@ class FromFile(Document):
 
     type: Literal["file"]
     file: FileName | None = Field(
-        default=None, description="an OBJ file, or an NPZ file with `positions` (V, 3) [m]; null: the file of the mesh"
+        default=None,
+        description="an OBJ file, or an NPZ file with `positions` (V, 3) [m]; null: the file of the mesh",
     )
 
 
 class Holder(Document):
-    """What holds vertices of a sheet: those in a rectangle of the flat sheet, on an edge, on its rim, or listed."""
+    """What holds vertices of a sheet: those in a rectangle of the flat sheet, on an edge, on its
+    rim, or listed.
+    """
 
     low: tuple[Place, Place] | None = Field(
-        default=None, description="corner of the rectangle (along the warp, across), from the middle [m]"
+        default=None,
+        description="corner of the rectangle (along the warp, across), from the middle [m]",
     )
     high: tuple[Place, Place] | None = Field(default=None, description="opposite corner [m]")
     edge: Literal["left", "right", "bottom", "top"] | None = Field(
-        default=None, description="left and right are the least and the largest along the warp, bottom and top across"
+        default=None,
+        description="left and right are the least and the largest along the warp, bottom and top across",
     )
     rim: Literal[True] | None = Field(default=None, description="all of the outline")
     vertices: tuple[Vertex, ...] | None = Field(default=None, min_length=1, max_length=100_000)
     motion: Motion | None = Field(default=None, description="of the holder; null: it stays")
     grasp: tuple[Time, Time] | None = Field(
-        default=None, description="when it takes hold and when it lets go [s]; null: it always holds"
+        default=None,
+        description="when it takes hold and when it lets go [s]; null: it always holds",
     )
 
     @model_validator(mode="after")
@@ -306,7 +352,9 @@ class Holder(Document):
                 f"low must be at most high in both [m], and they are {list(self.low or ())} and {list(self.high or ())}"
             )
         if self.grasp is not None and not self.grasp[0] < self.grasp[1]:
-            raise ValueError(f"grasp must be [from, until] in ascending order [s], and it is {list(self.grasp)}")
+            raise ValueError(
+                f"grasp must be [from, until] in ascending order [s], and it is {list(self.grasp)}"
+            )
         return self
 
 
@@ -331,12 +379,20 @@ class Sheet(Document):
     )
     thickness: Float = Field(default=5e-4, ge=1e-5, le=0.05, description="[m]")
     self_contact: Bool = Field(default=True, description="false: it passes through itself")
-    start: Annotated[Flat | Hung | Stretched | FromFile, Field(discriminator="type")] = Flat(type="flat")
-    holders: Annotated[dict[CustomName, Holder], BY_NAME] = Field(default_factory=dict, max_length=64)
+    start: Annotated[Flat | Hung | Stretched | FromFile, Field(discriminator="type")] = Flat(
+        type="flat"
+    )
+    holders: Annotated[dict[CustomName, Holder], BY_NAME] = Field(
+        default_factory=dict, max_length=64
+    )
 
     @model_validator(mode="after")
     def _can_start(self) -> Self:
-        if isinstance(self.start, FromFile) and self.start.file is None and not isinstance(self.mesh, FileMesh):
+        if (
+            isinstance(self.start, FromFile)
+            and self.start.file is None
+            and not isinstance(self.mesh, FileMesh)
+        ):
             raise ValueError("start.file must name a file where the mesh is not one")
         if isinstance(self.start, Hung) and not self.holders:
             raise ValueError("start can be hung only from holders, and there are none")
@@ -352,7 +408,9 @@ class View(Document):
 
     position: Vector = Field(description="[m]")
     target: Vector = Field(description="the point in the middle of the picture [m]")
-    focal_length: Float = Field(default=50.0, ge=10, le=400, description="for a film 36 mm wide [mm]")
+    focal_length: Float = Field(
+        default=50.0, ge=10, le=400, description="for a film 36 mm wide [mm]"
+    )
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
@@ -363,7 +421,9 @@ class View(Document):
                 f"it is {list(self.position)} m"
             )
         if math.hypot(*self._forward[:2]) < 1e-6:
-            raise ValueError(f"target must not be straight above or below position, and it is {list(self.target)} m")
+            raise ValueError(
+                f"target must not be straight above or below position, and it is {list(self.target)} m"
+            )
         return self
 
     @property
@@ -389,7 +449,9 @@ class SheetLook(Document):
 class BodyLook(Document):
     """What a body looks like."""
 
-    color: tuple[Share, Share, Share] = Field(default=(0.2, 0.2, 0.2), description="linear red, green, blue, 0 to 1")
+    color: tuple[Share, Share, Share] = Field(
+        default=(0.2, 0.2, 0.2), description="linear red, green, blue, 0 to 1"
+    )
     roughness: Share = Field(default=0.5, description="0 is a mirror")
 
 
@@ -401,11 +463,18 @@ class Looks(Document):
         description="textures of their own; the first sheet (by name) without one takes the axis `texture`",
     )
     bodies: Annotated[dict[CustomName, BodyLook], BY_NAME] = Field(default_factory=dict)
-    cameras: str | Annotated[dict[CustomName, View], BY_NAME, Field(min_length=1, max_length=64)] | None = Field(
-        default=None, description="a rig by name, or cameras; null: front, side and high frame all that moves"
+    cameras: (
+        str | Annotated[dict[CustomName, View], BY_NAME, Field(min_length=1, max_length=64)] | None
+    ) = Field(
+        default=None,
+        description="a rig by name, or cameras; null: front, side and high frame all that moves",
     )
-    light: Lighting | LampNumbers = Field(default=Lighting.drawn, description="of the axis `lighting` by default")
-    floor: Substrate | FloorNumbers = Field(default=Substrate.matt, description="of the axis `substrate` by default")
+    light: Lighting | LampNumbers = Field(
+        default=Lighting.drawn, description="of the axis `lighting` by default"
+    )
+    floor: Substrate | FloorNumbers = Field(
+        default=Substrate.matt, description="of the axis `substrate` by default"
+    )
 
     @field_validator("cameras")
     @classmethod

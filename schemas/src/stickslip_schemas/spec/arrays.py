@@ -1,8 +1,9 @@
 """What an array of a dataset is. The first dimension of every array is `sample`.
 
-Labels are a few large chunks; curves are one chunk per shard group; pictures, clips and meshes are one chunk per
-sample, and the chunks of a shard group lie in one shard. Every chunk is `bytes(little) -> zstd(3) -> crc32c`, but for
-those of clips and trajectories: see `stickslip_schemas.format.codecs`.
+Labels are a few large chunks; curves are one chunk per shard group; pictures, clips and meshes are
+one chunk per sample, and the chunks of a shard group lie in one shard. Every chunk is
+`bytes(little) -> zstd(3) -> crc32c`, but for those of clips and trajectories: see
+`stickslip_schemas.format.codecs`.
 """
 
 from collections.abc import Mapping
@@ -46,13 +47,18 @@ class ArrayLayout:
     per_sample: bool = False
     """True where a chunk is one sample and the chunks of a shard group lie in one shard."""
     is_recorded: bool = False
-    """True where the values come from the record of the simulation, not from a label or from the renderer."""
+    """True where the values come from the record of the simulation, not from a label or from the
+    renderer.
+    """
     categories: tuple[str, ...] = ()
     """Names of the codes 0, 1, ... of a categorical label."""
     is_trajectory: bool = False
-    """True where the first dimension of a sample is time and the values change slowly: coded as a trajectory."""
+    """True where the first dimension of a sample is time and the values change slowly: coded as a
+    trajectory.
+    """
     is_clip: bool = False
-    """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded as a clip."""
+    """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded as a clip.
+    """
     attributes: dict[str, Any] = field(default_factory=dict, hash=False)
     """What else the Zarr array says of itself."""
 
@@ -70,7 +76,11 @@ class ArrayLayout:
     @property
     def identity(self) -> dict[str, Any]:
         """What decides on the bytes of the array, as JSON: everything but the description."""
-        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "description"}
+        own = {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name != "description"
+        }
         return own | {"fill": repr(self.fill)}  # NaN has no JSON form
 
     def shard_path(self, shard: int) -> str:
@@ -81,13 +91,17 @@ class ArrayLayout:
 def array(
     name: str, text: str, dtype: str = "float64", of: Mapping[str, int] | None = None, **more: Any
 ) -> ArrayLayout:
-    """Return the layout of an array of numbers; a rejected sample has NaN, -1 or false, and 0 if unsigned.
+    """Return the layout of an array of numbers.
+
+    A rejected sample has NaN, -1 or false, and 0 if unsigned.
 
     `of` has the size of each dimension of a sample, by name; a sample is one number without it.
     """
     of = of or {}
     missing = {"f": NAN, "i": -1, "b": False}.get(dtype[0], 0)
-    return ArrayLayout(name, dtype, tuple(of.values()), tuple(of), text, **{"fill": missing, **more})
+    return ArrayLayout(
+        name, dtype, tuple(of.values()), tuple(of), text, **{"fill": missing, **more}
+    )
 
 
 SPLITS = ("train", "validation", "test")
@@ -110,7 +124,9 @@ def describe(array: ArrayLayout) -> dict[str, Any]:
 
 
 def shown_frames(count: int, instants: int) -> tuple[int, ...]:
-    """Return the instants that a clip of `count` frames shows of `instants`: the first, and then evenly spread."""
+    """Return the instants that a clip of `count` frames shows of `instants`: the first, and then
+    evenly spread.
+    """
     if not 1 <= count <= instants:
         raise ValueError(f"frames must be from 1 to {instants}, and is {count}")
     return tuple(position * instants // count for position in range(count))

@@ -21,7 +21,9 @@ MAX_SAMPLES = 1_000_000
 
 T = TypeVar("T")
 Count = Annotated[int, Strict(), Field(ge=1, le=MAX_SAMPLES), WHOLE]
-Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31, description="seed of all random draws"), WHOLE]
+Seed = Annotated[
+    int, Strict(), Field(ge=0, lt=2**31, description="seed of all random draws"), WHOLE
+]
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,9 @@ class _RangeAxis(_Axis[T], Generic[T]):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if not self.low < self.high:  # type: ignore[operator]  # T is a float wherever this axis is used
-            raise ValueError(f"low must be less than high, and {self.low} is not less than {self.high}")
+            raise ValueError(
+                f"low must be less than high, and {self.low} is not less than {self.high}"
+            )
         return self
 
 
@@ -107,11 +111,15 @@ def _long_form(value: Any) -> Any:
 class _Shorthand(BeforeValidator):
     """Accepts the short form of an axis, in validation and in the JSON schema."""
 
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+    def __get_pydantic_json_schema__(
+        self, core: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
         long = handler(core)
         if handler.mode == "serialization":
             return long
-        reference = {"$ref": long["discriminator"]["mapping"]["list"]} if "discriminator" in long else long
+        reference = (
+            {"$ref": long["discriminator"]["mapping"]["list"]} if "discriminator" in long else long
+        )
         values = handler.resolve_ref_schema(reference)["properties"]["values"]
         short = {name: value for name, value in values.items() if name != "title"}
         return {"anyOf": [values["items"], short, long]}
@@ -128,15 +136,17 @@ AnyAxis = ListAxis[Any] | LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any]
 def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
     """Return the values of `axis` in order.
 
-    `dimension` keeps axes apart that are sampled together: it selects the dimension of the Sobol sequence and
-    the stream of the random generator.
+    `dimension` keeps axes apart that are sampled together: it selects the dimension of the Sobol
+    sequence and the stream of the random generator.
     """
     match axis:
         case ListAxis():
             return list(axis.values)
         case LinspaceAxis(start=start, stop=stop, num=num):
             step = (stop - start) / max(1, num - 1)  # these are the bits of numpy.linspace
-            return [float(position * step + start) for position in range(num - 1)] + [float(stop if num > 1 else start)]
+            return [float(position * step + start) for position in range(num - 1)] + [
+                float(stop if num > 1 else start)
+            ]
         case _:
             drawn: list[Any] = drawn_values(axis, dimension=dimension).tolist()
             return drawn
@@ -150,7 +160,9 @@ def extremes(axis: AnyAxis) -> list[tuple[tuple[str | int, ...], Any]]:
     return [((end,), getattr(axis, end)) for end in ends]
 
 
-def drawn_values(axis: RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0) -> "npt.NDArray[np.float64]":
+def drawn_values(
+    axis: RandomAxis[Any] | SobolAxis[Any], *, dimension: int = 0
+) -> "npt.NDArray[np.float64]":
     """Return the values of an axis that is drawn; see `axis_values`."""
     import numpy as np  # the extra `arrays`
 

@@ -1,14 +1,16 @@
 """Calibrated cameras, as data.
 
-A point X [scene units] lands on the pixel (u, v), with the distortion of the lens as in OpenCV [Brown 1971]:
+A point X [scene units] lands on the pixel (u, v), with the distortion of the lens as in OpenCV
+[Brown 1971]:
 
     (X', Y', Z) = R X + t            camera axes: x right, y down, z forward; Z is the depth
     x = X' / Z,   y = Y' / Z,   s = x^2 + y^2,   g = 1 + k1 s + k2 s^2 + k3 s^3
     u = fx (x g + 2 p1 x y + p2 (s + 2 x^2)) + cx
     v = fy (y g + p1 (s + 2 y^2) + 2 p2 x y) + cy
 
-Integer pixel coordinates are pixel centres: the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5] and v grows
-downwards. A camera is nothing but a name and numbers, so its JSON form is what enters a content key.
+Integer pixel coordinates are pixel centres: the image covers [-0.5, width - 0.5] x [-0.5, height -
+0.5] and v grows downwards. A camera is nothing but a name and numbers, so its JSON form is what
+enters a content key.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ Lens = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 NO_LENS: Lens = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_TOLERANCE = 1e-6  # of R R^T - 1: calibration files print six digits or more
 
-_INVERSIONS = 60  # steps to the place that a lens moved: each leaves two thirds of the error, or less
+_INVERSIONS = (
+    60  # steps to the place that a lens moved: each leaves two thirds of the error, or less
+)
 _BORDER = 16  # places along each side of a picture at which it is found out how far a lens sees
 
 
@@ -49,7 +53,9 @@ def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
     k1, k2, p1, p2, k3 = lens
     s = x * x + y * y
     g = 1.0 + s * (k1 + s * (k2 + s * k3))
-    return x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x), y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+    return x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x), y * g + p1 * (
+        s + 2.0 * y * y
+    ) + 2.0 * p2 * x * y
 
 
 def undistorted(u: Any, v: Any, lens: Lens) -> tuple[Any, Any]:
@@ -62,7 +68,10 @@ def undistorted(u: Any, v: Any, lens: Lens) -> tuple[Any, Any]:
         s = x * x + y * y
         g = 1.0 + s * (k1 + s * (k2 + s * k3))
         xy = 2.0 * x * y
-        x, y = (u - p1 * xy - p2 * (s + 2.0 * x * x)) / g, (v - p1 * (s + 2.0 * y * y) - p2 * xy) / g
+        x, y = (
+            (u - p1 * xy - p2 * (s + 2.0 * x * x)) / g,
+            (v - p1 * (s + 2.0 * y * y) - p2 * xy) / g,
+        )
     return x, y
 
 
@@ -93,7 +102,9 @@ class Camera(Document):
     @field_validator("rotation")
     @classmethod
     def _is_rotation(cls, rotation: Matrix3) -> Matrix3:
-        products = ((i, j, sum(map(mul, rotation[i], rotation[j]))) for i in range(3) for j in range(3))
+        products = (
+            (i, j, sum(map(mul, rotation[i], rotation[j]))) for i in range(3) for j in range(3)
+        )
         error = max(abs(product - (i == j)) for i, j, product in products)
         (a, b, c), (d, e, f), (g, h, k) = rotation
         det = a * (e * k - f * h) - b * (d * k - f * g) + c * (d * h - e * g)
@@ -119,24 +130,33 @@ class Camera(Document):
     @property
     def position(self) -> Vector3:
         """The camera's centre in the world, -R^T t [scene units]."""
-        x, y, z = (0.0 - sum(map(mul, axis, self.translation)) for axis in zip(*self.rotation, strict=True))
+        x, y, z = (
+            0.0 - sum(map(mul, axis, self.translation)) for axis in zip(*self.rotation, strict=True)
+        )
         return x, y, z
 
-    def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...) [scene units].
+    def project(
+        self, points: npt.ArrayLike
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...) [scene
+        units].
 
         A point that is not in front of the camera has no image: its pixel is NaN.
         """
         import numpy as np  # the extra `arrays`
 
-        x = np.asarray(points, dtype=np.float64) @ np.asarray(self.rotation).T + np.asarray(self.translation)
+        x = np.asarray(points, dtype=np.float64) @ np.asarray(self.rotation).T + np.asarray(
+            self.translation
+        )
         depth = x[..., 2]
         inverse = 1.0 / np.where(depth > 0.0, depth, np.nan)
         u, v = distorted(x[..., 0] * inverse, x[..., 1] * inverse, self.distortion)
         return np.stack([self.fx * u + self.cx, self.fy * v + self.cy], axis=-1), depth
 
     def rays(self) -> npt.NDArray[np.float64]:
-        """Return the rays of depth 1 through the middle of all pixels, in the camera's axes, (height, width, 3)."""
+        """Return the rays of depth 1 through the middle of all pixels, in the camera's axes,
+        (height, width, 3).
+        """
         import numpy as np
 
         v, u = np.mgrid[: self.height, : self.width]
@@ -144,37 +164,63 @@ class Camera(Document):
         return np.stack([x, y, np.ones(x.shape)], axis=-1)
 
     def border(self) -> list[tuple[float, float]]:
-        """Return the places of the plane at depth 1 that the lens shows along the border of the picture."""
+        """Return the places of the plane at depth 1 that the lens shows along the border of the
+        picture.
+        """
         along = [k / _BORDER for k in range(_BORDER + 1)]
-        places = [(a, b) for a in along for b in (0.0, 1.0)] + [(a, b) for a in (0.0, 1.0) for b in along]
+        places = [(a, b) for a in along for b in (0.0, 1.0)] + [
+            (a, b) for a in (0.0, 1.0) for b in along
+        ]
         pixels = ((a * self.width - 0.5, b * self.height - 0.5) for a, b in places)
-        return [undistorted((u - self.cx) / self.fx, (v - self.cy) / self.fy, self.distortion) for u, v in pixels]
+        return [
+            undistorted((u - self.cx) / self.fx, (v - self.cy) / self.fy, self.distortion)
+            for u, v in pixels
+        ]
 
     def pinhole(self) -> Camera:
-        """Return the camera without distortion, of the same focal lengths, that sees all that this one does."""
+        """Return the camera without distortion, of the same focal lengths, that sees all that this
+        one does.
+        """
         if not any(self.distortion):
             return self
         x, y = zip(*self.border(), strict=True)
         left, top = floor(self.fx * min(x) + self.cx), floor(self.fy * min(y) + self.cy)
         right, bottom = ceil(self.fx * max(x) + self.cx), ceil(self.fy * max(y) + self.cy)
-        size = {"width": right - left + 1, "height": bottom - top + 1, "cx": self.cx - left, "cy": self.cy - top}
+        size = {
+            "width": right - left + 1,
+            "height": bottom - top + 1,
+            "cx": self.cx - left,
+            "cy": self.cy - top,
+        }
         return self.straight.model_copy(update=size)
 
     @property
     def numbers(self) -> list[float]:
         """The numbers of the label: fx, fy, cx, cy, R by rows, t."""
-        return [self.fx, self.fy, self.cx, self.cy, *(v for row in self.rotation for v in row), *self.translation]
+        return [
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            *(v for row in self.rotation for v in row),
+            *self.translation,
+        ]
 
     def overflow(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> float:
-        """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame [px].
+        """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame
+        [px].
 
-        The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's image is taken as a
-        disc, which is right to first order in its angular size. Infinite if a ball reaches behind the camera. What a
-        lens does not see it may fold into its picture: the pinhole camera says how far out that is.
+        The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's
+        image is taken as a disc, which is right to first order in its angular size. Infinite if a
+        ball reaches behind the camera. What a lens does not see it may fold into its picture: the
+        pinhole camera says how far out that is.
         """
         import numpy as np
 
-        if any(self.distortion) and (outside := self.pinhole().overflow(points, radius, margin)) > 0.0:
+        if (
+            any(self.distortion)
+            and (outside := self.pinhole().overflow(points, radius, margin)) > 0.0
+        ):
             return outside
         pixels, depth = self.project(points)
         if not bool(np.all(depth > radius)):
@@ -185,20 +231,27 @@ class Camera(Document):
 
 
 def square(name: str, size: int, focal: float, rotation: Any, translation: Vector3) -> Camera:
-    """Return a camera with a square frame of a size, and a focal length [px], whose axis meets the middle."""
+    """Return a camera with a square frame of a size, and a focal length [px], whose axis meets the
+    middle.
+    """
     middle, at = (size - 1) / 2, {"rotation": rotation, "translation": translation}
-    return Camera(name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at)
+    return Camera(
+        name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at
+    )
 
 
 FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
-"""Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames [degree]."""
+"""Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames
+[degree].
+"""
 
 _FRAMED_FOCAL = 560.0  # [px] at 224 pixels: a lens of 90 mm, as the rigs have
 _FRAMED_MARGIN = 10.0  # [px] at 224 pixels
 
 
 def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) -> Camera:
-    """Return the upright camera nearest to points (n, 3) [scene units] that has all of them in its square frame.
+    """Return the upright camera nearest to points (n, 3) [scene units] that has all of them in its
+    square frame.
 
     A point (X, Y, Z) in the camera's directions is in the frame where |X + t_x| <= k (Z + t_z), and the same of Y, so
     t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of Y, and t_x centres the points.

@@ -1,6 +1,7 @@
 """Specs: a `JobSpec` is a parameter grid of one kind.
 
-This module holds what all kinds have in common. A kind itself is one module of `stickslip_schemas.kinds`.
+This module holds what all kinds have in common. A kind itself is one module of
+`stickslip_schemas.kinds`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +14,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self, Type
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base import Document, Float, Int, Sha256, Stage, content_key, derived_seed, placed
+from stickslip_schemas.base import (
+    Document,
+    Float,
+    Int,
+    Sha256,
+    Stage,
+    content_key,
+    derived_seed,
+    placed,
+)
 from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed, axis_values
@@ -32,7 +42,10 @@ class Quality(StrEnum):
 
 
 class PresetName(StrEnum):
-    """Named, frozen sets of solver settings for cloth; the thesis's three are those of its Table 4.2."""
+    """Named, frozen sets of solver settings for cloth.
+
+    The thesis's three are those of its Table 4.2.
+    """
 
     certified = "certified"
     fast = "fast"
@@ -47,7 +60,9 @@ CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
 
 
 class Splits(Document):
-    """Shares of each split: of the simulations, all renders of one falling in the same split, or of the clips."""
+    """Shares of each split: of the simulations, all renders of one falling in the same split, or of
+    the clips.
+    """
 
     by: Literal["simulation", "clip"] = Field(
         default="simulation",
@@ -66,7 +81,10 @@ class Splits(Document):
 
 
 class Simulation(Document):
-    """What one trajectory depends on besides the build that makes it. Every kind has a class of its own."""
+    """What one trajectory depends on besides the build that makes it.
+
+    Every kind has a class of its own.
+    """
 
     kind: str
 
@@ -81,7 +99,10 @@ class Simulation(Document):
         return 0
 
     def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
-        """Return what it is made from, as JSON and arrays; `read` returns the bytes of an artifact by its digest."""
+        """Return what it is made from, as JSON and arrays.
+
+        `read` returns the bytes of an artifact by its digest.
+        """
         return self.model_dump(mode="json", exclude={"kind"})
 
 
@@ -121,9 +142,11 @@ class SeedRule(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Usual CPU times [s] of a simulation, of a render once it is shaded, of a shading, and of a renderer's start.
+    """Usual CPU times [s] of a simulation, of a render once it is shaded, of a shading, and of a
+    renderer's start.
 
-    Renders share a shading that differ only in the axis of variants. 80 % of simulations are within a factor `unsure`.
+    Renders share a shading that differ only in the axis of variants. 80 % of simulations are within
+    a factor `unsure`.
     """
 
     simulate: float
@@ -136,8 +159,9 @@ class Costs(NamedTuple):
 class JobSpec(Document):
     """What the specs of all kinds have in common, and what common code may ask a spec.
 
-    A kind states which documents describe a simulation and a render. A field of these documents that has the name of an
-    axis takes its value. `simulation_settings` and `render_settings` give the others, and each `SeedRule` draws a seed.
+    A kind states which documents describe a simulation and a render. A field of these documents
+    that has the name of an axis takes its value. `simulation_settings` and `render_settings` give
+    the others, and each `SeedRule` draws a seed.
     """
 
     simulation_type: ClassVar[type[Simulation]]
@@ -149,7 +173,9 @@ class JobSpec(Document):
 
     kind: str
     name: str | None = Field(
-        default=None, pattern=r"^[a-z0-9][a-z0-9-]{0,62}$", description="label of the job; enters no key"
+        default=None,
+        pattern=r"^[a-z0-9][a-z0-9-]{0,62}$",
+        description="label of the job; enters no key",
     )
     combine: Literal["product", "zip"] = Field(
         default="product",
@@ -184,7 +210,10 @@ class JobSpec(Document):
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Names of protocols that this certificate must have; a certificate without them does not vouch."""
+        """Names of protocols that this certificate must have.
+
+        A certificate without them does not vouch.
+        """
         return ()
 
     def simulation_settings(self) -> dict[str, Any]:
@@ -192,7 +221,10 @@ class JobSpec(Document):
         raise NotImplementedError
 
     def render_settings(self) -> dict[str, Any] | None:
-        """Return the fields of the render document that are the same for all samples; None renders nothing."""
+        """Return the fields of the render document that are the same for all samples.
+
+        None renders nothing.
+        """
         raise NotImplementedError
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
@@ -209,7 +241,10 @@ class JobSpec(Document):
         raise NotImplementedError
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return a text that is the same for samples whose `stage` costs about the same; of simulate or render."""
+        """Return a text that is the same for samples whose `stage` costs about the same.
+
+        Of simulate or render.
+        """
         return str(self.quality) if stage is Stage.render else ""
 
     def fields_of(self, axis: str) -> tuple[str, ...]:
@@ -225,7 +260,9 @@ class JobSpec(Document):
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        """Artifacts that the spec names and that have to be in the store, by JSON pointers into the spec."""
+        """Artifacts that the spec names and that have to be in the store, by JSON pointers into the
+        spec.
+        """
         return {}
 
     @property
@@ -246,18 +283,25 @@ class JobSpec(Document):
 
     @cached_property
     def arrays_digest(self) -> str:
-        """Key of the arrays of the dataset: their shapes, types, fill values and the names of their codes."""
+        """Key of the arrays of the dataset: their shapes, types, fill values and the names of their
+        codes.
+        """
         return content_key("arrays", [array.identity for array in (*self.arrays(), *COMMON_ARRAYS)])
 
     @property
     def dataset_id(self) -> str:
-        """Id of the dataset that answers the spec: the same spec has the same dataset, in any build."""
+        """Id of the dataset that answers the spec: the same spec has the same dataset, in any
+        build.
+        """
         return f"ds-{self.content_digest[:16]}"
 
     def columns(self) -> list[list[Any]]:
         """Return the values of each axis, in order."""
         axes = enumerate(self.named_axes.values())
-        return [axis_values(axis, dimension=place if self.combine == "zip" else 0) for place, axis in axes]
+        return [
+            axis_values(axis, dimension=place if self.combine == "zip" else 0)
+            for place, axis in axes
+        ]
 
     def combined(self, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[Any, ...]]:
         """Combine one column of cells for each axis as the spec says: all with all, or row by row."""
@@ -277,15 +321,25 @@ class JobSpec(Document):
 
     def simulation(self, point: Mapping[str, Any]) -> Simulation:
         """Return what to simulate at a point of the grid."""
-        return self._document(self.simulation_type, point, self.simulation_settings(), self.simulation_seeds)
+        return self._document(
+            self.simulation_type, point, self.simulation_settings(), self.simulation_seeds
+        )
 
     def render(self, point: Mapping[str, Any]) -> Render | None:
         """Return what to render at a point of the grid; None renders nothing."""
         settings = self.render_settings()
-        return None if settings is None else self._document(self.render_type, point, settings, self.render_seeds)
+        return (
+            None
+            if settings is None
+            else self._document(self.render_type, point, settings, self.render_seeds)
+        )
 
     def _document(
-        self, model: type[D], point: Mapping[str, Any], settings: dict[str, Any], seeds: tuple[SeedRule, ...]
+        self,
+        model: type[D],
+        point: Mapping[str, Any],
+        settings: dict[str, Any],
+        seeds: tuple[SeedRule, ...],
     ) -> D:
         fields: dict[str, Any] = {}
         for axis, given in point.items():
@@ -294,7 +348,9 @@ class JobSpec(Document):
                 if name in model.model_fields:
                     fields[name] = placed(fields.get(name, settings.get(name)), inner, value)
         drawn = {
-            rule.field: derived_seed(self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)})
+            rule.field: derived_seed(
+                self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)}
+            )
             for rule in seeds
         }
         return model(**{**settings, **fields, **drawn})
@@ -316,5 +372,7 @@ class JobSpec(Document):
                 details = InitErrorDetails(type=broken, loc=("axes", name), input=axis.values)
                 raise ValidationError.from_exception_data(type(self).__name__, [details])
         if self.sample_count > MAX_SAMPLES:
-            raise ValueError(f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}")
+            raise ValueError(
+                f"a job has at most {MAX_SAMPLES} samples, and this one has {self.sample_count}"
+            )
         return self

@@ -1,6 +1,8 @@
-"""What names in a spec stand for: fabrics, textures, lamps, floors and cameras, built in or as numbers of the user.
+"""What names in a spec stand for: fabrics, textures, lamps, floors and cameras, built in or as
+numbers of the user.
 
-The numbers of the measured fabrics live with the simulation core; a contract test compares the names.
+The numbers of the measured fabrics live with the simulation core; a contract test compares the
+names.
 """
 
 import math
@@ -48,9 +50,9 @@ PLATE_BOUNDS = (1e-11, 1.0)
 class FabricNumbers(Document):
     """The constitutive numbers of a custom fabric.
 
-    Give the resistance to stretching either as `stretching`, a table, or as `young`, `poisson` and `thickness`. Give
-    the resistance to bending as `bending`. With `young` you may leave it out: it is then that of a plate of this
-    thickness.
+    Give the resistance to stretching either as `stretching`, a table, or as `young`, `poisson` and
+    `thickness`. Give the resistance to bending as `bending`. With `young` you may leave it out: it
+    is then that of a plate of this thickness.
     """
 
     density: Float = Field(ge=0.01, le=5, description="mass per area [kg/m^2]")
@@ -60,14 +62,22 @@ class FabricNumbers(Document):
         "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, 67.5 and 90 degrees "
         "from the warp",
     )
-    young: Float | None = Field(default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet")
-    poisson: Float | None = Field(default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet")
-    thickness: Float | None = Field(default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet")
+    young: Float | None = Field(
+        default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet"
+    )
+    poisson: Float | None = Field(
+        default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet"
+    )
+    thickness: Float | None = Field(
+        default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet"
+    )
     bending: tuple[Rigidity, Rigidity, Rigidity] | None = Field(
         default=None,
         description="plate rigidities (along the warp, along the weft, twist) [N m], energy per area H:D:H/2",
     )
-    damping: Float = Field(default=0.0, ge=0, le=10, description="damping force over momentum [1/s]")
+    damping: Float = Field(
+        default=0.0, ge=0, le=10, description="damping force over momentum [1/s]"
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -84,14 +94,20 @@ class FabricNumbers(Document):
                         f"k0 = {k0:g}, k1 = {k1:g}, k2 = {k2:g}"
                     )
             if self.bending is None:
-                raise ValueError("bending must be given with stretching: a table says nothing of bending")
+                raise ValueError(
+                    "bending must be given with stretching: a table says nothing of bending"
+                )
         elif self.young is None or self.poisson is None or self.thickness is None:
             raise ValueError("give stretching, or all of young, poisson and thickness")
         else:
             membrane = self.young * self.thickness
             if membrane > MEMBRANE_MAX:
-                raise ValueError(f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is {membrane:g}")
-            plate = membrane * self.thickness**2 / (12 * (1 - self.poisson**2))  # E h^3 / (12 (1 - nu^2))
+                raise ValueError(
+                    f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is {membrane:g}"
+                )
+            plate = (
+                membrane * self.thickness**2 / (12 * (1 - self.poisson**2))
+            )  # E h^3 / (12 (1 - nu^2))
             if not PLATE_BOUNDS[0] <= plate <= PLATE_BOUNDS[1]:
                 low, high = PLATE_BOUNDS
                 raise ValueError(
@@ -105,11 +121,20 @@ CustomName = Annotated[str, Field(pattern=MATERIAL_NAME)]
 
 def name_schema(built_in: Iterable[str]) -> WithJsonSchema:
     """Return the JSON schema of a name: a built-in one, or the pattern of custom ones."""
-    return WithJsonSchema({"anyOf": [{"enum": list(map(str, built_in))}, {"type": "string", "pattern": MATERIAL_NAME}]})
+    return WithJsonSchema(
+        {
+            "anyOf": [
+                {"enum": list(map(str, built_in))},
+                {"type": "string", "pattern": MATERIAL_NAME},
+            ]
+        }
+    )
 
 
 class Texture(StrEnum):
-    """Procedural cloth textures; the last four are to test networks with that never saw them [thesis, 4.5.1].
+    """Procedural cloth textures.
+
+    The last four are to test networks with that never saw them [thesis, 4.5.1].
 
     Their order gives the codes of the label `texture`: add new ones at the end.
     """
@@ -129,13 +154,18 @@ class Texture(StrEnum):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return `; did you mean ...?` with the known word that is most like `word`, or nothing where none is."""
+    """Return `.
+
+    Did you mean ...?` with the known word that is most like `word`, or nothing where none is.
+    """
     close = get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 FARTHEST = 4.0
-"""Largest distance of a camera from the middle of the scene along each axis [m]: the floor ends at 8 m."""
+"""Largest distance of a camera from the middle of the scene along each axis [m]: the floor ends at
+8 m.
+"""
 LOWEST = 0.02
 """Least height of a camera above the floor [m]."""
 FIELD_OF_VIEW = (3.0, 150.0)
@@ -156,7 +186,8 @@ Row = tuple[Float, Float, Float]
 
 
 class Lighting(StrEnum):
-    """Named ranges that the lamp of a clip is drawn from: two of a studio, a bright room, a window beside the cloth.
+    """Named ranges that the lamp of a clip is drawn from: two of a studio, a bright room, a window
+    beside the cloth.
 
     Their order gives the codes of the label `lighting`: add new ones at the end.
     """
@@ -168,10 +199,11 @@ class Lighting(StrEnum):
 
 
 class Substrate(StrEnum):
-    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, bright ones, any hard one.
+    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, bright ones,
+    any hard one.
 
-    Numbers of a finish are drawn within a range. The order gives the codes of the label `substrate`: add new ones at
-    the end.
+    Numbers of a finish are drawn within a range. The order gives the codes of the label
+    `substrate`: add new ones at the end.
     """
 
     matt = "matt"
@@ -198,7 +230,9 @@ class _Ranges(Document):
         for name in type(self).model_fields:
             value = getattr(self, name)
             if isinstance(value, tuple) and len(value) == 2 and not value[0] <= value[1]:
-                raise ValueError(f"{name} must be [low, high], low at most high, and it is {list(value)}")
+                raise ValueError(
+                    f"{name} must be [low, high], low at most high, and it is {list(value)}"
+                )
         return self
 
 
@@ -214,7 +248,9 @@ class LampNumbers(_Ranges):
     elevation: tuple[Elevation, Elevation] = Field(
         description="elevation of the lamp above the floor [degree], 5 to 90"
     )
-    power: tuple[Power, Power] = Field(description="power over the nominal power, 0.05 to 10; `drawn` has 0.8 to 1.25")
+    power: tuple[Power, Power] = Field(
+        description="power over the nominal power, 0.05 to 10; `drawn` has 0.8 to 1.25"
+    )
 
 
 class FloorNumbers(_Ranges):
@@ -226,32 +262,45 @@ class FloorNumbers(_Ranges):
     albedo: tuple[Share, Share] = Field(
         description="share of the light that the floor scatters, or reflects if it is a metal, 0 to 1"
     )
-    roughness: tuple[Roughness, Roughness] = Field(description="roughness of the gloss, 0.01 to 1; 0.02 is a mirror")
+    roughness: tuple[Roughness, Roughness] = Field(
+        description="roughness of the gloss, 0.01 to 1; 0.02 is a mirror"
+    )
     metallic: Share = Field(default=0.0, description="1 for a metal, 0 for a dielectric")
-    specular: Share = Field(default=0.5, description="gloss of a dielectric; 0.5 is an index of refraction of 1.5")
+    specular: Share = Field(
+        default=0.5, description="gloss of a dielectric; 0.5 is an index of refraction of 1.5"
+    )
     grain: Share = Field(
-        default=0.1, description="contrast of the marks on the floor; at 0, motion over it is invisible"
+        default=0.1,
+        description="contrast of the marks on the floor; at 0, motion over it is invisible",
     )
     tint: tuple[Tint, Tint, Tint] = Field(
-        default=(1.0, 1.0, 1.0), description="colour (linear red, green, blue), 0.05 to 1; only ratios count"
+        default=(1.0, 1.0, 1.0),
+        description="colour (linear red, green, blue), 0.05 to 1; only ratios count",
     )
 
 
 class Calibration(Document):
     """A custom camera, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
 
-    The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x = -0.1 to 0.4, y = -0.1
-    to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle of the image, scaled to 224 x 224 pixels.
+    The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x =
+    -0.1 to 0.4, y = -0.1 to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle
+    of the image, scaled to 224 x 224 pixels.
     """
 
-    image_size: tuple[Pixels, Pixels] = Field(description="width and height of the calibrated image [px]")
-    camera_matrix: tuple[Row, Row, Row] = Field(description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]")
+    image_size: tuple[Pixels, Pixels] = Field(
+        description="width and height of the calibrated image [px]"
+    )
+    camera_matrix: tuple[Row, Row, Row] = Field(
+        description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]"
+    )
     distortion: tuple[Float, ...] = Field(
         default=(),
         max_length=14,
         description="distortion coefficients k1, k2, p1, p2, k3 of the lens; further ones must be 0",
     )
-    rvec: Row = Field(description="rotation from the world to the camera, as a Rodrigues vector [rad]")
+    rvec: Row = Field(
+        description="rotation from the world to the camera, as a Rodrigues vector [rad]"
+    )
     tvec: Row = Field(description="the world's origin in the camera's axes [m]")
 
     @model_validator(mode="after")
@@ -268,8 +317,13 @@ class Calibration(Document):
                 f"no skew; it is {[list(row) for row in self.camera_matrix]}"
             )
         for axis, f, c, side in zip("xy", (fx, fy), (cx, cy), self.image_size, strict=True):
-            least, most = (0.5 * side / math.tan(math.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW))
-            for name, value, low, high in (("f", f, least, most), ("c", c, -0.5 * side, 1.5 * side)):
+            least, most = (
+                0.5 * side / math.tan(math.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW)
+            )
+            for name, value, low, high in (
+                ("f", f, least, most),
+                ("c", c, -0.5 * side, 1.5 * side),
+            ):
                 if not low <= value <= high:
                     raise ValueError(
                         f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, for a field of view of "
@@ -285,30 +339,44 @@ class Calibration(Document):
         return self
 
     def _check_lens(self) -> None:
-        """Refuse a lens that shows a place twice within the square, or that sees farther than any camera may."""
+        """Refuse a lens that shows a place twice within the square, or that sees farther than any
+        camera may.
+        """
         camera = self.camera("own")
         border = camera.border()
         farthest = sum(max(abs(place[axis]) for place in border) ** 2 for axis in range(2))
         k1, k2, _, _, k3 = camera.distortion
         radii = (k / _RADII * farthest for k in range(_RADII + 1))
-        rising = all(1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3)) > 0.0 for s in radii)  # d(r g) / dr
+        rising = all(
+            1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3)) > 0.0 for s in radii
+        )  # d(r g) / dr
         shown = [distorted(x, y, camera.distortion) for x, y in border]
         pixels = [(camera.fx * u + camera.cx, camera.fy * v + camera.cy) for u, v in shown]
-        sides = [min(abs(p - side) for p in pixel for side in (-0.5, CLIP_SIZE - 0.5)) for pixel in pixels]
+        sides = [
+            min(abs(p - side) for p in pixel for side in (-0.5, CLIP_SIZE - 0.5))
+            for pixel in pixels
+        ]
         found = all(side < _FOUND for side in sides)
-        if not (rising and found and farthest <= 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2):
+        if not (
+            rising
+            and found
+            and farthest <= 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2
+        ):
             raise ValueError(
                 "distortion must move places outwards in their order over the whole square of the clip, for a field of "
                 f"view of up to {FIELD_OF_VIEW[1]:g} degrees; it is {list(self.distortion)}"
             )
 
     def camera(self, name: str) -> Camera:
-        """Return the camera of the clip: of the square in the middle of the image, scaled to `CLIP_SIZE`."""
+        """Return the camera of the clip: of the square in the middle of the image, scaled to
+        `CLIP_SIZE`.
+        """
         width, height = self.image_size
         side = min(width, height)
         scale = CLIP_SIZE / side
         (fx, _, cx), (_, fy, cy), _ = self.camera_matrix
-        # Pixel centres are whole numbers: the left edge of the square is at (width - side) / 2 - 1/2.
+        # Pixel centres are whole numbers: the left edge of the square is at (width - side) / 2 -
+        # 1/2.
         left, top = (width - side) / 2, (height - side) / 2
         return Camera(
             name=name,

@@ -1,8 +1,9 @@
-"""The store of artifacts and dataset versions: what it is, wherever it keeps its bytes, and the one in a directory.
+"""The store of artifacts and dataset versions: what it is, wherever it keeps its bytes, and the one
+in a directory.
 
-An **artifact** is a run of bytes that is named by its SHA-256. It is there whole or not at all, and two writers of the
-same bytes cannot disturb each other. A **version** of a dataset shows some artifacts a second time, under the paths
-that a Zarr reader asks for: `datasets/ID/vN/PATH`.
+An **artifact** is a run of bytes that is named by its SHA-256. It is there whole or not at all, and
+two writers of the same bytes cannot disturb each other. A **version** of a dataset shows some
+artifacts a second time, under the paths that a Zarr reader asks for: `datasets/ID/vN/PATH`.
 """
 
 import errno
@@ -29,10 +30,20 @@ DATASETS = "datasets"
 VERSION = re.compile(r"v[1-9]\d{0,8}")
 """Name of the directory of a version."""
 AT_ONCE = 32
-"""Requests to a store at once: a bucket answers each after a while, and all of them after little more."""
+"""Requests to a store at once: a bucket answers each after a while, and all of them after little
+more.
+"""
 
 _SCRATCH = re.compile(r"\.([0-9a-f]{64})\..*\.tmp")
-_UNAVAILABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ESTALE, errno.EHOSTUNREACH)
+_UNAVAILABLE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ESTALE,
+    errno.EHOSTUNREACH,
+)
 
 
 class CorruptArtifactError(OSError):
@@ -40,7 +51,9 @@ class CorruptArtifactError(OSError):
 
 
 def is_unavailable(error: OSError) -> bool:
-    """Return whether an error says that a store takes no files: full, read-only, not ours, gone, or out of reach."""
+    """Return whether an error says that a store takes no files: full, read-only, not ours, gone, or
+    out of reach.
+    """
     return error.errno in _UNAVAILABLE
 
 
@@ -78,9 +91,9 @@ class Room(NamedTuple):
 class Store(Protocol):
     """Artifacts by digest, and the versions that show them.
 
-    A digest that is not 64 lower-case hexadecimal digits raises ValueError, and an artifact that is not there
-    FileNotFoundError. Other failures of the store are OSError too; `is_unavailable` tells which of them mean that it
-    takes no files at all.
+    A digest that is not 64 lower-case hexadecimal digits raises ValueError, and an artifact that is
+    not there FileNotFoundError. Other failures of the store are OSError too; `is_unavailable` tells
+    which of them mean that it takes no files at all.
     """
 
     def __hash__(self) -> int:
@@ -104,7 +117,10 @@ class Store(Protocol):
         """
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes from `start` to `stop` in blocks; raise CorruptArtifactError where it ends before."""
+        """Yield the bytes from `start` to `stop` in blocks.
+
+        Raise CorruptArtifactError where it ends before.
+        """
 
     def size(self, digest: str) -> int:
         """Return how long an artifact is [bytes], without reading it."""
@@ -113,10 +129,15 @@ class Store(Protocol):
         """Return whether an artifact is there with at least `size` bytes, without reading it."""
 
     def holds(self, digest: str, *, size: int | None = None) -> bool:
-        """Return whether an artifact is there, of `size` bytes where that is known, with the digest that names it."""
+        """Return whether an artifact is there, of `size` bytes where that is known, with the digest
+        that names it.
+        """
 
     def delete(self, name: str) -> None:
-        """Delete an artifact, by its digest, or a leftover, by its name in `stored`. Deleting twice is no error."""
+        """Delete an artifact, by its digest, or a leftover, by its name in `stored`.
+
+        Deleting twice is no error.
+        """
 
     def stored(self) -> Iterator[Stored]:
         """Yield the artifacts and the leftovers, ordered by digest."""
@@ -125,7 +146,10 @@ class Store(Protocol):
         """Let a version show an artifact at `path`. Showing it twice is no error."""
 
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
-        """Return whether a version shows the bytes of `digest` at `path`. They are read where they are a copy."""
+        """Return whether a version shows the bytes of `digest` at `path`.
+
+        They are read where they are a copy.
+        """
 
     def read_shown(self, dataset: str, version: int, path: str) -> bytes:
         """Return what a version shows at `path`, unchecked."""
@@ -147,7 +171,10 @@ class Store(Protocol):
 
 
 def artifact_name(name: str) -> str:
-    """Return the path of an artifact, or of a leftover, below the root of a store; raise ValueError for a bad name."""
+    """Return the path of an artifact, or of a leftover, below the root of a store.
+
+    Raise ValueError for a bad name.
+    """
     leftover = _SCRATCH.fullmatch(name)
     digest = leftover[1] if leftover else name
     if not is_sha256(digest):
@@ -163,14 +190,22 @@ def version_name(dataset: str, version: int) -> str:
 
 
 def shown_name(dataset: str, version: int, path: str) -> str:
-    """Return the path of a file of a version below the root of a store; raise ValueError where it leads outside."""
+    """Return the path of a file of a version below the root of a store.
+
+    Raise ValueError where it leads outside.
+    """
     if any(part in ("", ".", "..") for part in path.split("/")):
         raise ValueError(f"path must be relative, without empty parts, '.' and '..'; got {path!r}")
     return f"{version_name(dataset, version)}/{path}"
 
 
-def in_parallel(function: Callable[[T], R], items: Iterable[T], *, at_once: int = AT_ONCE) -> list[R]:
-    """Return what `function` gives for each item, in their order; raise the first error, and begin nothing more."""
+def in_parallel(
+    function: Callable[[T], R], items: Iterable[T], *, at_once: int = AT_ONCE
+) -> list[R]:
+    """Return what `function` gives for each item, in their order.
+
+    Raise the first error, and begin nothing more.
+    """
     with ThreadPoolExecutor(at_once) as pool:
         try:
             return list(pool.map(function, items))
@@ -184,7 +219,9 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 def store_place(place: str | Path) -> str:
-    """Return the place of a store as every process of a machine understands it, a path or a URL; raise ValueError."""
+    """Return the place of a store as every process of a machine understands it, a path or a URL;
+    raise ValueError.
+    """
     text = str(place)
     if _SCHEME.match(text) is None and text:
         return str(Path(text).absolute())
@@ -231,10 +268,12 @@ _PROBE_BYTES = 4096
 
 
 class DirectoryStore:
-    """Artifacts below `root/artifacts` and versions below `root/datasets`; see `Store`. Several machines may share it.
+    """Artifacts below `root/artifacts` and versions below `root/datasets`; see `Store`.
 
-    A file is written beside its place, made durable, then renamed. A version is a directory of hard links, so that it
-    takes no room and any Zarr reader opens it.
+    Several machines may share it.
+
+    A file is written beside its place, made durable, then renamed. A version is a directory of hard
+    links, so that it takes no room and any Zarr reader opens it.
     """
 
     def __init__(self, root: Path | str) -> None:
@@ -255,11 +294,18 @@ class DirectoryStore:
         return self.root / version_name(dataset, version)
 
     def publish(self, data: bytes) -> str:
-        """An artifact that is there already is read and compared; a damaged one is mended in all versions."""
+        """An artifact that is there already is read and compared.
+
+        A damaged one is mended in all versions.
+        """
         digest = sha256(data)
         if not self.holds(digest, size=len(data)):
             path = self.path(digest)
-            links = self.root.glob(f"{DATASETS}/**/*") if path.exists() and path.stat().st_nlink > 1 else ()
+            links = (
+                self.root.glob(f"{DATASETS}/**/*")
+                if path.exists() and path.stat().st_nlink > 1
+                else ()
+            )
             shown = [file for file in links if file.is_file() and file.samefile(path)]
             write_durably(path, data)
             for file in shown:
@@ -313,7 +359,10 @@ class DirectoryStore:
             try:
                 is_ours = path == self.path(path.name)
                 status = path.stat()
-            except (ValueError, FileNotFoundError):  # of somebody else, or a writer has finished with it
+            except (
+                ValueError,
+                FileNotFoundError,
+            ):  # of somebody else, or a writer has finished with it
                 continue
             if is_ours:
                 is_shown = is_sha256(path.name) and status.st_nlink > 1
@@ -370,7 +419,8 @@ class DirectoryStore:
 
 
 def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
-    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename, fsync directory.
+    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename,
+    fsync directory.
 
     `mode` are its permissions, less those that the umask takes away.
     """

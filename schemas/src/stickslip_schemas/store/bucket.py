@@ -1,12 +1,13 @@
-"""A store in a bucket of Amazon S3, or of a server that speaks its protocol, through the Rust crate `object_store`.
+"""A store in a bucket of Amazon S3, or of a server that speaks its protocol, through the Rust crate
+`object_store`.
 
-A PUT is there whole or not at all, so no scratch names are needed. An artifact is put with `If-None-Match: *`: of two
-writers one wins, and the other finds that its bytes are there already. A version is a set of copies that the server
-makes, so that any Zarr reader opens it in the bucket.
+A PUT is there whole or not at all, so no scratch names are needed. An artifact is put with
+`If-None-Match: *`: of two writers one wins, and the other finds that its bytes are there already. A
+version is a set of copies that the server makes, so that any Zarr reader opens it in the bucket.
 
-Region, endpoint and credentials come from the variables that all S3 programs know: `AWS_REGION`, `AWS_ENDPOINT_URL`,
-`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, or from the machine's role. `AWS_ALLOW_HTTP=true` allows an endpoint
-without TLS.
+Region, endpoint and credentials come from the variables that all S3 programs know: `AWS_REGION`,
+`AWS_ENDPOINT_URL`, `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, or from the machine's role.
+`AWS_ALLOW_HTTP=true` allows an endpoint without TLS.
 """
 
 import errno
@@ -59,7 +60,9 @@ R = TypeVar("R")
 
 
 class BucketStore:
-    """Artifacts below `PREFIX/artifacts` and versions below `PREFIX/datasets` of a bucket; see `Store`."""
+    """Artifacts below `PREFIX/artifacts` and versions below `PREFIX/datasets` of a bucket; see
+    `Store`.
+    """
 
     def __init__(self, bucket: str, prefix: str = "", *, patience: float | None = None) -> None:
         """Open a store; raise ValueError where variables of the environment contradict each other."""
@@ -75,12 +78,15 @@ class BucketStore:
                 client_options={
                     "timeout": min(_REQUEST_TIMEOUT, timedelta(seconds=self._patience * 5)),
                     # What `object_store` reads where it is given no options of a client.
-                    "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"),
+                    "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower()
+                    in ("1", "true", "yes"),
                 },
                 retry_config={"retry_timeout": timedelta(seconds=self._patience)},
             )
         except obstore.exceptions.BaseError as error:
-            raise ValueError(f"the store {self.place} cannot be opened: {_summary(error)}") from error
+            raise ValueError(
+                f"the store {self.place} cannot be opened: {_summary(error)}"
+            ) from error
 
     @property
     def cache(self) -> None:
@@ -103,8 +109,8 @@ class BucketStore:
     def _put(self, name: str, data: bytes, *, mode: Any) -> None:
         """Put an object; raise FileExistsError where it must not exist and does.
 
-        A server answers 409 to one of two conditional PUTs that run at once, or to one beside a DELETE. Then the object
-        may be there or not, and the PUT is tried again until it is.
+        A server answers 409 to one of two conditional PUTs that run at once, or to one beside a
+        DELETE. Then the object may be there or not, and the PUT is tried again until it is.
         """
 
         def put() -> None:
@@ -124,8 +130,9 @@ class BucketStore:
     def _is_there(self, digest: str, data: bytes) -> bool:
         """Return whether an artifact has the bytes `data`.
 
-        The entity tag of an object that was put in one piece is its MD5, unless the server encrypts it with a key of
-        its own [Amazon S3, API reference, Object]. Another tag decides nothing, and the object is read.
+        The entity tag of an object that was put in one piece is its MD5, unless the server encrypts
+        it with a key of its own [Amazon S3, API reference, Object]. Another tag decides nothing,
+        and the object is read.
         """
         head = self._head(artifact_name(digest))
         if head["size"] != len(data):
@@ -135,7 +142,9 @@ class BucketStore:
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
         if offset != 0 or length is not None:
-            return self._read_part(digest, offset, self.size(digest) - offset if length is None else length)
+            return self._read_part(
+                digest, offset, self.size(digest) - offset if length is None else length
+            )
         data = self._get(artifact_name(digest))
         if sha256(data) != digest:
             raise CorruptArtifactError(f"artifact {digest} has other bytes than its name says")
@@ -146,14 +155,18 @@ class BucketStore:
         with suppress(_RefusedError):  # it starts behind the end
             if length > 0:
                 part = self._tried(
-                    lambda: obstore.get_range(self._objects, name, start=start, length=length).to_bytes()
+                    lambda: obstore.get_range(
+                        self._objects, name, start=start, length=length
+                    ).to_bytes()
                 )
         if len(part) == length > 0:
             return part
         if self.size(digest) < start + length:
             raise CorruptArtifactError(f"artifact {digest} ends before {start} + {length}")
         if length > 0:
-            raise OSError(errno.EIO, f"{self.place} did not send all that was asked for of artifact {digest}")
+            raise OSError(
+                errno.EIO, f"{self.place} did not send all that was asked for of artifact {digest}"
+            )
         return part
 
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
@@ -192,7 +205,9 @@ class BucketStore:
         for found in self._list(f"{ARTIFACTS}/"):
             digest = found["path"].rpartition("/")[2]
             if is_sha256(digest) and found["path"] == artifact_name(digest):
-                yield Stored(digest, found["size"], found["last_modified"].timestamp(), is_shown=False)
+                yield Stored(
+                    digest, found["size"], found["last_modified"].timestamp(), is_shown=False
+                )
 
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
         source, target = artifact_name(digest), shown_name(dataset, version, path)
@@ -231,7 +246,9 @@ class BucketStore:
         """Return None: a bucket has no limit."""
 
     def probe(self) -> None:
-        quick = BucketStore(self._bucket, self._prefix, patience=min(self._patience, PROBE_PATIENCE))
+        quick = BucketStore(
+            self._bucket, self._prefix, patience=min(self._patience, PROBE_PATIENCE)
+        )
         quick._deletes_many = self._deletes_many
         name = f".probe-{random.randbytes(8).hex()}"
         quick._put(name, b"probe", mode="overwrite")
@@ -246,7 +263,9 @@ class BucketStore:
 
     def _list(self, prefix: str) -> list[Any]:
         """Return the objects below a prefix, ordered by name."""
-        return self._tried(lambda: [found for page in obstore.list(self._objects, prefix=prefix) for found in page])
+        return self._tried(
+            lambda: [found for page in obstore.list(self._objects, prefix=prefix) for found in page]
+        )
 
     def _folders(self, prefix: str) -> list[str]:
         found = self._tried(lambda: obstore.list_with_delimiter(self._objects, prefix))
@@ -267,7 +286,9 @@ class BucketStore:
         """Delete an object by a request of its own, which `obstore` signs, but does not make."""
         url = obstore.sign(self._objects, "DELETE", name, timedelta(minutes=5))
         try:
-            urllib.request.urlopen(urllib.request.Request(url, method="DELETE"), timeout=PROBE_PATIENCE).close()
+            urllib.request.urlopen(
+                urllib.request.Request(url, method="DELETE"), timeout=PROBE_PATIENCE
+            ).close()
         except urllib.error.HTTPError as error:
             if error.code != HTTPStatus.NOT_FOUND:
                 raise _BusyError(f"status code: {error.code}") from error
@@ -277,19 +298,22 @@ class BucketStore:
     def _tried(self, request: Callable[[], R]) -> R:
         """Make a request until the server answers or patience ends.
 
-        `object_store` itself tries again after 5xx, and after a broken connection where a second try can do no harm.
-        None of ours can: what an artifact holds is known by its name. So the rest is tried again here.
+        `object_store` itself tries again after 5xx, and after a broken connection where a second
+        try can do no harm. None of ours can: what an artifact holds is known by its name. So the
+        rest is tried again here.
 
-        Raises:
-            PermissionError: The server does not let us.
-            _RefusedError: The server refuses the request, whenever it is made.
-            OSError: The server cannot be reached, or is busy for too long; `is_unavailable` is true of it.
+        Raises: PermissionError: The server does not let us. _RefusedError: The server refuses the
+            request, whenever it is made. OSError: The server cannot be reached, or is busy for too
+            long; `is_unavailable` is true of it.
         """
         end, wait = time.monotonic() + self._patience, _FIRST_WAIT
         while True:
             try:
                 return request()
-            except (obstore.exceptions.PermissionDeniedError, obstore.exceptions.UnauthenticatedError) as error:
+            except (
+                obstore.exceptions.PermissionDeniedError,
+                obstore.exceptions.UnauthenticatedError,
+            ) as error:
                 raise PermissionError(errno.EACCES, f"{self.place}: {_summary(error)}") from error
             except (_BusyError, obstore.exceptions.BaseError) as error:
                 if any(sign in str(error) for sign in _REFUSALS):
@@ -300,7 +324,10 @@ class BucketStore:
             wait = min(2 * wait, _LONGEST_WAIT)
 
 
-_REFUSALS = ("builder error", *(f"status code: {status}" for status in (400, 405, 411, 412, 413, 414, 416, 501)))
+_REFUSALS = (
+    "builder error",
+    *(f"status code: {status}" for status in (400, 405, 411, 412, 413, 414, 416, 501)),
+)
 """What an error says that comes again, however often the request is made."""
 
 
@@ -313,5 +340,8 @@ class _RefusedError(OSError):
 
 
 def _summary(error: Exception) -> str:
-    """Return the first line of an error, which says what failed; the others are the structure of a Rust value."""
+    """Return the first line of an error, which says what failed.
+
+    The others are the structure of a Rust value.
+    """
     return str(error).partition("\n")[0]

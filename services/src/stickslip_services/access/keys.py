@@ -1,15 +1,17 @@
-"""Who asks, what they may do and see, and what they have done: scopes, API keys, projects and the audit log.
+"""Who asks, what they may do and see, and what they have done: scopes, API keys, projects and the
+audit log.
 
-Every query for something that belongs to a project has one of the conditions `own_...`. What belongs to another project
-is thus not found. The coordinator itself, and commands on its machine, see everything, and so do keys of the scope
-`admin`.
+Every query for something that belongs to a project has one of the conditions `own_...`. What
+belongs to another project is thus not found. The coordinator itself, and commands on its machine,
+see everything, and so do keys of the scope `admin`.
 
-The database stores only the SHA-256 digests of the keys' secrets, which have 256 random bits and so need no salt. A key
-belongs to one project, and so do the jobs submitted with it. Leases are shared evenly between projects, and a project
-may have a quota. Requests without a key belong to the project with the empty name.
+The database stores only the SHA-256 digests of the keys' secrets, which have 256 random bits and so
+need no salt. A key belongs to one project, and so do the jobs submitted with it. Leases are shared
+evenly between projects, and a project may have a quota. Requests without a key belong to the
+project with the empty name.
 
-The audit log is append-only: the database refuses to change or delete an entry. An entry is written in the transaction
-of the change itself, so that neither exists without the other.
+The audit log is append-only: the database refuses to change or delete an entry. An entry is written
+in the transaction of the change itself, so that neither exists without the other.
 """
 
 import getpass
@@ -28,13 +30,32 @@ from pathlib import Path
 from typing import Any
 
 from cryptography.fernet import Fernet
-from sqlalchemy import ColumnElement, Connection, Row, delete, exists, func, insert, or_, select, true, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    delete,
+    exists,
+    func,
+    insert,
+    or_,
+    select,
+    true,
+    update,
+)
 from stickslip_schemas.base import Document, JobState, sha256
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.database.database import Database, Role, document_of
 from stickslip_services.database.opening import opened
-from stickslip_services.database.tables import api_keys, audit_log, dataset_versions, job_tasks, jobs, projects
+from stickslip_services.database.tables import (
+    api_keys,
+    audit_log,
+    dataset_versions,
+    job_tasks,
+    jobs,
+    projects,
+)
 from stickslip_services.errors import CommandError, NotFoundError, QuotaExceededError, SettingsError
 from stickslip_services.settings import Settings
 
@@ -55,7 +76,9 @@ class Scope(StrEnum):
 def check_project(name: str) -> str:
     """Return the name of a project; raise CommandError where it is malformed."""
     if re.fullmatch(r"([a-z0-9][a-z0-9-]{0,62})?", name) is None:
-        raise CommandError(f"project must be lower-case letters, digits and '-', 63 at most; got {name[:100]!r}")
+        raise CommandError(
+            f"project must be lower-case letters, digits and '-', 63 at most; got {name[:100]!r}"
+        )
     return name
 
 
@@ -73,7 +96,9 @@ class Asker:
     project: str = ""
 
     def may(self, needed: Scope) -> bool:
-        return bool(self.scopes & {needed, Scope.admin}) or (needed is Scope.read and Scope.submit in self.scopes)
+        return bool(self.scopes & {needed, Scope.admin}) or (
+            needed is Scope.read and Scope.submit in self.scopes
+        )
 
     @property
     def sees_all(self) -> bool:
@@ -113,14 +138,20 @@ def own(project: ColumnElement[str]) -> ColumnElement[bool]:
 
 
 def own_task(task: ColumnElement[int]) -> ColumnElement[bool]:
-    """Return the condition that a job that the asker sees has a task. Projects share tasks of one content."""
+    """Return the condition that a job that the asker sees has a task.
+
+    Projects share tasks of one content.
+    """
     if this_asker().sees_all:
         return true()
-    return exists().where(job_tasks.c.task == task, job_tasks.c.job == jobs.c.seq, own(jobs.c.project))
+    return exists().where(
+        job_tasks.c.task == task, job_tasks.c.job == jobs.c.seq, own(jobs.c.project)
+    )
 
 
 def own_version() -> ColumnElement[bool]:
-    """Return the condition that a job that the asker sees has made a dataset version, or would make the same one.
+    """Return the condition that a job that the asker sees has made a dataset version, or would make
+    the same one.
 
     A version without a job belongs to the project with the empty name.
     """
@@ -133,7 +164,9 @@ def own_version() -> ColumnElement[bool]:
 
 
 def refuse_projects(what: str) -> None:
-    """Raise NotFoundError where the asker belongs to a project, for something that tells about all of them."""
+    """Raise NotFoundError where the asker belongs to a project, for something that tells about all
+    of them.
+    """
     if this_asker().project and not this_asker().sees_all:
         raise NotFoundError(f"{what} are of all projects: ask with a key without a project")
 
@@ -152,26 +185,41 @@ class Entry(Document):
 def note(connection: Connection, action: str, subject: str, now: float, **details: Any) -> None:
     connection.execute(
         insert(audit_log).values(
-            at=now, actor=this_asker().name, action=action, subject=subject, details=json.dumps(details)
+            at=now,
+            actor=this_asker().name,
+            action=action,
+            subject=subject,
+            details=json.dumps(details),
         )
     )
 
 
-def read_audit_log(connection: Connection, *, subject: str | None = None, limit: int = 100) -> list[Entry]:
+def read_audit_log(
+    connection: Connection, *, subject: str | None = None, limit: int = 100
+) -> list[Entry]:
     """Return the last `limit` entries, newest first; with `subject`, only those about it."""
     query = select(audit_log).order_by(audit_log.c.seq.desc()).limit(limit)
     if subject is not None:
         query = query.where(audit_log.c.subject == subject)
-    return [document_of(Entry, row, details=json.loads(row.details)) for row in connection.execute(query)]
+    return [
+        document_of(Entry, row, details=json.loads(row.details))
+        for row in connection.execute(query)
+    ]
 
 
 @contextmanager
 def visited(settings: Settings) -> Iterator[Connection]:
-    """Open a write transaction on a database for a command on this machine; raise DatabaseRefusedError.
+    """Open a write transaction on a database for a command on this machine.
+
+    Raise DatabaseRefusedError.
 
     A coordinator may run meanwhile.
     """
-    with asking(this_user()), opened(settings, Role.visitor) as database, database.write() as connection:
+    with (
+        asking(this_user()),
+        opened(settings, Role.visitor) as database,
+        database.write() as connection,
+    ):
         yield connection
 
 
@@ -185,7 +233,10 @@ FRESH_SECONDS = 1.0
 def create_key(
     connection: Connection, name: str, scopes: Collection[Scope], now: float, *, project: str = ""
 ) -> tuple[str, str]:
-    """Make a key; return its id and its secret, which is not stored. Raise CommandError for a bad name or project."""
+    """Make a key; return its id and its secret, which is not stored.
+
+    Raise CommandError for a bad name or project.
+    """
     if not 1 <= len(name) <= 100:
         raise CommandError(f"name must have 1 to 100 characters, and has {len(name)}")
     secret = f"sk_{secrets.token_urlsafe(32)}"
@@ -209,7 +260,10 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
 
 
 def secret_in(path: Path) -> str:
-    """Return the secret in a key file; make the file where it is missing, readable by its owner alone."""
+    """Return the secret in a key file.
+
+    Make the file where it is missing, readable by its owner alone.
+    """
     if not path.exists():
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_durably(path, f"{secrets.token_urlsafe(32)}\n".encode(), mode=0o600)
@@ -217,19 +271,26 @@ def secret_in(path: Path) -> str:
 
 
 def sealer(settings: Settings) -> Fernet:
-    """Return the cipher of secrets that the database keeps sealed; raise SettingsError for a key of another form."""
+    """Return the cipher of secrets that the database keeps sealed.
+
+    Raise SettingsError for a key of another form.
+    """
     given = settings.secrets_key
     key = secret_in(settings.data / "secrets-key") if given is None else given.get_secret_value()
     try:
         return Fernet(key.rstrip("=") + "=")
     except ValueError:
-        raise SettingsError("the secrets key must be 32 bytes in base64, as `openssl rand -base64 32` makes") from None
+        raise SettingsError(
+            "the secrets key must be 32 bytes in base64, as `openssl rand -base64 32` makes"
+        ) from None
 
 
 def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
     """Register the secret of the local workers as a key of the scope `work`; replace a revoked one."""
     digest = sha256(secret_in(path).encode())
-    row = connection.execute(select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)).one_or_none()
+    row = connection.execute(
+        select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)
+    ).one_or_none()
     if row is not None and row.revoked_at is not None:
         path.unlink()
         row = None
@@ -256,10 +317,14 @@ class KeyRing:
         with self._lock:
             if not self.is_fresh:
                 with self._database.read() as connection:
-                    rows = connection.execute(select(api_keys).where(api_keys.c.revoked_at.is_(None)))
+                    rows = connection.execute(
+                        select(api_keys).where(api_keys.c.revoked_at.is_(None))
+                    )
                     self._holders = {
                         row.digest: Asker(
-                            f"{row.id} {row.name}", frozenset(map(Scope, row.scopes.split())), row.project
+                            f"{row.id} {row.name}",
+                            frozenset(map(Scope, row.scopes.split())),
+                            row.project,
                         )
                         for row in rows
                     }
@@ -268,7 +333,13 @@ class KeyRing:
 
 
 def _insert(
-    connection: Connection, name: str, scopes: Collection[Scope], secret: str, now: float, *, project: str = ""
+    connection: Connection,
+    name: str,
+    scopes: Collection[Scope],
+    secret: str,
+    now: float,
+    *,
+    project: str = "",
 ) -> str:
     key_id = f"key-{secrets.token_hex(8)}"
     connection.execute(
@@ -298,10 +369,14 @@ class Project:
     jobs: int
 
 
-def set_quota(connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float) -> None:
+def set_quota(
+    connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float
+) -> None:
     """Set the quota of a project from the next submission on; raise CommandError for a bad name."""
     connection.execute(delete(projects).where(projects.c.name == check_project(name)))
-    connection.execute(insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs))
+    connection.execute(
+        insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs)
+    )
     note(connection, "project.quota", name, now, max_samples=max_samples, max_jobs=max_jobs)
 
 
@@ -335,4 +410,6 @@ def check_quota(connection: Connection, name: str, sample_count: int) -> None:
     if project.max_jobs is not None and project.jobs + 1 > project.max_jobs:
         raise QuotaExceededError(name, "jobs", project.max_jobs, taken=project.jobs, asked=1)
     if project.max_samples is not None and project.samples + sample_count > project.max_samples:
-        raise QuotaExceededError(name, "samples", project.max_samples, taken=project.samples, asked=sample_count)
+        raise QuotaExceededError(
+            name, "samples", project.max_samples, taken=project.samples, asked=sample_count
+        )

@@ -1,8 +1,8 @@
 """Webhooks: URLs that receive job events, i.e. changes of a job's state and published datasets.
 
-Messages are signed according to Standard Webhooks 1.0.0 [standardwebhooks.com]. A webhook stores its position in the
-sequence of events, so events arrive in order, and none is lost when a process is killed. A message may arrive twice,
-with the same `webhook-id`.
+Messages are signed according to Standard Webhooks 1.0.0 [standardwebhooks.com]. A webhook stores
+its position in the sequence of events, so events arrive in order, and none is lost when a process
+is killed. A message may arrive twice, with the same `webhook-id`.
 """
 
 import asyncio
@@ -54,7 +54,9 @@ TOLD = (EventName.job_state, EventName.dataset_published)
 def create_webhook(
     connection: Connection, sealing: Fernet, url: str, now: float, *, project: str = ""
 ) -> tuple[str, str]:
-    """Make a webhook for events of the jobs of a project from now on; return its id and its secret, kept sealed.
+    """Make a webhook for events of the jobs of a project from now on.
+
+    Return its id and its secret, kept sealed.
 
     Raises SettingsError for a bad URL, ValueError for a bad project.
     """
@@ -88,7 +90,12 @@ def list_webhooks(connection: Connection, now: float) -> Sequence[Row[Any]]:
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Retry a webhook at once, even if it was given up; raise NotFoundError."""
     values = {"next_at": now, "failures": 0, "failing_since": None}
-    if connection.execute(update(webhooks).where(webhooks.c.id == webhook_id).values(values)).rowcount == 0:
+    if (
+        connection.execute(
+            update(webhooks).where(webhooks.c.id == webhook_id).values(values)
+        ).rowcount
+        == 0
+    ):
         raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
     note(connection, "webhook.retry", webhook_id, now)
 
@@ -116,13 +123,16 @@ class WebhookDelivery:
     def run(self) -> None:
         """Deliver all events that webhooks have not received, unless they wait for a retry.
 
-        Each webhook has a thread of its own, so a slow receiver holds up no other. The threads of slow ones go on when
-        this returns.
+        Each webhook has a thread of its own, so a slow receiver holds up no other. The threads of
+        slow ones go on when this returns.
         """
         with self._database.read() as connection:
             due = connection.scalars(select(webhooks.c.seq).where(_is_due(self._clock()))).all()
             behind = [seq for seq in due if _next_message(connection, seq) is not None]
-        threads = [threading.Thread(target=self._deliver, args=(seq,), daemon=True) for seq in behind[:MOST_AT_ONCE]]
+        threads = [
+            threading.Thread(target=self._deliver, args=(seq,), daemon=True)
+            for seq in behind[:MOST_AT_ONCE]
+        ]
         for thread in threads:
             thread.start()
         end = time.monotonic() + WAIT_SECONDS
@@ -151,7 +161,10 @@ class WebhookDelivery:
                 connection.execute(place.values(next_at=self._clock() + (wait or 0.0)))
 
     def _deliver_one(self, seq: int) -> float | None:
-        """Deliver the next message of a webhook; return the wait before the next try [s], None for another message."""
+        """Deliver the next message of a webhook.
+
+        Return the wait before the next try [s], None for another message.
+        """
         with self._database.read() as connection:
             row = connection.execute(select(webhooks).where(webhooks.c.seq == seq)).one_or_none()
             message = None if row is None else _next_message(connection, seq)
@@ -172,7 +185,10 @@ class WebhookDelivery:
             return None
         wait = WAITS[min(row.failures, len(WAITS) - 1)]
         logger.warning("webhook %s: %s; it is tried again in %g s", row.id, fault, wait)
-        failed = {"failures": row.failures + 1, "failing_since": func.coalesce(webhooks.c.failing_since, now)}
+        failed = {
+            "failures": row.failures + 1,
+            "failing_since": func.coalesce(webhooks.c.failing_since, now),
+        }
         with self._database.write() as connection:
             connection.execute(place.values(failed | {"fault": fault}))
         return wait
@@ -187,9 +203,14 @@ def _is_given_up(now: float) -> ColumnElement[bool]:
 
 
 def _next_message(connection: Connection, seq: int) -> tuple[int, str] | None:
-    """Return the first event that a webhook has not received, and its message; None if it has received all."""
+    """Return the first event that a webhook has not received, and its message.
+
+    None if it has received all.
+    """
     found = connection.execute(
-        select(events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name)
+        select(
+            events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name
+        )
         .join(jobs, jobs.c.seq == events.c.job)
         .join(webhooks, webhooks.c.project == jobs.c.project)
         .where(webhooks.c.seq == seq, events.c.id > webhooks.c.position, events.c.name.in_(TOLD))
@@ -236,5 +257,9 @@ def _check(url: str) -> None:
         parts = httpx.URL(url)
     except httpx.InvalidURL:
         parts = httpx.URL("")
-    if not parts.host or not (parts.scheme == "https" or (parts.scheme == "http" and is_loopback(parts.host))):
-        raise SettingsError(f"url must be https://HOST/PATH, or http:// on this machine; got {url[:200]!r}")
+    if not parts.host or not (
+        parts.scheme == "https" or (parts.scheme == "http" and is_loopback(parts.host))
+    ):
+        raise SettingsError(
+            f"url must be https://HOST/PATH, or http:// on this machine; got {url[:200]!r}"
+        )

@@ -1,10 +1,12 @@
-"""What a request passes before its route: limits on connections, an id, a timing, and authorisation.
+"""What a request passes before its route: limits on connections, an id, a timing, and
+authorisation.
 
-A request, headers and body, must arrive within `TURN_SECONDS` plus the time that its bytes take at `LEAST_RATE`.
-Answers have no limit: event streams last as long as jobs.
+A request, headers and body, must arrive within `TURN_SECONDS` plus the time that its bytes take at
+`LEAST_RATE`. Answers have no limit: event streams last as long as jobs.
 
-A page of another site that is open in a browser on this machine can send requests to the coordinator, but it cannot
-forge `Host` and `Origin`. The check of `Host` prevents DNS rebinding, that of `Origin` cross-site request forgery.
+A page of another site that is open in a browser on this machine can send requests to the
+coordinator, but it cannot forge `Host` and `Origin`. The check of `Host` prevents DNS rebinding,
+that of `Origin` cross-site request forgery.
 """
 
 import asyncio
@@ -38,8 +40,9 @@ LEAST_RATE = 64 * 2**10
 MOST_CONNECTIONS = 4000
 
 IDLE_SECONDS = 15.0
-"""A connection without a request is closed after so long [s]. Clients close theirs earlier, httpx after 5 s: where both
-wait equally long, a request may meet a connection that is just being closed, and fails."""
+"""A connection without a request is closed after so long [s]. Clients close theirs earlier, httpx
+after 5 s: where both wait equally long, a request may meet a connection that is just being closed,
+and fails."""
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_.:-]{1,128}")
 _METHODS = frozenset(HTTPMethod)
@@ -63,7 +66,11 @@ class PatientProtocol(H11Protocol):
         self.timeout_keep_alive = IDLE_SECONDS  # type: ignore[assignment]
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
-            self._refuse(503, ProblemCode.busy, f"there are more than {MOST_CONNECTIONS} connections; try again later")
+            self._refuse(
+                503,
+                ProblemCode.busy,
+                f"there are more than {MOST_CONNECTIONS} connections; try again later",
+            )
         else:
             self._start_turn()
 
@@ -105,7 +112,9 @@ class PatientProtocol(H11Protocol):
         if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
             body = ProblemError(status, code, detail).document().model_dump_json().encode()
             headers = f"Content-Type: {MEDIA_TYPE}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n"
-            self.transport.write(f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{headers}\r\n".encode() + body)
+            self.transport.write(
+                f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{headers}\r\n".encode() + body
+            )
         self.transport.close()
 
 
@@ -118,9 +127,11 @@ def allow_many_files() -> None:
 
 @dataclass(frozen=True, slots=True)
 class RequestMiddleware:
-    """Gives every request an id, the client's where it sent a sensible `X-Request-Id`, returns it, and takes the time.
+    """Gives every request an id, the client's where it sent a sensible `X-Request-Id`, returns it,
+    and takes the time.
 
-    Every answer also forbids browsers to guess its type. `observe` gets method, template of the route, status and time.
+    Every answer also forbids browsers to guess its type. `observe` gets method, template of the
+    route, status and time.
     """
 
     app: ASGIApp
@@ -168,12 +179,14 @@ class OriginMiddleware:
         host = headers.get("host", "")
         name = _host_name(host)
         if name is None or not (is_loopback(name) or name in self.allowed_hosts):
-            detail = (
-                f"Host must be a loopback name such as 127.0.0.1, or one of STICKSLIP_ALLOWED_HOSTS; got {host[:100]!r}"
-            )
+            detail = f"Host must be a loopback name such as 127.0.0.1, or one of STICKSLIP_ALLOWED_HOSTS; got {host[:100]!r}"
             return ProblemError(403, ProblemCode.host_not_allowed, detail)
         origin = headers.get("origin")
-        if origin is None or scope["method"] in _SAFE or urlsplit(origin).netloc.lower() == host.lower():
+        if (
+            origin is None
+            or scope["method"] in _SAFE
+            or urlsplit(origin).netloc.lower() == host.lower()
+        ):
             return None
         detail = f"Origin must be that of the coordinator's own pages, http://{host[:100]}; got {origin[:100]!r}"
         return ProblemError(403, ProblemCode.origin_not_allowed, detail)
@@ -189,8 +202,8 @@ def _host_name(host: str) -> str | None:
 class KeyMiddleware:
     """Refuses requests without a key of the scope that they need.
 
-    The scope follows from method and path alone, so that a new route is never open by mistake. Where no key is
-    required, everybody on this machine may do everything except act as a worker.
+    The scope follows from method and path alone, so that a new route is never open by mistake.
+    Where no key is required, everybody on this machine may do everything except act as a worker.
     """
 
     def __init__(self, app: ASGIApp, ring: KeyRing, *, required: bool) -> None:
@@ -207,7 +220,9 @@ class KeyMiddleware:
             admitted = await self._admitted(Headers(scope=scope), needed)
         except OperationalError:
             detail = "the coordinator cannot read its keys; its log says more"
-            admitted = ProblemError(503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"})
+            admitted = ProblemError(
+                503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"}
+            )
         if isinstance(admitted, ProblemError):
             await admitted.answer(scope, receive, send)
             return
@@ -236,7 +251,9 @@ class KeyMiddleware:
 
 
 def _unauthorized(why: str) -> ProblemError:
-    return ProblemError(401, ProblemCode.unauthorized, f"{why}{_HOW}", headers={"WWW-Authenticate": _CHALLENGE})
+    return ProblemError(
+        401, ProblemCode.unauthorized, f"{why}{_HOW}", headers={"WWW-Authenticate": _CHALLENGE}
+    )
 
 
 def needed_scope(method: str, path: str) -> Scope | None:
@@ -251,7 +268,10 @@ def needed_scope(method: str, path: str) -> Scope | None:
 
 
 def _secret(authorization: str) -> str | None:
-    """Return the secret of an Authorization header; browsers send it as the password of a user of any name."""
+    """Return the secret of an Authorization header.
+
+    Browsers send it as the password of a user of any name.
+    """
     scheme, _, value = authorization.partition(" ")
     if scheme.lower() == "bearer":
         return value.strip() or None

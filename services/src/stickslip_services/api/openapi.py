@@ -11,24 +11,46 @@ from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import Problem
 from stickslip_schemas.documents.responses import JobPatch
 from stickslip_schemas.documents.tasks import task_adapter
-from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, ReportBatch, WorkerRegistration
+from stickslip_schemas.documents.worker_api import (
+    Heartbeat,
+    LeaseRequest,
+    ReportBatch,
+    WorkerRegistration,
+)
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 
 from stickslip_services.access.keys import Scope
 from stickslip_services.api.middleware import needed_scope
 
-_MODELS = (WorkerRegistration, LeaseRequest, Heartbeat, ReportBatch, Certificate, JobPatch, Manifest, Problem)
+_MODELS = (
+    WorkerRegistration,
+    LeaseRequest,
+    Heartbeat,
+    ReportBatch,
+    Certificate,
+    JobPatch,
+    Manifest,
+    Problem,
+)
 _DOCUMENTS: dict[str, TypeAdapter[Any]] = {model.__name__: TypeAdapter(model) for model in _MODELS}
 _DOCUMENTS |= {"JobSpec": job_spec_adapter, "Task": task_adapter}
-_TAGS = {"previews": "jobs", "textures": "uploads", "files": "uploads", "worker": "workers", "": "health"}
+_TAGS = {
+    "previews": "jobs",
+    "textures": "uploads",
+    "files": "uploads",
+    "worker": "workers",
+    "": "health",
+}
 """Tags of paths whose first word is another."""
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document of `app`, with the documents of requests."""
     if not app.openapi_schema:
-        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        document = get_openapi(
+            title=app.title, version=app.version, description=app.description, routes=app.routes
+        )
         components = document.setdefault("components", {}).setdefault("schemas", {})
         document["components"]["securitySchemes"] = {
             "key": {
@@ -37,26 +59,37 @@ def describe(app: FastAPI) -> dict[str, Any]:
                 "description": "an API key, as `stickslip keys create` makes it",
             }
         }
-        # Requests allow more forms than answers (short forms of axes), so their schema holds for both.
+        # Requests allow more forms than answers (short forms of axes), so their schema holds for
+        # both.
         components.update(_body_components())
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
-                operation["tags"] = [_TAGS.get(word := re.split(r"[/:]", path.removeprefix("/v1/"))[0], word)]
+                operation["tags"] = [
+                    _TAGS.get(word := re.split(r"[/:]", path.removeprefix("/v1/"))[0], word)
+                ]
                 if needed_scope(method.upper(), path) is Scope.work:
                     operation["security"] = [{"key": []}]
                 _tidy(operation)
         _name_by_title(document)
         _require_tags(document)
-        for unused in ("HTTPValidationError", "ValidationError"):  # FastAPI's own; we answer with problems
+        for unused in (
+            "HTTPValidationError",
+            "ValidationError",
+        ):  # FastAPI's own; we answer with problems
             components.pop(unused, None)
         app.openapi_schema = document
     return app.openapi_schema
 
 
 def _tidy(operation: dict[str, Any]) -> None:
-    """Drop FastAPI's 422 answer where no parameter can be invalid; make a summary; remove null from parameters."""
+    """Drop FastAPI's 422 answer where no parameter can be invalid.
+
+    Make a summary; remove null from parameters.
+    """
     content = operation["responses"].get("422", {}).get("content", {})
-    if content.get("application/json", {}).get("schema") == {"$ref": "#/components/schemas/HTTPValidationError"}:
+    if content.get("application/json", {}).get("schema") == {
+        "$ref": "#/components/schemas/HTTPValidationError"
+    }:
         del operation["responses"]["422"]
     if "description" in operation:  # its first sentence
         sentence = re.split(r"(?<=[.;:]) |\n", operation["description"], maxsplit=1)[0]
@@ -69,7 +102,9 @@ def _tidy(operation: dict[str, Any]) -> None:
 def _objects(node: Any) -> Iterator[dict[str, Any]]:
     if isinstance(node, dict):
         yield node
-    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+    for value in (
+        node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    ):
         yield from _objects(value)
 
 
@@ -80,11 +115,15 @@ def _require_tags(document: dict[str, Any]) -> None:
         if isinstance(discriminator, dict) and "mapping" in discriminator:
             for reference in discriminator["mapping"].values():
                 member = document["components"]["schemas"][reference.rpartition("/")[2]]
-                member["required"] = sorted({*member.get("required", ()), discriminator["propertyName"]})
+                member["required"] = sorted(
+                    {*member.get("required", ()), discriminator["propertyName"]}
+                )
 
 
 def _name_by_title(document: dict[str, Any]) -> None:
-    """Rename components to their titles where pydantic derived a name from parameters: `ListAxisMu`."""
+    """Rename components to their titles where pydantic derived a name from parameters:
+    `ListAxisMu`.
+    """
     components = document["components"]["schemas"]
     for name in list(components):
         title = components[name].get("title", name)
@@ -99,7 +138,9 @@ def _name_by_title(document: dict[str, Any]) -> None:
 def _body_components() -> dict[str, Any]:
     """Return the OpenAPI components of request documents by name."""
     adapters = [(name, "validation", adapter) for name, adapter in _DOCUMENTS.items()]
-    schemas, shared = TypeAdapter.json_schemas(adapters, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]
+    schemas, shared = TypeAdapter.json_schemas(
+        adapters, ref_template="#/components/schemas/{model}"
+    )  # type: ignore[arg-type]
     components: dict[str, Any] = dict(shared.get("$defs", {}))
     for (name, _), schema in schemas.items():
         if schema != {"$ref": f"#/components/schemas/{name}"}:

@@ -63,11 +63,19 @@ class ProblemError(Exception):
         return Response(content, self.status, self.headers, MEDIA_TYPE)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self.response(scope["path"], scope.get("state", {}).get("request_id"))(scope, receive, send)
+        await self.response(scope["path"], scope.get("state", {}).get("request_id"))(
+            scope, receive, send
+        )
 
 
 def install(app: FastAPI) -> None:
-    known = (ProblemError, errors.StickslipError, RequestValidationError, HTTPException, OperationalError)
+    known = (
+        ProblemError,
+        errors.StickslipError,
+        RequestValidationError,
+        HTTPException,
+        OperationalError,
+    )
     for sort in (*known, OSError, BrokenSectionError, Exception):
         app.add_exception_handler(sort, _answer)
 
@@ -91,7 +99,8 @@ def _problem_of(request: Request, error: Exception) -> ProblemError:
             if status >= 500:
                 logger.error("%s %s: %s", request.method, path, error)
             return ProblemError(status, code, str(error), error.fields)
-        case RequestValidationError():  # parameters of path, query and header; `JsonBody` reads bodies
+        # parameters of path, query and header; `JsonBody` reads bodies
+        case RequestValidationError():
             fields = [
                 FieldError(
                     pointer="".join(f"/{part}" for part in item["loc"]),
@@ -103,27 +112,44 @@ def _problem_of(request: Request, error: Exception) -> ProblemError:
             detail = "; ".join(f"{field.pointer[1:]}: {field.rule}" for field in fields)
             return ProblemError(422, ProblemCode.validation_failed, detail, fields)
         case HTTPException(status_code=404):
-            return ProblemError(404, ProblemCode.not_found, f"there is nothing at {path}", headers=error.headers)
+            return ProblemError(
+                404, ProblemCode.not_found, f"there is nothing at {path}", headers=error.headers
+            )
         case HTTPException(status_code=405):
             allowed = _allowed_methods(request)
             detail = f"{path} answers {allowed}, and not {request.method}"
-            return ProblemError(405, ProblemCode.method_not_allowed, detail, headers={"Allow": allowed})
+            return ProblemError(
+                405, ProblemCode.method_not_allowed, detail, headers={"Allow": allowed}
+            )
         case HTTPException():
-            code = ProblemCode.body_too_large if error.status_code == 413 else ProblemCode.malformed_body
+            code = (
+                ProblemCode.body_too_large
+                if error.status_code == 413
+                else ProblemCode.malformed_body
+            )
             return ProblemError(error.status_code, code, error.detail, headers=error.headers)
         case OperationalError():
             logger.error("%s %s: %s", request.method, path, error)
             if any(words in str(error) for words in ("locked", "busy", "lock timeout")):
                 return ProblemError(
-                    503, ProblemCode.busy, "the database is busy; try again", headers={"Retry-After": "1"}
+                    503,
+                    ProblemCode.busy,
+                    "the database is busy; try again",
+                    headers={"Retry-After": "1"},
                 )
-            detail = "the coordinator cannot use its database (is the disk full?); its log says more"
-            return ProblemError(503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"})
+            detail = (
+                "the coordinator cannot use its database (is the disk full?); its log says more"
+            )
+            return ProblemError(
+                503, ProblemCode.storage_error, detail, headers={"Retry-After": "10"}
+            )
     logger.error("%s %s failed", request.method, path, exc_info=error)
     if isinstance(error, OSError | BrokenSectionError):
         detail = "a file is missing or damaged in the store, or the store is out of reach; the log says more"
         return ProblemError(500, ProblemCode.storage_error, detail)
-    return ProblemError(500, ProblemCode.internal_error, "the coordinator has a fault; its log says more")
+    return ProblemError(
+        500, ProblemCode.internal_error, "the coordinator has a fault; its log says more"
+    )
 
 
 def _allowed_methods(request: Request) -> str:
@@ -134,5 +160,7 @@ def _allowed_methods(request: Request) -> str:
         if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE
     ]
     longest = max((len(route.path) for route in fitting), default=0)
-    methods = {method for route in fitting if len(route.path) == longest for method in route.methods or ()}
+    methods = {
+        method for route in fitting if len(route.path) == longest for method in route.methods or ()
+    }
     return ", ".join(sorted(methods))

@@ -1,8 +1,8 @@
 """Event streams: the stored events of a job after a given one, then new events until the job ends.
 
-All watchers of a job share one feed, which alone reads the database, so a thousand watchers cost no more than one. A
-feed holds no database connection while it waits for the notifier. Progress is not stored and has no id of its own: it
-carries that of the event before it.
+All watchers of a job share one feed, which alone reads the database, so a thousand watchers cost no
+more than one. A feed holds no database connection while it waits for the notifier. Progress is not
+stored and has no id of its own: it carries that of the event before it.
 """
 
 import asyncio
@@ -55,10 +55,15 @@ class EventStream(StreamingResponse):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         address = scope["client"][0] if scope["client"] else "no address"
         owners = {f"key {this_asker().name}": MOST_STREAMS, f"address {address}": MOST_STREAMS}
-        places = {(scope["app"], owner): most for owner, most in {**owners, "coordinator": ALL_STREAMS}.items()}
+        places = {
+            (scope["app"], owner): most
+            for owner, most in {**owners, "coordinator": ALL_STREAMS}.items()
+        }
         for place, most in places.items():
             if self._open[place] >= most:
-                detail = f"the {place[1]} has {most} event streams, and may have no more: close some"
+                detail = (
+                    f"the {place[1]} has {most} event streams, and may have no more: close some"
+                )
                 headers = {"Retry-After": "60"}
                 raise ProblemError(429, ProblemCode.too_many_streams, detail, headers=headers)
         self._open.update(places.keys())
@@ -77,7 +82,10 @@ class Feeds:
 
     def stream(self, job: int, *, after: int) -> StreamingResponse:
         """Answer with the events of a job after the one with the id `after`."""
-        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # no proxy may buffer events
+        headers = {
+            "Cache-Control": "no-store",
+            "X-Accel-Buffering": "no",
+        }  # no proxy may buffer events
         return EventStream(self._watch(job, after), headers=headers, media_type="text/event-stream")
 
     async def _watch(self, job: int, cursor: int) -> AsyncIterator[bytes]:
@@ -103,7 +111,9 @@ class _Feed:
         self._context = context
         self._job = job
         self._after = after
-        """`_events`, those of the last look, are all events after this id; older ones are read from the database."""
+        """`_events`, those of the last look, are all events after this id; older ones are read from
+        the database.
+        """
         self._events: list[StoredEvent] = []
         self._progress = ""
         self._is_complete = False
@@ -123,12 +133,16 @@ class _Feed:
             last: list[bytes] = []  # the end of the job comes after the progress that goes with it
             for event in events:
                 cursor = event.id
-                (last if event.is_last else messages).append(_message(event.name, event.data, cursor))
+                (last if event.is_last else messages).append(
+                    _message(event.name, event.data, cursor)
+                )
             is_up_to_date = cursor >= self._newest
             ended = self._is_complete and is_up_to_date
             if self._progress not in ("", told) and is_up_to_date and (last or not ended):
                 told = self._progress
-                messages.append(_message(EventName.job_progress, told, cursor - 1 if last else cursor))
+                messages.append(
+                    _message(EventName.job_progress, told, cursor - 1 if last else cursor)
+                )
             if messages or last:
                 messages.insert(0, opening)
                 opening = b""
@@ -152,20 +166,26 @@ class _Feed:
         if cursor >= self._after:
             return [event for event in self._events if event.id > cursor]
         older = await run_in_threadpool(self._read, cursor)
-        return [event for event in older if event.id <= self._newest]  # newer ones come with their progress
+        return [
+            event for event in older if event.id <= self._newest
+        ]  # newer ones come with their progress
 
     def _read(self, after: int) -> list[StoredEvent]:
         with self._context.database.read() as connection:
             return read_events(connection, self._job, after=after, limit=BATCH)
 
     def _look(self, *, with_progress: bool) -> tuple[list[StoredEvent], str | None, bool]:
-        """Return new events, the progress if it was read, and whether the job has ended and these are its last."""
+        """Return new events, the progress if it was read, and whether the job has ended and these
+        are its last.
+        """
         with self._context.database.read() as connection:
             events = read_events(connection, self._job, after=self._newest, limit=BATCH)
             is_shown = with_progress or any(event.is_last for event in events)
             shown = show_job(self._context, connection, self._job) if is_shown else None
         ended = shown is not None and not shown.state.is_open and len(events) < BATCH
-        progress = None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
+        progress = (
+            None if shown is None else JobProgressEvent(progress=shown.progress).model_dump_json()
+        )
         return events, progress, ended
 
     async def _follow(self) -> None:
@@ -176,7 +196,9 @@ class _Feed:
                 seen = self._context.notifier.count
                 now = time.monotonic()
                 is_progress_due = now - looked_at >= PROGRESS_SECONDS
-                events, progress, ended = await run_in_threadpool(self._look, with_progress=is_progress_due)
+                events, progress, ended = await run_in_threadpool(
+                    self._look, with_progress=is_progress_due
+                )
                 if progress is not None:
                     looked_at = now
                 self._take(events, progress, ended=ended)
@@ -184,7 +206,11 @@ class _Feed:
                     continue
                 # A busy queue notifies all the time; a few looks a second are enough for people.
                 await asyncio.sleep(LOOK_SECONDS)
-                due_in = KEEP_ALIVE_SECONDS if is_progress_due else looked_at + PROGRESS_SECONDS - time.monotonic()
+                due_in = (
+                    KEEP_ALIVE_SECONDS
+                    if is_progress_due
+                    else looked_at + PROGRESS_SECONDS - time.monotonic()
+                )
                 await self._context.notifier.wait(seen, max(0.0, due_in))
         finally:
             self._tell()

@@ -1,4 +1,7 @@
-"""What jobs build on: certificates; uploaded textures, meshes and paths, which specs name by digest; and scenes."""
+"""What jobs build on: certificates.
+
+Uploaded textures, meshes and paths, which specs name by digest; and scenes.
+"""
 
 import json
 from dataclasses import dataclass, field
@@ -23,8 +26,12 @@ from stickslip_services.database.tables import certificates, dataset_versions, j
 from stickslip_services.errors import NotFoundError, UnknownFileError
 
 
-def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) -> tuple[Sha256, list[str]] | None:
-    """Return digest and protocols of the newest full certificate of a preset and a build, if it passed."""
+def standing_certificate(
+    connection: Connection, preset: str, sim_core: Sha256
+) -> tuple[Sha256, list[str]] | None:
+    """Return digest and protocols of the newest full certificate of a preset and a build, if it
+    passed.
+    """
     columns = certificates.c
     row = connection.execute(
         select(columns.digest, columns.passed, columns.protocols)
@@ -35,10 +42,15 @@ def standing_certificate(connection: Connection, preset: str, sim_core: Sha256) 
     return (row.digest, row.protocols.split()) if row is not None and row.passed else None
 
 
-def register_certificate(database: Database, store: Store, certificate: Certificate, now: float) -> CertificateEntry:
+def register_certificate(
+    database: Database, store: Store, certificate: Certificate, now: float
+) -> CertificateEntry:
     """Store a certificate, and register it; a known one becomes the newest again."""
     artifact = store.publish(certificate.canonical())
-    values = {"created_at": now, "protocols": " ".join(report.protocol for report in certificate.protocols)}
+    values = {
+        "created_at": now,
+        "protocols": " ".join(report.protocol for report in certificate.protocols),
+    }
     with database.write() as connection:
         known = update(certificates).where(certificates.c.digest == certificate.digest)
         if connection.execute(known.values(values)).rowcount == 0:
@@ -54,18 +66,29 @@ def register_certificate(database: Database, store: Store, certificate: Certific
                 )
             )
         entry = _entry(find_certificate(connection, certificate.digest))
-        note(connection, "certificate.register", entry.digest, now, preset=entry.preset, passed=entry.passed)
+        note(
+            connection,
+            "certificate.register",
+            entry.digest,
+            now,
+            preset=entry.preset,
+            passed=entry.passed,
+        )
         return entry
 
 
 def list_certificates(connection: Connection, page: PageRequest) -> Page[CertificateEntry]:
     """Return a page of certificates, newest first."""
-    return read_page(connection, select(certificates), page, certificates.c.seq, lambda rows: map(_entry, rows))
+    return read_page(
+        connection, select(certificates), page, certificates.c.seq, lambda rows: map(_entry, rows)
+    )
 
 
 def find_certificate(connection: Connection, digest: str) -> Row[tuple[Any, ...]]:
     """Return the row of a certificate; raise NotFoundError."""
-    row = connection.execute(select(certificates).where(certificates.c.digest == digest)).one_or_none()
+    row = connection.execute(
+        select(certificates).where(certificates.c.digest == digest)
+    ).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no certificate {digest[:100]!r}")
     return row
@@ -78,13 +101,17 @@ def _entry(row: Row[tuple[Any, ...]]) -> CertificateEntry:
 def store_texture(database: Database, store: Store, data: bytes) -> TextureEntry:
     """Store a picture file; raise UnfitPictureError where it cannot be a texture."""
     side = len(read_picture(data))
-    return TextureEntry(texture=f"{ARTIFACT}{_store(database, store, data)}", side=side, bytes=len(data))
+    return TextureEntry(
+        texture=f"{ARTIFACT}{_store(database, store, data)}", side=side, bytes=len(data)
+    )
 
 
 def store_file(database: Database, store: Store, data: bytes) -> FileUpload:
     """Store a file of a scene; raise UnfitFileError where it can be none."""
     counts = counts_of(data)
-    return FileUpload(file=f"{ARTIFACT}{_store(database, store, data)}", counts=counts, bytes=len(data))
+    return FileUpload(
+        file=f"{ARTIFACT}{_store(database, store, data)}", counts=counts, bytes=len(data)
+    )
 
 
 def _store(database: Database, store: Store, data: bytes) -> Sha256:
@@ -97,13 +124,16 @@ def _store(database: Database, store: Store, data: bytes) -> Sha256:
 
 
 def check_files(database: Database, store: Store, spec: JobSpec) -> None:
-    """Raise UnknownFileError where a spec names files that are missing, damaged, or not what it needs.
+    """Raise UnknownFileError where a spec names files that are missing, damaged, or not what it
+    needs.
 
     Those of other projects are as good as missing. Files of built-in scenes are stored first.
     """
     wrong = []
     with database.read() as connection:
-        asked = select(uploads.c.digest).where(uploads.c.digest.in_(spec.artifacts.values()), own(uploads.c.project))
+        asked = select(uploads.c.digest).where(
+            uploads.c.digest.in_(spec.artifacts.values()), own(uploads.c.project)
+        )
         uploaded = set(connection.scalars(asked))
     for pointer, digest in spec.artifacts.items():
         try:
@@ -124,13 +154,19 @@ def check_files(database: Database, store: Store, spec: JobSpec) -> None:
         for place, name in spec.scene.files():
             if not name.startswith(ARTIFACT):
                 rule = "must be sha256: and the digest of an uploaded file; `stickslip submit` uploads files of scenes"
-                wrong.append(FieldError(pointer="/".join(("/scene", *map(str, place))), rule=rule, value=f'"{name}"'))
+                wrong.append(
+                    FieldError(
+                        pointer="/".join(("/scene", *map(str, place))), rule=rule, value=f'"{name}"'
+                    )
+                )
     if wrong:
         raise UnknownFileError(wrong)
 
 
 def _check(spec: JobSpec, pointer: str, data: bytes) -> None:
-    """Raise UnfitPictureError or UnfitFileError where a file is not what the spec needs at a pointer."""
+    """Raise UnfitPictureError or UnfitFileError where a file is not what the spec needs at a
+    pointer.
+    """
     words = pointer.split("/")[1:]
     if isinstance(spec, ClothSceneSpec) and words[0] == "scene" and words[1] != "looks":
         check_scene_file(spec.stage, tuple(words[1:]), data)
@@ -154,7 +190,10 @@ class KnownScene:
 
 def known_scenes(connection: Connection) -> dict[str, KnownScene]:
     """Return scenes by digest: the built-in ones, and those of the newest jobs."""
-    found = {scene.digest: KnownScene(scene, is_built_in=True) for scene in map(load_scene, scene_names())}
+    found = {
+        scene.digest: KnownScene(scene, is_built_in=True)
+        for scene in map(load_scene, scene_names())
+    }
     rows = connection.execute(
         select(jobs.c.spec, jobs.c.dataset, jobs.c.version)
         .where(jobs.c.kind == KIND, own(jobs.c.project))
@@ -164,7 +203,9 @@ def known_scenes(connection: Connection) -> dict[str, KnownScene]:
     kept = dataset_versions.c.manifest.is_not(None)
     there = {
         tuple(one)
-        for one in connection.execute(select(dataset_versions.c.dataset, dataset_versions.c.version).where(kept))
+        for one in connection.execute(
+            select(dataset_versions.c.dataset, dataset_versions.c.version).where(kept)
+        )
     }
     for row in rows:
         scene = Scene.model_validate(json.loads(row.spec)["scene"])

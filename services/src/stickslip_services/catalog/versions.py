@@ -1,4 +1,7 @@
-"""Datasets, their versions and files. A version exists as soon as the digest of its manifest is in the database."""
+"""Datasets, their versions and files.
+
+A version exists as soon as the digest of its manifest is in the database.
+"""
 
 import time
 from collections.abc import Mapping
@@ -10,7 +13,12 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
 from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
-from stickslip_schemas.documents.tasks import PackOutput, PublishOutput, RenderOutput, SimulateOutput
+from stickslip_schemas.documents.tasks import (
+    PackOutput,
+    PublishOutput,
+    RenderOutput,
+    SimulateOutput,
+)
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
@@ -35,14 +43,21 @@ HEADS_AT_ONCE = 128
 
 
 def stored_contents(store: Store, manifest: Sha256) -> Contents:
-    """Return what a manifest in the store lists; raise OSError or ValueError. Sections are read on demand."""
+    """Return what a manifest in the store lists; raise OSError or ValueError.
+
+    Sections are read on demand.
+    """
     document = Manifest.model_validate_json(store.read(manifest))
     return Contents(document, lambda file: store.read(file.sha256))
 
 
 def sealed_digests(manifest: Sha256, group: Sha256) -> dict[str, Sha256]:
     """Return the digests of the files of a version that its manifest does not list, by path."""
-    return {MANIFEST_NAME: manifest, GROUP_NAME: group, SEAL_NAME: sha256(seal_text(manifest, group))}
+    return {
+        MANIFEST_NAME: manifest,
+        GROUP_NAME: group,
+        SEAL_NAME: sha256(seal_text(manifest, group)),
+    }
 
 
 def read_version(store: Store, output: PublishOutput) -> Manifest:
@@ -53,8 +68,13 @@ def read_version(store: Store, output: PublishOutput) -> Manifest:
     check_seal(*map(store.read, sealed_digests(output.manifest, output.group).values()))
     contents = stored_contents(store, output.manifest)
     manifest = contents.manifest
-    if manifest.spec.dataset_id != manifest.dataset or manifest.spec.content_digest != manifest.spec_digest:
-        raise ValueError(f"the manifest's dataset is {manifest.dataset}, and its spec is that of another")
+    if (
+        manifest.spec.dataset_id != manifest.dataset
+        or manifest.spec.content_digest != manifest.spec_digest
+    ):
+        raise ValueError(
+            f"the manifest's dataset is {manifest.dataset}, and its spec is that of another"
+        )
     files = list(contents.files())
     sizes = in_parallel(lambda file: store.size(file.sha256), files, at_once=HEADS_AT_ONCE)
     for file, size in zip(files, sizes, strict=True):
@@ -94,13 +114,17 @@ def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutpu
         named |= {file.sha256: file.size for file in output.files} | {output.labels: 1}
     for digest, size in named.items():
         if not store.exists(digest, size=size):
-            raise CorruptArtifactError(f"artifact {digest} must be in the store with at least {size} bytes")
+            raise CorruptArtifactError(
+                f"artifact {digest} must be in the store with at least {size} bytes"
+            )
 
 
 def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] | None:
     """Return the dataset and the version number reserved for a publish task."""
     query = select(dataset_versions.c.dataset, dataset_versions.c.version)
-    row = connection.execute(query.where(dataset_versions.c.publish_task == publish_task)).one_or_none()
+    row = connection.execute(
+        query.where(dataset_versions.c.publish_task == publish_task)
+    ).one_or_none()
     return None if row is None else (row.dataset, row.version)
 
 
@@ -114,7 +138,9 @@ def version_number(connection: Connection, dataset: str, publish_task: int) -> i
 
 
 def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
-    connection.execute(insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task))
+    connection.execute(
+        insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task)
+    )
 
 
 def commit_version(
@@ -128,7 +154,12 @@ def commit_version(
 ) -> None:
     """Commit a version; with its first version a dataset gets its `name`."""
     if connection.scalar(select(datasets.c.seq).where(datasets.c.id == manifest.dataset)) is None:
-        row = {"id": manifest.dataset, "name": name, "kind": manifest.spec.kind, "spec_digest": manifest.spec_digest}
+        row = {
+            "id": manifest.dataset,
+            "name": name,
+            "kind": manifest.spec.kind,
+            "spec_digest": manifest.spec_digest,
+        }
         connection.execute(insert(datasets).values(row))
     connection.execute(
         update(dataset_versions)
@@ -147,14 +178,20 @@ def commit_version(
 
 
 def find_committed(connection: Connection, publish_task: int) -> Row[Any]:
-    return connection.execute(select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)).one()
+    return connection.execute(
+        select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)
+    ).one()
 
 
-def damaged_files(store: Store, manifest: Sha256, group: Sha256, *, rate: float = inf) -> Mapping[str, Sha256] | None:
-    """Return path and digest of the damaged files of a version, in the store or in the version's directory.
+def damaged_files(
+    store: Store, manifest: Sha256, group: Sha256, *, rate: float = inf
+) -> Mapping[str, Sha256] | None:
+    """Return path and digest of the damaged files of a version, in the store or in the version's
+    directory.
 
-    None if the manifest, the root's metadata or the seal is damaged, so that the others are unknown. All files are
-    read, at `rate` [bytes/s]. Raises OSError where the store is out of reach.
+    None if the manifest, the root's metadata or the seal is damaged, so that the others are
+    unknown. All files are read, at `rate` [bytes/s]. Raises OSError where the store is out of
+    reach.
     """
     own = sealed_digests(manifest, group)
     try:
@@ -171,22 +208,36 @@ def damaged_files(store: Store, manifest: Sha256, group: Sha256, *, rate: float 
     def is_whole(shown: tuple[str, Sha256]) -> bool:
         path, digest = shown
         time.sleep(sizes.get(path, 0) / rate)
-        return store.shows(digest, contents.manifest.dataset, contents.manifest.version, path) and store.holds(digest)
+        return store.shows(
+            digest, contents.manifest.dataset, contents.manifest.version, path
+        ) and store.holds(digest)
 
     # Threads of a pool would read to the end before the process may end.
     whole = in_parallel(is_whole, files.items()) if rate == inf else map(is_whole, files.items())
-    return {path: digest for (path, digest), is_good in zip(files.items(), whole, strict=True) if not is_good}
+    return {
+        path: digest
+        for (path, digest), is_good in zip(files.items(), whole, strict=True)
+        if not is_good
+    }
 
 
 def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
     """Return a page of datasets, newest first."""
     shown = partial(_shown_dataset, connection)
-    return read_page(connection, select(datasets).where(_is_own()), page, datasets.c.seq, lambda rows: map(shown, rows))
+    return read_page(
+        connection,
+        select(datasets).where(_is_own()),
+        page,
+        datasets.c.seq,
+        lambda rows: map(shown, rows),
+    )
 
 
 def find_dataset(connection: Connection, dataset: str) -> Dataset:
     """Return a dataset with its committed versions; raise NotFoundError."""
-    row = connection.execute(select(datasets).where(datasets.c.id == dataset, _is_own())).one_or_none()
+    row = connection.execute(
+        select(datasets).where(datasets.c.id == dataset, _is_own())
+    ).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no dataset {dataset[:100]!r}")
     return _shown_dataset(connection, row)
@@ -212,12 +263,16 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
     if file is None:
         raise NotFoundError(f"version {version.version} has no file {path[:200]!r}")
     if store.size(file.sha256) != file.size:
-        raise CorruptArtifactError(f"file {path} of version {version.version} is damaged in the store")
+        raise CorruptArtifactError(
+            f"file {path} of version {version.version} is damaged in the store"
+        )
     return file
 
 
 read_contents = lru_cache(maxsize=16)(stored_contents)
-"""Returns what a manifest lists. It never changes; a section is read with the first request for one of its files."""
+"""Returns what a manifest lists. It never changes; a section is read with the first request for one
+of its files.
+"""
 
 
 def _is_own() -> ColumnElement[bool]:
@@ -227,8 +282,14 @@ def _is_own() -> ColumnElement[bool]:
 def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
     versions = connection.execute(
         select(dataset_versions)
-        .where(dataset_versions.c.dataset == row.id, dataset_versions.c.manifest.is_not(None), own_version())
+        .where(
+            dataset_versions.c.dataset == row.id,
+            dataset_versions.c.manifest.is_not(None),
+            own_version(),
+        )
         .order_by(dataset_versions.c.version)
     )
-    shown = (document_of(DatasetVersion, version, group=version.group_digest) for version in versions)
+    shown = (
+        document_of(DatasetVersion, version, group=version.group_digest) for version in versions
+    )
     return document_of(Dataset, row, versions=tuple(shown))

@@ -31,7 +31,10 @@ _COMMANDS = {
 _COMPLETIONS = {
     "bash": ("~/.bashrc", 'eval "$(_STICKSLIP_COMPLETE=bash_source stickslip)"'),
     "zsh": ("~/.zshrc", 'eval "$(_STICKSLIP_COMPLETE=zsh_source stickslip)"'),
-    "fish": ("~/.config/fish/completions/stickslip.fish", "_STICKSLIP_COMPLETE=fish_source stickslip | source"),
+    "fish": (
+        "~/.config/fish/completions/stickslip.fish",
+        "_STICKSLIP_COMPLETE=fish_source stickslip | source",
+    ),
 }
 """File of each shell, and the line in it that completes our commands."""
 
@@ -39,10 +42,14 @@ _COMPLETIONS = {
 @cache
 def _loaded(name: str) -> click.Command:
     """Return a command, of whose module the import takes most of the time of a short command."""
-    from stickslip_services.cli.common import shows_errors  # some need the server, which a client lacks
+    from stickslip_services.cli.common import (
+        shows_errors,
+    )  # some need the server, which a client lacks
 
     module, attribute = _COMMANDS[name]
-    command: click.Command = getattr(shows_errors(import_module)(f"stickslip_services.cli.{module}"), attribute)
+    command: click.Command = getattr(
+        shows_errors(import_module)(f"stickslip_services.cli.{module}"), attribute
+    )
     return command
 
 
@@ -54,7 +61,11 @@ def _source(module: str) -> list[ast.stmt]:
 def _help(name: str) -> str:
     """Return the docstring of a command, from its source."""
     module, attribute = _COMMANDS[name]
-    found = (node for node in _source(module) if isinstance(node, ast.FunctionDef) and node.name == attribute)
+    found = (
+        node
+        for node in _source(module)
+        if isinstance(node, ast.FunctionDef) and node.name == attribute
+    )
     return ast.get_docstring(next(found)) or ""
 
 
@@ -68,7 +79,9 @@ class _Commands(click.Group):
         return click.Command(cmd_name, help=_help(cmd_name)) if cmd_name in _COMMANDS else None
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[Any, Any, list[str]]:
-        self.commands = {known: click.Command(known) for known in _COMMANDS}  # near names are looked for here
+        self.commands = {
+            known: click.Command(known) for known in _COMMANDS
+        }  # near names are looked for here
         name, listed, rest = super().resolve_command(ctx, args)
         return name, listed and _loaded(str(name)), rest
 

@@ -1,7 +1,8 @@
-"""Running a service on this machine, and administering it: API keys, projects, webhooks and the audit log.
+"""Running a service on this machine, and administering it: API keys, projects, webhooks and the
+audit log.
 
-The commands of administration open the database of a data directory, also while the coordinator runs. They need no API
-key: users who may write the data directory may make keys.
+The commands of administration open the database of a data directory, also while the coordinator
+runs. They need no API key: users who may write the data directory may make keys.
 """
 
 import functools
@@ -27,7 +28,10 @@ from stickslip_services.settings import SERVER, Settings, options
 
 
 @click.command()
-@click.option("--name", help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL")
+@click.option(
+    "--name",
+    help="name of the dispatcher; `local`, or this machine's where the database is PostgreSQL",
+)
 @click.option("--slots", type=click.IntRange(1), help="tasks at once; as many as there are cores")
 @click.option("--workers", hidden=True, help="another program than stickslip_workers, for tests")
 @shows_errors
@@ -85,14 +89,18 @@ def keys() -> None:
     help="repeatable; `submit` includes `read`, `admin` includes all",
 )
 @click.option(
-    "--project", default="", help="project of the jobs that it submits: projects share leases, and may have quotas"
+    "--project",
+    default="",
+    help="project of the jobs that it submits: projects share leases, and may have quotas",
 )
 @administers
 def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], project: str) -> None:
     """Make a key and print it. It is shown only once, because the database keeps only its digest."""
     key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
-    say(f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header")
+    say(
+        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header"
+    )
     say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
 
 
@@ -125,24 +133,40 @@ def projects() -> None:
 @projects.command("list")
 @administers
 def list_projects(connection: Connection) -> None:
-    """List projects with their quotas, and the jobs and samples in progress that count against them."""
+    """List projects with their quotas, and the jobs and samples in progress that count against
+    them.
+    """
     rows = []
     for project in stored_keys.list_projects(connection):
         limits = _limit(project.max_jobs), _limit(project.max_samples)
-        rows.append((project.name or "(none)", f"{project.jobs:,}", limits[0], f"{project.samples:,}", limits[1]))
+        rows.append(
+            (
+                project.name or "(none)",
+                f"{project.jobs:,}",
+                limits[0],
+                f"{project.samples:,}",
+                limits[1],
+            )
+        )
     print_table(("project", "jobs", "at most", "samples", "at most"), rows)
 
 
 @projects.command("quota")
 @click.argument("name", metavar="PROJECT", help="'' for requests without a project")
-@click.option("--samples", type=click.IntRange(0), help="most samples of jobs in progress; default: any number")
+@click.option(
+    "--samples",
+    type=click.IntRange(0),
+    help="most samples of jobs in progress; default: any number",
+)
 @click.option("--jobs", type=click.IntRange(0), help="most jobs in progress; default: any number")
 @administers
 def set_quota(connection: Connection, name: str, samples: int | None, jobs: int | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
     stored_keys.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
-    click.echo(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
+    click.echo(
+        f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended"
+    )
 
 
 def _limit(value: int | None) -> str:
@@ -156,16 +180,22 @@ def webhooks() -> None:
 
 @webhooks.command("create")
 @click.argument("url", help="receiver of the events: https://..., or http:// on this machine")
-@click.option("--project", default="", help="project whose jobs it hears of; default: jobs without one")
+@click.option(
+    "--project", default="", help="project whose jobs it hears of; default: jobs without one"
+)
 @shows_errors
 @options("data", "database")
 def create_webhook(settings: Settings, url: str, project: str) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
     with visited(settings) as connection:
         sealing = stored_keys.sealer(settings)
-        webhook_id, secret = stored_webhooks.create_webhook(connection, sealing, url, time.time(), project=project)
+        webhook_id, secret = stored_webhooks.create_webhook(
+            connection, sealing, url, time.time(), project=project
+        )
     click.echo(secret)
-    say(f"{webhook_id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes")
+    say(
+        f"{webhook_id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes"
+    )
 
 
 @webhooks.command("list")
@@ -177,7 +207,9 @@ def list_webhooks(connection: Connection) -> None:
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
         made = f"{as_datetime(webhook.created_at):%Y-%m-%d %H:%M}"
         rows.append((webhook.id, webhook.url, str(webhook.failures), webhook.project, made, fault))
-    print_table(("webhook", "url", "failed tries", "project", "made", "fault"), rows, sentences=True)
+    print_table(
+        ("webhook", "url", "failed tries", "project", "made", "fault"), rows, sentences=True
+    )
 
 
 @webhooks.command("retry")
@@ -199,9 +231,16 @@ def delete_webhook(connection: Connection, webhook: str) -> None:
 
 
 @click.command()
-@click.argument("subject", metavar="[ID]", required=False, help="only changes of this job, version, key or webhook")
+@click.argument(
+    "subject",
+    metavar="[ID]",
+    required=False,
+    help="only changes of this job, version, key or webhook",
+)
 @click.option("--limit", type=click.IntRange(1), default=100, help="most entries to show")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON document a line, for programs")
+@click.option(
+    "--json", "as_json", is_flag=True, help="print one JSON document a line, for programs"
+)
 @administers
 def audit_log(connection: Connection, subject: str | None, limit: int, as_json: bool) -> None:
     """Show who changed what and when, newest first."""
@@ -213,5 +252,7 @@ def audit_log(connection: Connection, subject: str | None, limit: int, as_json: 
     rows = []
     for entry in entries:
         details = ", ".join(f"{name} {value}" for name, value in entry.details.items())
-        rows.append((f"{entry.at:%Y-%m-%d %H:%M:%S}", entry.actor, entry.action, entry.subject, details))
+        rows.append(
+            (f"{entry.at:%Y-%m-%d %H:%M:%S}", entry.actor, entry.action, entry.subject, details)
+        )
     print_table(("when", "who", "what", "to what", "details"), rows, sentences=True)

@@ -1,4 +1,6 @@
-"""Options, tables, JSON output and errors (field, rule and value, without a traceback), shared by the commands."""
+"""Options, tables, JSON output and errors (field, rule and value, without a traceback), shared by
+the commands.
+"""
 
 import functools
 import json
@@ -18,7 +20,13 @@ from pydantic import BaseModel
 from stickslip_schemas.documents.problems import FieldError
 
 from stickslip_services.addresses import DEFAULT_URL
-from stickslip_services.client.http import Client, ClientError, MissingExtraError, ProblemError, UnreachableError
+from stickslip_services.client.http import (
+    Client,
+    ClientError,
+    MissingExtraError,
+    ProblemError,
+    UnreachableError,
+)
 from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")
@@ -30,7 +38,9 @@ ARRAYS = frozenset({"google_crc32c", "numcodecs", "numpy", "obstore", "scipy", "
 _LEAST_SENTENCE = 30
 """Least width of a column of sentences [characters]."""
 
-_url_option = click.option("--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, help="where the coordinator is")
+_url_option = click.option(
+    "--url", envvar="STICKSLIP_URL", default=DEFAULT_URL, help="where the coordinator is"
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="print JSON for programs")
 spec_argument = click.argument("file", type=FILE, help="a JobSpec, YAML or JSON")
 job_argument = click.argument("job_id", metavar="JOB", help="id of a job")
@@ -65,23 +75,40 @@ def room() -> int:
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
 
 
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, sentences: bool = False) -> None:
-    """Print rows under their heads. Columns come by importance: in a narrow terminal the last ones are left out.
+def print_table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], *, sentences: bool = False
+) -> None:
+    """Print rows under their heads.
+
+    Columns come by importance: in a narrow terminal the last ones are left out.
 
     With `sentences`, the last column is text, which stays and is wrapped between words.
     """
-    lines = [tuple(click.style(head, bold=True) for head in heads), *rows] if any(heads) else list(rows)
+    lines = (
+        [tuple(click.style(head, bold=True) for head in heads), *rows] if any(heads) else list(rows)
+    )
     widths = [max(map(_width, column)) for column in zip(*lines, strict=True)]
     columns = list(range(len(widths)))
     if sentences and widths:
-        widths[-1] = min(widths[-1], max(_LEAST_SENTENCE, room() - sum(widths[:-1]) - 2 * len(widths) + 2))
-    while len(columns) > 1 + sentences and sum(widths[column] + 2 for column in columns) - 2 > room():
+        widths[-1] = min(
+            widths[-1], max(_LEAST_SENTENCE, room() - sum(widths[:-1]) - 2 * len(widths) + 2)
+        )
+    while (
+        len(columns) > 1 + sentences and sum(widths[column] + 2 for column in columns) - 2 > room()
+    ):
         columns.pop(-1 - sentences)
     for line in lines:
         cells = [line[column] for column in columns]
-        text = textwrap.wrap(cells[-1], widths[-1], break_long_words=False, break_on_hyphens=False) if sentences else []
+        text = (
+            textwrap.wrap(cells[-1], widths[-1], break_long_words=False, break_on_hyphens=False)
+            if sentences
+            else []
+        )
         start = cells[:-1] if sentences else cells
-        padded = [cell + " " * (widths[column] - _width(cell)) for column, cell in zip(columns, start, strict=False)]
+        padded = [
+            cell + " " * (widths[column] - _width(cell))
+            for column, cell in zip(columns, start, strict=False)
+        ]
         indent = "\n" + " " * sum(widths[column] + 2 for column in columns[:-1])
         click.echo("  ".join([*padded, indent.join(text)] if sentences else padded).rstrip())
     if len(columns) < len(widths):
@@ -112,7 +139,9 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         try:
             return command(*arguments, **options)
         except ProblemError as error:
-            _print_error(error.problem.detail if not error.problem.errors else "the document is not valid")
+            _print_error(
+                error.problem.detail if not error.problem.errors else "the document is not valid"
+            )
             for field in error.problem.errors:
                 say(field_line(field))
             if error.problem.request_id and error.problem.status >= 500:

@@ -13,7 +13,15 @@ from click.exceptions import Exit
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 
-from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table, say, shows_errors
+from stickslip_services.cli.common import (
+    FILE,
+    asks,
+    json_option,
+    print_json,
+    print_table,
+    say,
+    shows_errors,
+)
 from stickslip_services.client import pulling
 from stickslip_services.client.http import Client, ClientError
 from stickslip_services.client.verifying import READS_ARRAYS, sign_directory, signer_of
@@ -21,7 +29,9 @@ from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
 
 allowed_signers_option = click.option(
-    "--allowed-signers", type=FILE, help="refuse a dataset that nobody of this file of ssh-keygen(1) has signed"
+    "--allowed-signers",
+    type=FILE,
+    help="refuse a dataset that nobody of this file of ssh-keygen(1) has signed",
 )
 
 
@@ -44,9 +54,15 @@ def datasets(client: Client, as_json: bool) -> None:
 @click.command()
 @click.argument("dataset", metavar="DATASET[:vN]", help="without :vN, the newest version")
 @click.argument("target", metavar="DEST", type=FILE, help="directory to write to")
-@click.option("--arrays", help="arrays to take, with commas between; labels always come; without, all")
+@click.option(
+    "--arrays", help="arrays to take, with commas between; labels always come; without, all"
+)
 @click.option("--split", help="train, validation or test; without, all")
-@click.option("--where", multiple=True, help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat")
+@click.option(
+    "--where",
+    multiple=True,
+    help="a condition on a label, as in 'mu<0.5' or 'material==denim'; may repeat",
+)
 @allowed_signers_option
 @asks
 def pull(
@@ -58,10 +74,13 @@ def pull(
     where: tuple[str, ...],
     allowed_signers: Path | None,
 ) -> None:
-    """Download a dataset or a part of it. Every file is checked, and intact files are not downloaded again.
+    """Download a dataset or a part of it.
 
-    A part has all labels and, of the other arrays, the shards that hold a chosen sample. The reader of
-    stickslip-training shows only the chosen samples; other readers show fill values for missing samples.
+    Every file is checked, and intact files are not downloaded again.
+
+    A part has all labels and, of the other arrays, the shards that hold a chosen sample. The reader
+    of stickslip-training shows only the chosen samples; other readers show fill values for missing
+    samples.
     """
     try:
         selection = Selection.of_options(arrays, split, where)
@@ -69,7 +88,9 @@ def pull(
         raise ClientError(str(error)) from error
     name, version = _resolve(client, dataset)
     counting = Lock()  # files are downloaded by several threads
-    with click.progressbar(length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr) as bar:
+    with click.progressbar(
+        length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr
+    ) as bar:
 
         def on_bytes(count: int) -> None:
             with counting:
@@ -90,18 +111,29 @@ def pull(
         f"{name}:v{version} is in {target}: {done.downloaded_files} files downloaded "
         f"({size(done.downloaded_bytes)}), {there} already there"
     )
-    say(f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}")
+    say(
+        f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}"
+    )
 
 
-@click.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+@click.command(
+    context_settings={
+        "allow_extra_args": True,
+        "ignore_unknown_options": True,
+        "help_option_names": [],
+    }
+)
 @asks
 def export(client: Client) -> None:
     """Export a dataset to a format of another library.
 
-    Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes the URL of a version.
+    Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes
+    the URL of a version.
     """
     if find_spec("stickslip_training") is None:
-        raise ClientError("`stickslip export` needs the training package: pip install 'stickslip-training[export]'")
+        raise ClientError(
+            "`stickslip export` needs the training package: pip install 'stickslip-training[export]'"
+        )
     given = click.get_current_context().args
     arguments = []
     for argument in given:
@@ -128,13 +160,21 @@ def _resolve(client: Client, dataset: str) -> tuple[str, int]:
 
 
 @click.command()
-@click.argument("target", metavar="DIR", type=FILE, help="a dataset that was pulled, or a version in a store")
+@click.argument(
+    "target", metavar="DIR", type=FILE, help="a dataset that was pulled, or a version in a store"
+)
 @click.option(
-    "--key", type=FILE, required=True, help="private key of OpenSSH, or a public key whose private one an agent has"
+    "--key",
+    type=FILE,
+    required=True,
+    help="private key of OpenSSH, or a public key whose private one an agent has",
 )
 @shows_errors
 def sign(target: Path, key: Path) -> None:
-    """Sign a dataset with a key of OpenSSH. The signature, manifest.sha256.sig, covers all of its files."""
+    """Sign a dataset with a key of OpenSSH.
+
+    The signature, manifest.sha256.sig, covers all of its files.
+    """
     sign_directory(target, key)
     click.echo(f"{target / SIGNATURE_NAME} is written")
 
@@ -144,17 +184,27 @@ def sign(target: Path, key: Path) -> None:
 @allowed_signers_option
 @shows_errors
 def verify(target: Path, allowed_signers: Path | None) -> None:
-    """Check every file of a dataset against its manifest, and who signed it; exit with 1 if anything is wrong."""
+    """Check every file of a dataset against its manifest, and who signed it.
+
+    Exit with 1 if anything is wrong.
+    """
     signed = "" if allowed_signers is None else f", signed by {signer_of(target, allowed_signers)}"
     faults = find_faults(target)
     if not faults:
         click.echo(f"{target}: all files are present and unchanged{signed}")
         if not READS_ARRAYS:
-            say("sample keys were not compared with the manifest: that needs pip install 'stickslip[arrays]'")
+            say(
+                "sample keys were not compared with the manifest: that needs pip install 'stickslip[arrays]'"
+            )
         return
-    print_table(("file", "fault", "detail"), ((each.path, each.fault, each.detail) for each in faults), sentences=True)
+    print_table(
+        ("file", "fault", "detail"),
+        ((each.path, each.fault, each.detail) for each in faults),
+        sentences=True,
+    )
     files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
     click.secho(
-        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.", fg="red"
+        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.",
+        fg="red",
     )
     raise Exit(1)

@@ -1,4 +1,6 @@
-"""Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise and cancel."""
+"""Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise
+and cancel.
+"""
 
 import json
 import os
@@ -35,7 +37,9 @@ SHOWN_REJECTS = 50
 GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
 
 _COLORS = {
-    **dict.fromkeys((JobState.planning, JobState.queued, JobState.cancelling, JobState.cancelled), "yellow"),
+    **dict.fromkeys(
+        (JobState.planning, JobState.queued, JobState.cancelling, JobState.cancelled), "yellow"
+    ),
     **dict.fromkeys(GOOD, "green"),
     JobState.running: "cyan",
     JobState.failed: "red",
@@ -43,7 +47,9 @@ _COLORS = {
 _NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
 
 PRIORITY = click.IntRange(-100, 100)
-PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of one number share evenly"
+PRIORITY_HELP = (
+    "tasks of the job with the highest number come first; jobs of one number share evenly"
+)
 
 
 @click.command()
@@ -51,7 +57,10 @@ PRIORITY_HELP = "tasks of the job with the highest number come first; jobs of on
 @json_option
 @asks
 def validate(client: Client, file: Path, as_json: bool) -> None:
-    """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused. Works offline."""
+    """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused.
+
+    Works offline.
+    """
     document, files = read_job(file)
     spec = check_spec(document, file)
     try:
@@ -88,10 +97,16 @@ def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
 
 def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     for stage, interval in costs.stages.items():
-        source = "measured by this service" if stage in costs.measured else "by the package's records"
+        source = (
+            "measured by this service" if stage in costs.measured else "by the package's records"
+        )
         yield f"CPU time, {stage}", f"{_interval(interval)}, {source}"
     yield "CPU time, all", _interval(costs.cpu_seconds)
-    wall = "unknown: no worker is there" if costs.wall_seconds is None else _interval(costs.wall_seconds)
+    wall = (
+        "unknown: no worker is there"
+        if costs.wall_seconds is None
+        else _interval(costs.wall_seconds)
+    )
     yield f"wall time, {costs.slots} at once", wall
 
 
@@ -107,10 +122,15 @@ def _counts(counts: Counts | responses.Validation, spec: JobSpec) -> Iterator[tu
 @click.command()
 @spec_argument
 @click.option("--watch", "then_watch", is_flag=True, help="watch the job until it ends")
-@click.option("--idempotency-key", help="a key that you choose; two submissions with the same key make one job")
+@click.option(
+    "--idempotency-key",
+    help="a key that you choose; two submissions with the same key make one job",
+)
 @click.option("--priority", type=PRIORITY, default=0, help=PRIORITY_HELP)
 @asks
-def submit(client: Client, file: Path, then_watch: bool, idempotency_key: str | None, priority: int) -> None:
+def submit(
+    client: Client, file: Path, then_watch: bool, idempotency_key: str | None, priority: int
+) -> None:
     """Submit a job and print its id."""
     document, files = read_job(file)
     if files:
@@ -130,7 +150,9 @@ def submit(client: Client, file: Path, then_watch: bool, idempotency_key: str | 
 @click.option("--state", type=click.Choice(JobState), help="only jobs in this state")
 @click.option("--project", default="", help="only jobs of this project")
 @asks
-def jobs(client: Client, as_json: bool, limit: int, search: str, state: JobState | None, project: str) -> None:
+def jobs(
+    client: Client, as_json: bool, limit: int, search: str, state: JobState | None, project: str
+) -> None:
     """List jobs, newest first."""
     found = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
@@ -138,9 +160,26 @@ def jobs(client: Client, as_json: bool, limit: int, search: str, state: JobState
     rows = []
     for job in found:
         left = "" if job.progress.eta is None else duration(job.progress.eta.seconds)
-        progress = _coloured(job.state), f"{job.progress.done}/{job.progress.total}", left, _version(job.dataset)
-        rows.append((job.id, *progress, job.name or "", job.kind, str(job.sample_count), str(job.rejected_count)))
-    return print_table(("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected"), rows)
+        progress = (
+            _coloured(job.state),
+            f"{job.progress.done}/{job.progress.total}",
+            left,
+            _version(job.dataset),
+        )
+        rows.append(
+            (
+                job.id,
+                *progress,
+                job.name or "",
+                job.kind,
+                str(job.sample_count),
+                str(job.rejected_count),
+            )
+        )
+    return print_table(
+        ("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected"),
+        rows,
+    )
 
 
 @click.command()
@@ -163,7 +202,9 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
             rows.append((str(reject.slot), str(reject.reason), parameters, reject.message))
         print_table(("slot", "reason", "parameters", "message"), rows, sentences=True)
         if job.rejected_count > len(shown):
-            click.echo(f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected")
+            click.echo(
+                f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected"
+            )
     return None
 
 
@@ -182,7 +223,10 @@ def _fields(job: responses.JobDetail) -> Iterator[tuple[str, str]]:
     yield "CPU time", duration(sum(stage.cpu_seconds for stage in job.progress.stages.values()))
     if job.state in GOOD:
         rate = 1 - job.rejected_count / job.sample_count
-        yield "accepted", f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})"
+        yield (
+            "accepted",
+            f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})",
+        )
     else:
         yield "samples", f"{job.sample_count}, {job.rejected_count} rejected so far"
     if job.dataset is not None:
@@ -211,14 +255,20 @@ def _watched(client: Client, job_id: str) -> JobState:
                     state = event.state
                     view.line(f"{job_id}: {_coloured(state)}{_because(event.message)}")
                 case responses.TaskStateEvent():
-                    view.line(f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}")
+                    view.line(
+                        f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}"
+                    )
                 case responses.DatasetPublishedEvent():
                     name = _version(event.dataset)
                     view.line(f"published {click.style(name, bold=True)}")
                     view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
-                    view.line(f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}")
+                    view.line(
+                        f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}"
+                    )
     except KeyboardInterrupt:
-        say(f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}")
+        say(
+            f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}"
+        )
         raise Exit(130) from None
     return state
 
@@ -239,11 +289,15 @@ class _Lines:
         click.echo(f"{self._clear}{text}")
 
     def progress(self, progress: responses.Progress) -> None:
-        text = ", ".join(filter(None, [planned_so_far(progress, self._sample_count), _stages(progress)]))
+        text = ", ".join(
+            filter(None, [planned_so_far(progress, self._sample_count), _stages(progress)])
+        )
         if progress.eta is not None:
             text += f"; {_left(progress.eta)} left"
         if text != self._last:
-            click.echo(f"{self._clear}{text[: room() - 1]}" if self._clear else text, nl=not self._clear)
+            click.echo(
+                f"{self._clear}{text[: room() - 1]}" if self._clear else text, nl=not self._clear
+            )
         self._last = text
 
 
@@ -253,7 +307,9 @@ class _Lines:
 def cancel(client: Client, job_id: str) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     job = client.cancel(job_id)
-    click.echo(f"{job.id} is {_coloured(job.state)}. To run it again, submit its spec: results are cached")
+    click.echo(
+        f"{job.id} is {_coloured(job.state)}. To run it again, submit its spec: results are cached"
+    )
 
 
 @click.command()
@@ -262,7 +318,9 @@ def cancel(client: Client, job_id: str) -> None:
 def pause(client: Client, job_id: str) -> None:
     """Pause a job: no further task is started, and running tasks finish."""
     job = client.pause(job_id)
-    click.echo(f"{job.id} is {_coloured(job.state)}: {job.message}. To go on: stickslip resume {job.id}")
+    click.echo(
+        f"{job.id} is {_coloured(job.state)}: {job.message}. To go on: stickslip resume {job.id}"
+    )
 
 
 @click.command()
@@ -294,11 +352,16 @@ def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
 
 
 @click.command()
-@click.argument("files", type=FILE, nargs=-1, required=True, help="PNG or JPEG files; files of scenes")
+@click.argument(
+    "files", type=FILE, nargs=-1, required=True, help="PNG or JPEG files; files of scenes"
+)
 @json_option
 @asks
 def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
-    """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes; print the references that specs use."""
+    """Upload pictures as textures, and OBJ, NPZ and CSV files of scenes.
+
+    Print the references that specs use.
+    """
     found: list[responses.TextureEntry | responses.FileUpload] = []
     for file in files:
         try:
@@ -314,19 +377,26 @@ def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
         return print_json(found)
     say("In a spec, under any names:")
     pictures = [
-        (file, entry) for file, entry in zip(files, found, strict=True) if isinstance(entry, responses.TextureEntry)
+        (file, entry)
+        for file, entry in zip(files, found, strict=True)
+        if isinstance(entry, responses.TextureEntry)
     ]
     for number, (file, picture) in enumerate(pictures):
         click.echo(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
     for entry in found:
         if isinstance(entry, responses.FileUpload):
-            click.echo(f"file: {entry.file}" + (f"  # counts: {list(entry.counts)}" if entry.counts else ""))
+            click.echo(
+                f"file: {entry.file}"
+                + (f"  # counts: {list(entry.counts)}" if entry.counts else "")
+            )
     return None
 
 
 def _name(file: Path) -> str:
     """Return the name of a texture, from the name of its file."""
-    word = "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower())
+    word = "".join(
+        letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower()
+    )
     return word.strip("-")[:60] or "custom"
 
 
@@ -351,13 +421,18 @@ def _version(value: responses.DatasetRef | None) -> str:
 
 def planned_so_far(progress: responses.Progress, sample_count: int) -> str:
     """Return the number of planned samples; empty when all are planned."""
-    return "" if progress.planned == sample_count else f"{progress.planned:,} of {sample_count:,} samples are planned"
+    return (
+        ""
+        if progress.planned == sample_count
+        else f"{progress.planned:,} of {sample_count:,} samples are planned"
+    )
 
 
 def _stages(progress: responses.Progress) -> str:
     """Return a line of counts: `simulate 12/40 (3 cached, 1 rejected), render 0/40`."""
     shown = [
-        f"{stage} {counted.done}/{counted.total}" + (f" ({', '.join(found)})" if (found := _notes(counted)) else "")
+        f"{stage} {counted.done}/{counted.total}"
+        + (f" ({', '.join(found)})" if (found := _notes(counted)) else "")
         for stage, counted in progress.stages.items()
         if counted.total
     ]
@@ -367,4 +442,6 @@ def _stages(progress: responses.Progress) -> str:
 def _notes(counted: responses.StageProgress) -> list[str]:
     """Return counts of tasks of a stage that need a word: `3 cached`, `1 rejected`."""
     cached = [f"{counted.cached} cached"] if counted.cached else []
-    return cached + [f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)]
+    return cached + [
+        f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)
+    ]

@@ -1,4 +1,6 @@
-"""Maintenance of a stopped coordinator's data: removing versions and unused files, and recovering a lost database."""
+"""Maintenance of a stopped coordinator's data: removing versions and unused files, and recovering a
+lost database.
+"""
 
 import re
 from collections import Counter
@@ -39,7 +41,8 @@ def _refuse_none(settings: Settings, role: Role) -> None:
 
 @contextmanager
 def _owned(settings: Settings) -> Iterator[tuple[Database, Store]]:
-    """Open the database and the store of a coordinator that is stopped, and keep others from starting one.
+    """Open the database and the store of a coordinator that is stopped, and keep others from
+    starting one.
 
     Raise DatabaseRefusedError if one runs.
     """
@@ -64,13 +67,19 @@ def rm(settings: Settings, version: str) -> None:
     _refuse_none(settings, Role.upkeep)
     with _owned(settings) as (database, files):
         jobs, tasks = remove(database, files, parts[1], int(parts[2]))
-    click.echo(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
+    click.echo(
+        f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs"
+    )
     click.echo("to free the space: stickslip gc --delete --older-than 0")
 
 
 @click.command()
 @click.option(
-    "--older-than", type=amount("hours", 0), metavar="HOURS", default=24.0, help="keep files that are younger"
+    "--older-than",
+    type=amount("hours", 0),
+    metavar="HOURS",
+    default=24.0,
+    help="keep files that are younger",
 )
 @click.option("--delete", is_flag=True, help="delete the files; default: only count them")
 @keeps
@@ -91,7 +100,10 @@ def gc(settings: Settings, older_than: float, delete: bool) -> None:
 @click.command()
 @keeps
 def reindex(settings: Settings) -> None:
-    """Recover the datasets in the store after the database was lost. Known datasets stay as they are."""
+    """Recover the datasets in the store after the database was lost.
+
+    Known datasets stay as they are.
+    """
     counts = Counter[str]()
     with _owned(settings) as (database, files):
         for found in reindexed(database, files):
@@ -100,19 +112,29 @@ def reindex(settings: Settings) -> None:
             elif found.is_new:
                 click.echo(f"{found.name}  {found.samples} samples")
             counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
-    say(f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out")
-    say("certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`")
+    say(
+        f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out"
+    )
+    say(
+        "certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`"
+    )
     raise Exit(1 if counts["bad"] else 0)
 
 
 @click.command()
-@click.option("--rate", type=amount("MB/s", 0.1), metavar="MB/S", default=100.0, help="read so much a second at most")
+@click.option(
+    "--rate",
+    type=amount("MB/s", 0.1),
+    metavar="MB/S",
+    default=100.0,
+    help="read so much a second at most",
+)
 @keeps
 def scrub(settings: Settings, rate: float) -> None:
     """Read all datasets, beside a running service or without one; exit with 1 if a file is damaged.
 
-    Workers recompute damaged files. With STICKSLIP_SIGNING_KEY, versions without a good signature are signed again.
-    Versions that were read longest ago come first, also after a stop.
+    Workers recompute damaged files. With STICKSLIP_SIGNING_KEY, versions without a good signature
+    are signed again. Versions that were read longest ago come first, also after a stop.
     """
     count = bad = 0
     _refuse_none(settings, Role.visitor)
@@ -123,5 +145,8 @@ def scrub(settings: Settings, rate: float) -> None:
             count, bad = count + 1, bad + bool(damaged)
             for path in damaged:
                 click.echo(f"{version}  {path}")
-    say(f"{count} versions read, {bad} damaged" + (": a service with workers recomputes their files" if bad else ""))
+    say(
+        f"{count} versions read, {bad} damaged"
+        + (": a service with workers recomputes their files" if bad else "")
+    )
     raise Exit(1 if bad else 0)

@@ -22,7 +22,14 @@ from stickslip_schemas.spec.cameras import FRAMING, load_rig
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.spec.names import MATERIAL_NAME
 
-from stickslip_services.cli.common import FILE, field_line, json_option, print_table, say, shows_errors
+from stickslip_services.cli.common import (
+    FILE,
+    field_line,
+    json_option,
+    print_table,
+    say,
+    shows_errors,
+)
 from stickslip_services.client.http import ClientError
 from stickslip_services.errors import CommandError
 from stickslip_services.local import making
@@ -33,7 +40,9 @@ SCENE_SUFFIXES = (".yaml", ".yml", ".json")
 MAX_VALUES = 10_000_000
 """Of a file."""
 
-scene_argument = click.argument("scene", help="a scene, YAML or JSON, or the name of a built-in one")
+scene_argument = click.argument(
+    "scene", help="a scene, YAML or JSON, or the name of a built-in one"
+)
 
 
 @click.command()
@@ -45,16 +54,27 @@ scene_argument = click.argument("scene", help="a scene, YAML or JSON, or the nam
     type=FILE,
     help="what `stickslip certify` wrote (certificates/PRESET, if it is there)",
 )
-@click.option("--allow-uncertified", is_flag=True, help="simulate even where no certificate vouches for the preset")
+@click.option(
+    "--allow-uncertified",
+    is_flag=True,
+    help="simulate even where no certificate vouches for the preset",
+)
 @click.option("--obj", is_flag=True, help="write an OBJ file for each sheet and frame, too")
 @json_option
 @shows_errors
 def simulate(
-    scene: str, out: Path, certificate: Path | None, allow_uncertified: bool, obj: bool, as_json: bool
+    scene: str,
+    out: Path,
+    certificate: Path | None,
+    allow_uncertified: bool,
+    obj: bool,
+    as_json: bool,
 ) -> None:
-    """Simulate one sample of a scene on this machine, by the stages of the queue, with its default parameters.
+    """Simulate one sample of a scene on this machine, by the stages of the queue, with its default
+    parameters.
 
-    Writes trajectory.npz and scene.json; exits with 1 if the sample is not valid. No coordinator is needed.
+    Writes trajectory.npz and scene.json; exits with 1 if the sample is not valid. No coordinator is
+    needed.
     """
     given, files = _scene(scene)
     usual = Path("certificates") / given.preset.value
@@ -82,11 +102,19 @@ def scene() -> None:
 @json_option
 @shows_errors
 def check(scene: str, as_json: bool) -> None:
-    """Check a scene and the files that it names; list its axes, the arrays of a dataset of it, and costs."""
+    """Check a scene and the files that it names.
+
+    List its axes, the arrays of a dataset of it, and costs.
+    """
     given, files = _scene(scene)
     spec = spec_of(given)
     arrays: list[dict[str, Any]] = [
-        {"name": each.name, "dtype": each.dtype, "shape": list(each.shape), "description": each.description}
+        {
+            "name": each.name,
+            "dtype": each.dtype,
+            "shape": list(each.shape),
+            "description": each.description,
+        }
         for each in layout(spec)
     ]
     axes: dict[str, dict[str, Any]] = {
@@ -115,8 +143,14 @@ def check(scene: str, as_json: bool) -> None:
     }
     if as_json:
         return click.echo(json.dumps(said, indent=2))
-    print_table(("axis", "default", "values"), ((n, str(a["default"]), a["values"]) for n, a in axes.items()))
-    rows = ((each["name"], each["dtype"], str(tuple(each["shape"])), each["description"]) for each in arrays)
+    print_table(
+        ("axis", "default", "values"),
+        ((n, str(a["default"]), a["values"]) for n, a in axes.items()),
+    )
+    rows = (
+        (each["name"], each["dtype"], str(tuple(each["shape"])), each["description"])
+        for each in arrays
+    )
     print_table(("array", "type", "shape", "meaning"), rows, sentences=True)
     cost = said["cost"]
     least, most = cost["cpu_seconds_a_sample"]
@@ -164,7 +198,10 @@ def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
             "scene": scene.model_dump(mode="json"),
             "frames": min(30, scene.frames),
             "allow_uncertified": allow_uncertified,
-            "axes": {"texture": "checker", "viewpoint": next(iter(cameras if isinstance(cameras, dict) else rig))},
+            "axes": {
+                "texture": "checker",
+                "viewpoint": next(iter(cameras if isinstance(cameras, dict) else rig)),
+            },
         }
     )
     assert isinstance(spec, ClothSceneSpec)
@@ -172,7 +209,10 @@ def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
 
 
 def read_spec(path: Path) -> dict[str, Any]:
-    """Return the document of a spec file, which may break rules of specs; raise CommandError if it is no document."""
+    """Return the document of a spec file, which may break rules of specs.
+
+    Raise CommandError if it is no document.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -182,13 +222,19 @@ def read_spec(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise CommandError(f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}") from error
+        raise CommandError(
+            f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}"
+        ) from error
     if not isinstance(document, dict):
-        raise CommandError(f"{path} must hold a mapping (key: value), and it holds {document!r:.100}")
+        raise CommandError(
+            f"{path} must hold a mapping (key: value), and it holds {document!r:.100}"
+        )
     try:
         _check(document, "", path, count())
     except RecursionError as error:
-        raise CommandError(f"{path} must not nest so deeply: does an alias name what it is in?") from error
+        raise CommandError(
+            f"{path} must not nest so deeply: does an alias name what it is in?"
+        ) from error
     return document
 
 
@@ -211,14 +257,18 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 
 
 def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
-    """Return the scene of a file, with references by digest, and its files by digest; raise CommandError."""
+    """Return the scene of a file, with references by digest, and its files by digest; raise
+    CommandError.
+    """
     name = path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
     return _inlined({"name": name, **read_spec(path)}, path)
 
 
 def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
     if (length := len(json.dumps(document))) > MAX_DOCUMENT_BYTES:
-        raise CommandError(f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}")
+        raise CommandError(
+            f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}"
+        )
     try:
         scene = Scene.model_validate(document)
     except ValidationError as error:
@@ -226,13 +276,21 @@ def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, byt
 
     if not any(scene.files()):
         return scene, {}
-    from stickslip_schemas.scene.files import UnfitFileError, frames_of, inlined  # needs the extra `arrays`
+    from stickslip_schemas.scene.files import (
+        UnfitFileError,
+        frames_of,
+        inlined,
+    )  # needs the extra `arrays`
 
     def read(name: str) -> bytes:
         place = (path.parent / name).resolve()
         if not place.is_relative_to(path.parent.resolve()):
             raise UnfitFileError("must be in the folder of the scene, and a link leads out of it")
-        return frames_of(sorted(place.glob("*.obj")), scene, name) if place.is_dir() else place.read_bytes()
+        return (
+            frames_of(sorted(place.glob("*.obj")), scene, name)
+            if place.is_dir()
+            else place.read_bytes()
+        )
 
     try:
         return inlined(scene, read)
@@ -248,15 +306,21 @@ def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
         raise _not_valid(error, document, AnyJobSpec, path) from error
 
 
-def _not_valid(error: ValidationError, document: dict[str, Any], model: Any, path: Path) -> CommandError:
+def _not_valid(
+    error: ValidationError, document: dict[str, Any], model: Any, path: Path
+) -> CommandError:
     lines = [field_line(field) for field in field_errors(error, document, model)]
     return CommandError("\n".join([f"{path} is not valid", *lines]))
 
 
 def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
-    """Raise CommandError for values that JSON cannot hold, and for aliases that make too many of them."""
+    """Raise CommandError for values that JSON cannot hold, and for aliases that make too many of
+    them.
+    """
     if next(values) > MAX_VALUES:
-        raise CommandError(f"{path} must hold at most {MAX_VALUES} values, with aliases written out")
+        raise CommandError(
+            f"{path} must hold at most {MAX_VALUES} values, with aliases written out"
+        )
     if isinstance(value, dict):
         for key, item in value.items():
             _check(item, f"{place}.{key}" if place else str(key), path, values)
@@ -266,4 +330,6 @@ def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
     elif isinstance(value, float) and not math.isfinite(value):
         raise CommandError(f"{path}: {place} must be a finite number, and it is {value}")
     elif value is not None and not isinstance(value, str | int | float | bool):
-        raise CommandError(f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}")
+        raise CommandError(
+            f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}"
+        )

@@ -41,23 +41,34 @@ PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
 @click.command()
 @click.option("--preset", type=click.Choice(PRESETS), required=True, help="the preset to certify")
 @click.option("--out", type=FILE, help="folder for the certificate (certificates/PRESET)")
-@click.option("--quick", is_flag=True, help="measure a few points only, in seconds; such a certificate does not count")
+@click.option(
+    "--quick",
+    is_flag=True,
+    help="measure a few points only, in seconds; such a certificate does not count",
+)
 @asks
 def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
-    """Measure a preset on the physical protocols, and register the certificate with the coordinator.
+    """Measure a preset on the physical protocols, and register the certificate with the
+    coordinator.
 
-    A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this build and preset
-    only. Writes certificate.json; exits with 1 if the preset does not pass.
+    A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this
+    build and preset only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     directory = out or Path("certificates") / preset
     certificate = making.measure(preset, directory, quick=quick)
     written = directory / making.DOCUMENT_NAME
     if quick:
         passed = "All" if certificate.passed else "NOT all"
-        click.echo(f"{passed} of the few points that were measured are within the tolerances: {written}")
-        click.echo(f"A quick run does not count. To certify the preset: stickslip certify --preset {preset}")
+        click.echo(
+            f"{passed} of the few points that were measured are within the tolerances: {written}"
+        )
+        click.echo(
+            f"A quick run does not count. To certify the preset: stickslip certify --preset {preset}"
+        )
     else:
-        click.echo(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {written}")
+        click.echo(
+            f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {written}"
+        )
     client.patience = 1.0
     try:
         _register(client, directory)
@@ -76,21 +87,27 @@ def register(client: Client, directory: Path) -> None:
 
 def _register(client: Client, directory: Path) -> None:
     entry = client.register(making.read_certificate(directory))
-    click.echo(f"certificate {entry.digest} is registered: {client.url}/certificates/{entry.digest}")
+    click.echo(
+        f"certificate {entry.digest} is registered: {client.url}/certificates/{entry.digest}"
+    )
 
 
 @click.command()
 @json_option
 @asks
 def certificates(client: Client, as_json: bool) -> None:
-    """List certificates, newest first, and compare their builds with those of the connected workers."""
+    """List certificates, newest first, and compare their builds with those of the connected
+    workers.
+    """
     found = list(client.certificates())
     if as_json:
         return print_json(found)
     builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
     rows = []
     for entry in found:
-        verdict = click.style("passed", fg="green") if entry.passed else click.style("failed", fg="red")
+        verdict = (
+            click.style("passed", fg="green") if entry.passed else click.style("failed", fg="red")
+        )
         build = "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})"
         made = f"{entry.created_at:%Y-%m-%d %H:%M} UTC"
         rows.append((entry.digest[:16], entry.preset, verdict, build, entry.extent, made))

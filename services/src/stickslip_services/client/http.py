@@ -1,4 +1,5 @@
-"""The HTTP client of a coordinator: typed answers, problems as exceptions, retries while the coordinator restarts.
+"""The HTTP client of a coordinator: typed answers, problems as exceptions, retries while the
+coordinator restarts.
 
 Each case that callers tell apart has a `ClientError` of a class of its own.
 """
@@ -83,22 +84,31 @@ class MissingExtraError(ClientError):
 
 
 def raise_for_problem(response: httpx.Response) -> None:
-    """Raise ProblemError or UnexpectedError unless a response, whose body has been read, reports success."""
+    """Raise ProblemError or UnexpectedError unless a response, whose body has been read, reports
+    success.
+    """
     if response.is_success:
         return
     if response.headers.get("content-type", "").startswith(MEDIA_TYPE):
         try:
             problem = Problem.model_validate_json(response.content)
         except ValidationError as error:
-            raise UnexpectedError(f"{response.url} answered with an invalid problem document") from error
+            raise UnexpectedError(
+                f"{response.url} answered with an invalid problem document"
+            ) from error
         raise ProblemError(problem)
-    raise UnexpectedError(f"{response.url} answered with status {response.status_code}; is it a coordinator?")
+    raise UnexpectedError(
+        f"{response.url} answered with status {response.status_code}; is it a coordinator?"
+    )
 
 
 T = TypeVar("T")
 
 Event = (
-    responses.JobStateEvent | responses.JobProgressEvent | responses.TaskStateEvent | responses.DatasetPublishedEvent
+    responses.JobStateEvent
+    | responses.JobProgressEvent
+    | responses.TaskStateEvent
+    | responses.DatasetPublishedEvent
 )
 
 _EVENTS: Mapping[str, type[Event]] = {
@@ -113,7 +123,8 @@ PAGE_SIZE = "200"
 PATIENCE_SECONDS = 60.0
 """How long a failed request is repeated [s]."""
 PAUSES_SECONDS = (0.25, 0.5, 1.0, 2.0, 3.0)
-"""Longest pauses between tries [s], the last one again and again; a drawn share of them is waited."""
+"""Longest pauses between tries [s], the last one again and again; a drawn share of them is waited.
+"""
 SILENCE_SECONDS = 60.0
 """Read timeout of an event stream [s]; the coordinator sends a keep-alive every 15 s."""
 
@@ -121,7 +132,8 @@ SILENCE_SECONDS = 60.0
 class Client:
     """A client of one coordinator, and a context manager that closes its connections.
 
-    Its methods block. Asynchronous programs call them in a thread: `await asyncio.to_thread(client.submit, spec)`.
+    Its methods block. Asynchronous programs call them in a thread: `await
+    asyncio.to_thread(client.submit, spec)`.
     """
 
     def __init__(
@@ -147,13 +159,15 @@ class Client:
         """
         self.url = (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")
         if not self.url.startswith(("http://", "https://")):
-            raise ClientError(f"the URL of the coordinator must begin with http:// or https://: it is {self.url!r}")
+            raise ClientError(
+                f"the URL of the coordinator must begin with http:// or https://: it is {self.url!r}"
+            )
         self.patience = patience
         self._sleep = sleep
         self._was_answered = False
         key = key or os.environ.get("STICKSLIP_KEY")
-        # trust_env is off because a proxy of the environment is for the internet. SSL_CERT_FILE still applies: only
-        # this machine may trust the authority of the coordinator's certificate.
+        # trust_env is off because a proxy of the environment is for the internet. SSL_CERT_FILE
+        # still applies: only this machine may trust the authority of the coordinator's certificate.
         authorities = os.environ.get("SSL_CERT_FILE") if self.url.startswith("https") else None
         self._http = httpx.Client(
             base_url=self.url,
@@ -180,16 +194,25 @@ class Client:
     def submit(
         self, spec: Mapping[str, Any], *, idempotency_key: str | None = None, priority: int = 0
     ) -> responses.JobDetail:
-        """Submit a job. Requests with the same idempotency key make one job; by default each call has a new key."""
+        """Submit a job.
+
+        Requests with the same idempotency key make one job; by default each call has a new key.
+        """
         headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
         query = {"priority": str(priority)} if priority else {}
-        return self._call(responses.JobDetail, "POST", "/v1/jobs", json=spec, headers=headers, params=query)
+        return self._call(
+            responses.JobDetail, "POST", "/v1/jobs", json=spec, headers=headers, params=query
+        )
 
     def upload_texture(self, picture: bytes) -> responses.TextureEntry:
         """Upload a PNG or JPEG file as a texture, which specs name under `textures`."""
         media_type = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
         return self._call(
-            responses.TextureEntry, "POST", "/v1/textures", content=picture, headers={"Content-Type": media_type}
+            responses.TextureEntry,
+            "POST",
+            "/v1/textures",
+            content=picture,
+            headers={"Content-Type": media_type},
         )
 
     def upload_file(self, data: bytes) -> responses.FileUpload:
@@ -200,20 +223,30 @@ class Client:
     def job(self, job_id: str) -> responses.JobDetail:
         return self._call(responses.JobDetail, "GET", f"/v1/jobs/{job_id}")
 
-    def jobs(self, *, search: str = "", state: JobState | None = None, project: str = "") -> Iterator[responses.Job]:
+    def jobs(
+        self, *, search: str = "", state: JobState | None = None, project: str = ""
+    ) -> Iterator[responses.Job]:
         """Yield jobs, newest first; `search` is a part of the name, kind, id or dataset."""
         query = {"search": search, "state": str(state or ""), "project": project}
         return self._items(
-            responses.Page[responses.Job], "/v1/jobs", {name: value for name, value in query.items() if value}
+            responses.Page[responses.Job],
+            "/v1/jobs",
+            {name: value for name, value in query.items() if value},
         )
 
-    def samples(self, job_id: str, *, state: TaskState | None = None) -> Iterator[responses.SampleState]:
+    def samples(
+        self, job_id: str, *, state: TaskState | None = None
+    ) -> Iterator[responses.SampleState]:
         query = {} if state is None else {"state": str(state)}
-        return self._items(responses.Page[responses.SampleState], f"/v1/jobs/{job_id}/samples", query)
+        return self._items(
+            responses.Page[responses.SampleState], f"/v1/jobs/{job_id}/samples", query
+        )
 
     def prioritise(self, job_id: str, priority: int) -> responses.JobDetail:
         """Set the priority of a job: tasks of the job with the highest number run first."""
-        return self._call(responses.JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority})
+        return self._call(
+            responses.JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority}
+        )
 
     def cancel(self, job_id: str) -> responses.JobDetail:
         return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
@@ -226,7 +259,9 @@ class Client:
         return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
-        """Yield the events of a job until it ends, across lost connections and restarts of the coordinator."""
+        """Yield the events of a job until it ends, across lost connections and restarts of the
+        coordinator.
+        """
         last_id = ""
         waited = 0.0
         while True:
@@ -248,7 +283,9 @@ class Client:
             waited += 1.0
 
     def wait(self, job_id: str) -> responses.JobDetail:
-        """Wait until a job has ended, as `events` does, and return it: its `state` says how it ended."""
+        """Wait until a job has ended, as `events` does, and return it: its `state` says how it
+        ended.
+        """
         for _ in self.events(job_id):
             pass
         return self.job(job_id)
@@ -256,7 +293,9 @@ class Client:
     def _stream(self, job_id: str, last_id: str) -> Iterator[dict[str, str]]:
         headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
         timeout = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
-        with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
+        with self._http.stream(
+            "GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout
+        ) as response:
             if response.status_code == 503:
                 raise httpx.ReadError("the coordinator is busy")
             if not response.is_success:
@@ -277,25 +316,37 @@ class Client:
         return self._call(responses.Dataset, "GET", f"/v1/datasets/{dataset}")
 
     def version(self, dataset: str, version: int) -> responses.DatasetVersion:
-        return self._call(responses.DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}")
+        return self._call(
+            responses.DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}"
+        )
 
     def contents(self, dataset: str, version: int) -> Contents:
-        """Return what the manifest of a version lists; sections of a large one are fetched on demand."""
+        """Return what the manifest of a version lists.
+
+        Sections of a large one are fetched on demand.
+        """
         root = f"/v1/datasets/{dataset}/versions/{version}"
         manifest = self._call(Manifest, "GET", f"{root}/manifest")
-        return Contents(manifest, lambda file: self.request("GET", f"{root}/files/{file.path}").content)
+        return Contents(
+            manifest, lambda file: self.request("GET", f"{root}/files/{file.path}").content
+        )
 
     def newest(self, dataset: str) -> int:
-        """Return the number of the newest version of a dataset; raise ClientError if it has none yet."""
+        """Return the number of the newest version of a dataset.
+
+        Raise ClientError if it has none yet.
+        """
         versions = self.dataset(dataset).versions
         if not versions:
             raise ClientError(f"dataset {dataset} has no version yet")
         return versions[-1].version
 
     def open(self, dataset: str, version: int | None = None) -> "zarr.Group":
-        """Open a version of a dataset, the newest by default, as a Zarr group, whose chunks are downloaded when read.
+        """Open a version of a dataset, the newest by default, as a Zarr group, whose chunks are
+        downloaded when read.
 
-        A missing chunk reads as the fill value: pull the dataset, or read it with stickslip-training, to get an error.
+        A missing chunk reads as the fill value: pull the dataset, or read it with
+        stickslip-training, to get an error.
 
         Raises:
             MissingExtraError: The extra `arrays` is not installed.
@@ -306,7 +357,9 @@ class Client:
             from obstore.store import HTTPStore
             from zarr.storage import ObjectStore
         except ImportError as error:
-            raise MissingExtraError("arrays", f"to open a dataset needs zarr and obstore, and {error.name}") from error
+            raise MissingExtraError(
+                "arrays", f"to open a dataset needs zarr and obstore, and {error.name}"
+            ) from error
         number = self.newest(dataset) if version is None else version
         self.version(dataset, number)
         files = f"{self.url}/v1/datasets/{dataset}/versions/{number}/files"
@@ -325,13 +378,15 @@ class Client:
         """Register a certificate. Registering it again changes nothing."""
         headers = {"Content-Type": "application/json"}
         content = certificate.model_dump_json()
-        return self._call(responses.CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers)
+        return self._call(
+            responses.CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers
+        )
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request, and repeat it while the connection fails or the coordinator is busy.
 
-        Repeating is safe: requests that change something are idempotent or carry an idempotency key. Raises
-        ClientError.
+        Repeating is safe: requests that change something are idempotent or carry an idempotency
+        key. Raises ClientError.
         """
         until = time.monotonic() + self.patience
         for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):
@@ -341,7 +396,9 @@ class Client:
             except httpx.TransportError as error:
                 # A coordinator that has answered before may be restarting.
                 if last or (isinstance(error, httpx.ConnectError) and not self._was_answered):
-                    raise UnreachableError(f"{self.url} does not answer: {error or type(error).__name__}") from error
+                    raise UnreachableError(
+                        f"{self.url} does not answer: {error or type(error).__name__}"
+                    ) from error
             else:
                 self._was_answered = True
                 if last or response.status_code != 503:
@@ -350,17 +407,23 @@ class Client:
             self._sleep(pause * random.random())
         raise AssertionError
 
-    def stream(self, path: str, headers: Mapping[str, str]) -> AbstractContextManager[httpx.Response]:
+    def stream(
+        self, path: str, headers: Mapping[str, str]
+    ) -> AbstractContextManager[httpx.Response]:
         """Open a download; the caller handles connection errors."""
         return self._http.stream("GET", path, headers=headers)
 
     def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
         return parsed(answer, self.request(method, path, **options))
 
-    def _items(self, answer: type[responses.Page[T]], path: str, query: Mapping[str, str] | None = None) -> Iterator[T]:
+    def _items(
+        self, answer: type[responses.Page[T]], path: str, query: Mapping[str, str] | None = None
+    ) -> Iterator[T]:
         token: str | None = ""
         while token is not None:
-            params = {"page_size": PAGE_SIZE, **(query or {})} | ({"page_token": token} if token else {})
+            params = {"page_size": PAGE_SIZE, **(query or {})} | (
+                {"page_token": token} if token else {}
+            )
             page = self._call(answer, "GET", path, params=params)
             yield from page.items
             token = page.next_page_token

@@ -1,8 +1,8 @@
 """Downloads of dataset versions to a directory.
 
-The manifest lists the files and their digests. Only listed files are written, and a file gets its name after its digest
-has been checked. An interrupted download continues: a `.part` file holds the first bytes of a file, and the rest is
-requested by range.
+The manifest lists the files and their digests. Only listed files are written, and a file gets its
+name after its digest has been checked. An interrupted download continues: a `.part` file holds the
+first bytes of a file, and the rest is requested by range.
 """
 
 import threading
@@ -77,27 +77,24 @@ def pull(
     on_bytes: Callable[[int], None] = lambda _: None,
     on_plan: Callable[[int, int], None] = lambda _files, _bytes: None,
 ) -> Pulled:
-    """Download a version, or the part that `selection` chooses, to `target`. Intact files are not downloaded again.
+    """Download a version, or the part that `selection` chooses, to `target`.
 
-    A part has all labels and, of the other arrays, the shards that hold a chosen sample; `selection.json` describes it.
-    The manifest is written last, so a directory with a manifest is complete.
+    Intact files are not downloaded again.
 
-    Args:
-        client: A client of the coordinator that has the dataset.
-        dataset: Id of the dataset.
-        version: Number of the version.
-        target: Directory to write to.
-        selection: Part to download.
-        allowed_signers: File of the signers to trust [ssh-keygen(1)]; without, signatures are not checked.
-        on_bytes: Called with the number of bytes of each received block.
-        on_plan: Called once, with the number of files and bytes to download.
+    A part has all labels and, of the other arrays, the shards that hold a chosen sample;
+    `selection.json` describes it. The manifest is written last, so a directory with a manifest is
+    complete.
 
-    Raises:
-        ForeignFilesError: `target` holds other files. Nothing was written.
-        SelectionError: The dataset has no such array or label.
-        DamagedError: Received bytes differ from what the manifest lists.
-        UnsignedError, ChangedError, UnknownSignerError: No allowed signer signed the version. Nothing was written.
-        ClientError: The coordinator refused, or does not answer.
+    Args: client: A client of the coordinator that has the dataset. dataset: Id of the dataset.
+        version: Number of the version. target: Directory to write to. selection: Part to download.
+        allowed_signers: File of the signers to trust [ssh-keygen(1)]; without, signatures are not
+        checked. on_bytes: Called with the number of bytes of each received block. on_plan: Called
+        once, with the number of files and bytes to download.
+
+    Raises: ForeignFilesError: `target` holds other files. Nothing was written. SelectionError: The
+        dataset has no such array or label. DamagedError: Received bytes differ from what the
+        manifest lists. UnsignedError, ChangedError, UnknownSignerError: No allowed signer signed
+        the version. Nothing was written. ClientError: The coordinator refused, or does not answer.
     """
     contents, sealed = _fetch_sealed(client, dataset, version)
     manifest = contents.manifest
@@ -117,7 +114,9 @@ def pull(
         _download_all(client, root, labels, lambda _: None)
         labels_done = (len(labels), sum(file.size for file, _ in labels))
         with _selecting():
-            wanted = part_files(contents, selection, lambda name: read_label(target, manifest, name))
+            wanted = part_files(
+                contents, selection, lambda name: read_label(target, manifest, name)
+            )
         files = _with_paths(target, wanted)
         document = PartDocument(manifest=sha256(sealed[MANIFEST_NAME]), selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
@@ -142,11 +141,17 @@ def _with_paths(target: Path, files: list[FileEntry]) -> list[tuple[FileEntry, P
 
 
 def _download_all(
-    client: Client, root: str, missing: list[tuple[FileEntry, Path]], on_bytes: Callable[[int], None]
+    client: Client,
+    root: str,
+    missing: list[tuple[FileEntry, Path]],
+    on_bytes: Callable[[int], None],
 ) -> None:
     stop = threading.Event()
     with ThreadPoolExecutor(CONNECTIONS) as pool:
-        downloads = [pool.submit(_download, client, root, file, path, on_bytes, stop) for file, path in missing]
+        downloads = [
+            pool.submit(_download, client, root, file, path, on_bytes, stop)
+            for file, path in missing
+        ]
         try:
             for download in as_completed(downloads):
                 download.result()
@@ -166,7 +171,10 @@ def _selecting() -> Iterator[None]:
 
 
 def refuse_other_part(target: Path, selection: Selection) -> None:
-    """Raise ForeignFilesError if `target` holds another part of a version; a whole version replaces any part."""
+    """Raise ForeignFilesError if `target` holds another part of a version.
+
+    A whole version replaces any part.
+    """
     with suppress(FileNotFoundError):
         there = read_part(target).selection
         if not selection.is_everything and there != selection:
@@ -177,13 +185,16 @@ def refuse_other_part(target: Path, selection: Selection) -> None:
 
 
 def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
-    """Raise ForeignFilesError if `target` holds files that `contents`, of the version `name`, does not list.
+    """Raise ForeignFilesError if `target` holds files that `contents`, of the version `name`, does
+    not list.
 
     A directory that already holds this version may have other files beside it.
     """
     found = sorted(files_below(target))  # by array and shard, so that each section is read once
     foreign = [
-        path for path in found if (name_ := path.removesuffix(PART)) not in OWN_NAMES and contents.file(name_) is None
+        path
+        for path in found
+        if (name_ := path.removesuffix(PART)) not in OWN_NAMES and contents.file(name_) is None
     ]
     there = ""
     with suppress(OSError, ValidationError):
@@ -200,7 +211,9 @@ def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
 
 
 def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents, dict[str, bytes]]:
-    """Return the contents of a version, and the bytes of its three sealed files by name, the manifest last."""
+    """Return the contents of a version, and the bytes of its three sealed files by name, the
+    manifest last.
+    """
     promised = client.version(dataset, version)
     answer = client.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
     content, root = answer.content, f"/v1/datasets/{dataset}/versions/{version}/files/"
@@ -215,7 +228,9 @@ def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents,
         raise DamagedError(f"{dataset}, version {version}: {error}") from error
     manifest = parsed(Manifest, answer)
     if (manifest.dataset, manifest.version) != (dataset, version):
-        raise DamagedError(f"the manifest of {dataset}:v{version} is that of {manifest.dataset}:v{manifest.version}")
+        raise DamagedError(
+            f"the manifest of {dataset}:v{version} is that of {manifest.dataset}:v{manifest.version}"
+        )
     contents = Contents(manifest, lambda file: client.request("GET", root + file.path).content)
     return contents, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
 
@@ -237,7 +252,12 @@ def _read(path: Path) -> bytes | None:
 
 
 def _download(
-    client: Client, root: str, file: FileEntry, path: Path, on_bytes: Callable[[int], None], stop: threading.Event
+    client: Client,
+    root: str,
+    file: FileEntry,
+    path: Path,
+    on_bytes: Callable[[int], None],
+    stop: threading.Event,
 ) -> None:
     """Download a file to its `.part` file, check it, and rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -263,16 +283,25 @@ def _download(
         part.unlink()  # a part of another file, or damaged in transit: start again
         reason = "it arrived damaged"
     if reason == "it arrived damaged":
-        raise DamagedError(f"{file.path} arrived {TRIES} times with other bytes than the manifest promises")
+        raise DamagedError(
+            f"{file.path} arrived {TRIES} times with other bytes than the manifest promises"
+        )
     raise UnreachableError(f"{file.path} could not be downloaded in {TRIES} tries: {reason}")
 
 
 def _fetch(
-    client: Client, url: str, digest: Sha256, part: Path, on_bytes: Callable[[int], None], stop: threading.Event
+    client: Client,
+    url: str,
+    digest: Sha256,
+    part: Path,
+    on_bytes: Callable[[int], None],
+    stop: threading.Event,
 ) -> None:
     have = part.stat().st_size if part.exists() else 0
     etag = f'"{digest}"'
-    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={have}-", "If-Range": etag} if have else {})
+    headers = {"Accept-Encoding": "identity"} | (
+        {"Range": f"bytes={have}-", "If-Range": etag} if have else {}
+    )
     with client.stream(url, headers) as response:
         if response.status_code == 416:  # the part is at least as long as the file
             return

@@ -1,8 +1,10 @@
-"""Verification of a dataset directory (its seal, its files, and the absence of other files), and signatures.
+"""Verification of a dataset directory (its seal, its files, and the absence of other files), and
+signatures.
 
-A signature is that of `ssh-keygen -Y sign` over `manifest.sha256`, with the namespace `stickslip`. OpenSSH does all
-cryptography and reads the keys; see ssh-keygen(1). The seal has the digests of the manifest and of the root's metadata,
-which have those of all other files, so the signature covers all of a version.
+A signature is that of `ssh-keygen -Y sign` over `manifest.sha256`, with the namespace `stickslip`.
+OpenSSH does all cryptography and reads the keys; see ssh-keygen(1). The seal has the digests of the
+manifest and of the root's metadata, which have those of all other files, so the signature covers
+all of a version.
 """
 
 import hashlib
@@ -33,7 +35,13 @@ from stickslip_schemas.format.manifest import (
     check_seal,
     layout,
 )
-from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files, sections_of
+from stickslip_schemas.format.selection import (
+    SELECTION_NAME,
+    PartDocument,
+    Selection,
+    part_files,
+    sections_of,
+)
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.client.http import (
@@ -53,7 +61,9 @@ CONNECTIONS = 4
 PART = ".part"
 """Suffix of a file that is being downloaded."""
 READS_ARRAYS = find_spec("numcodecs") is not None
-"""Whether the extra `arrays` is there: without it, `verify` does not look into the array `sample_key`."""
+"""Whether the extra `arrays` is there: without it, `verify` does not look into the array
+`sample_key`.
+"""
 EVERYTHING = Selection()
 OWN_NAMES = (*SEALED_NAMES, SIGNATURE_NAME, SELECTION_NAME)
 """Files of a directory that no manifest lists."""
@@ -62,16 +72,23 @@ OWN_NAMES = (*SEALED_NAMES, SIGNATURE_NAME, SELECTION_NAME)
 @dataclass(frozen=True, slots=True)
 class Fault:
     path: str
-    fault: Literal["missing", "size", "sha256", "extra", "manifest", "seal", "sample_key", "selection"]
+    fault: Literal[
+        "missing", "size", "sha256", "extra", "manifest", "seal", "sample_key", "selection"
+    ]
     detail: str
 
 
 def read_part(target: Path) -> PartDocument:
-    """Return the part of a version that a directory holds; raise FileNotFoundError if it holds all of it."""
+    """Return the part of a version that a directory holds.
+
+    Raise FileNotFoundError if it holds all of it.
+    """
     try:
         return PartDocument.model_validate_json((target / SELECTION_NAME).read_bytes())
     except ValidationError as error:
-        raise DamagedError(f"{target / SELECTION_NAME} is damaged: {str(error).splitlines()[0]}") from error
+        raise DamagedError(
+            f"{target / SELECTION_NAME} is damaged: {str(error).splitlines()[0]}"
+        ) from error
 
 
 def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]":
@@ -81,21 +98,35 @@ def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]
 
     array = next(array for array in layout(manifest.spec) if array.name == name)
     numbers = range(-(-manifest.sample_count // manifest.spec.samples_per_file(array)))
-    content = b"".join(bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers)
-    return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[: manifest.sample_count]
+    content = b"".join(
+        bytes(decode_chunk((target / array.shard_path(number)).read_bytes())) for number in numbers
+    )
+    return np.frombuffer(content, dtype=array.dtype).reshape(-1, *array.shape)[
+        : manifest.sample_count
+    ]
 
 
 def safe_path(target: Path, path: str) -> Path:
     """Return the path of a file of a manifest; raise UnsafePathError if it is not inside `target`.
 
-    Existing symbolic links are followed for the check, so a link that leads out of `target` is refused, too.
+    Existing symbolic links are followed for the check, so a link that leads out of `target` is
+    refused, too.
     """
     parts = PurePosixPath(path).parts
-    if not parts or path.startswith("/") or any(part in ("..", ".") for part in path.split("/")) or "\\" in path:
-        raise UnsafePathError(f"the manifest names the file {path!r}, which leaves the dataset; nothing was written")
+    if (
+        not parts
+        or path.startswith("/")
+        or any(part in ("..", ".") for part in path.split("/"))
+        or "\\" in path
+    ):
+        raise UnsafePathError(
+            f"the manifest names the file {path!r}, which leaves the dataset; nothing was written"
+        )
     whole = target.joinpath(*parts)
     if not whole.resolve().is_relative_to(target.resolve()):
-        raise UnsafePathError(f"the file {path!r} would be written outside {target}; nothing was written")
+        raise UnsafePathError(
+            f"the file {path!r} would be written outside {target}; nothing was written"
+        )
     if path in OWN_NAMES or path.endswith(PART):
         raise UnsafePathError(f"the manifest names the file {path!r}, which is a reserved name")
     return whole
@@ -107,13 +138,17 @@ def verify(target: Path) -> list[Fault]:
 
 
 def _found(target: Path) -> list[Fault]:
-    """Return the faults of the first check that finds some: of the seal, of a part, of the sections, of the files."""
+    """Return the faults of the first check that finds some: of the seal, of a part, of the
+    sections, of the files.
+    """
     sealed: dict[str, bytes] = {}
     for name in SEALED_NAMES:
         try:
             sealed[name] = (target / name).read_bytes()
         except FileNotFoundError:
-            return [Fault(name, "missing", "not there: no dataset, or a pull that was not finished")]
+            return [
+                Fault(name, "missing", "not there: no dataset, or a pull that was not finished")
+            ]
         except OSError as error:
             return [Fault(name, "missing", f"cannot be read: {error.strerror}")]
     try:
@@ -127,7 +162,13 @@ def _found(target: Path) -> list[Fault]:
     try:
         selection = read_part(target)
         if selection.manifest != sha256(sealed[MANIFEST_NAME]):
-            return [Fault(SELECTION_NAME, "selection", f"of another version, whose manifest is {selection.manifest}")]
+            return [
+                Fault(
+                    SELECTION_NAME,
+                    "selection",
+                    f"of another version, whose manifest is {selection.manifest}",
+                )
+            ]
         needed = part_files(contents, selection.selection, None)
         if faults := _faults(target, needed):  # the other files of a part follow from its labels
             return faults
@@ -151,13 +192,19 @@ def _found(target: Path) -> list[Fault]:
     except (OSError, BrokenSectionError) as error:
         return [Fault(MANIFEST_NAME, "manifest", str(error))]
     faults = _faults(target, list(wanted.values()))
-    faults += [Fault(path, "extra", "not in the manifest") for path in there - wanted.keys() - {*OWN_NAMES}]
+    faults += [
+        Fault(path, "extra", "not in the manifest") for path in there - wanted.keys() - {*OWN_NAMES}
+    ]
     return faults or (_sample_key_faults(target, contents, numbers) if READS_ARRAYS else [])
 
 
 def _faults(target: Path, files: list[FileEntry]) -> list[Fault]:
     with ThreadPoolExecutor(CONNECTIONS) as pool:
-        return [fault for fault in pool.map(lambda file: fault_of(target, file), files) if fault is not None]
+        return [
+            fault
+            for fault in pool.map(lambda file: fault_of(target, file), files)
+            if fault is not None
+        ]
 
 
 def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int]) -> list[Fault]:
@@ -173,10 +220,14 @@ def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int])
     faults = []
     for number in numbers:
         section = contents.section(number)
-        if stored[section.first : section.end].tobytes() != bytes.fromhex("".join(section.sample_keys)):
+        if stored[section.first : section.end].tobytes() != bytes.fromhex(
+            "".join(section.sample_keys)
+        ):
             path = array.shard_path(section.first // manifest.spec.samples_per_file(array))
             slots = f"slots {section.first} to {section.end - 1}"
-            faults.append(Fault(path, "sample_key", f"{slots} have other keys than the manifest says"))
+            faults.append(
+                Fault(path, "sample_key", f"{slots} have other keys than the manifest says")
+            )
     return faults
 
 
@@ -194,7 +245,11 @@ def fault_of(target: Path, file: FileEntry) -> Fault | None:
         return Fault(file.path, "missing", "not there")
     except OSError as error:
         return Fault(file.path, "missing", f"cannot be read: {error.strerror}")
-    return None if digest == file.sha256 else Fault(file.path, "sha256", f"{digest}, and should be {file.sha256}")
+    return (
+        None
+        if digest == file.sha256
+        else Fault(file.path, "sha256", f"{digest}, and should be {file.sha256}")
+    )
 
 
 def files_below(target: Path) -> Iterator[str]:
@@ -213,7 +268,10 @@ NAMESPACE = "stickslip"
 
 
 def sign(seal: bytes, key: Path) -> bytes:
-    """Return the signature of a seal; raise ClientError if the key, private or of an agent, cannot sign."""
+    """Return the signature of a seal.
+
+    Raise ClientError if the key, private or of an agent, cannot sign.
+    """
     ended = _keygen("sign", "-n", NAMESPACE, "-f", str(key), data=seal)
     if ended.returncode != 0:
         raise ClientError(f"{key} cannot sign: {_last_line(ended)}")
@@ -224,12 +282,16 @@ def is_signature(signature: bytes, seal: bytes) -> bool:
     with NamedTemporaryFile() as file:
         file.write(signature)
         file.flush()
-        return _keygen("check-novalidate", "-n", NAMESPACE, "-s", file.name, data=seal).returncode == 0
+        return (
+            _keygen("check-novalidate", "-n", NAMESPACE, "-s", file.name, data=seal).returncode == 0
+        )
 
 
 def sign_directory(target: Path, key: Path) -> None:
     """Write the signature of the dataset in a directory; raise DamagedError if the seal is broken."""
-    manifest, group, seal = ((target / name).read_bytes() for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))
+    manifest, group, seal = (
+        (target / name).read_bytes() for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
+    )
     try:
         check_seal(manifest, group, seal)
     except BrokenSealError as error:
@@ -238,7 +300,10 @@ def sign_directory(target: Path, key: Path) -> None:
 
 
 def signer_of(target: Path, allowed_signers: Path) -> str:
-    """Return who signed the dataset in a directory; raise what `check_signature` raises. Files are not checked."""
+    """Return who signed the dataset in a directory; raise what `check_signature` raises.
+
+    Files are not checked.
+    """
     try:
         signature = (target / SIGNATURE_NAME).read_bytes()
     except FileNotFoundError:
@@ -272,14 +337,20 @@ def check_signature(seal: bytes, signature: bytes | None, allowed_signers: Path)
             if _keygen("verify", "-n", NAMESPACE, "-I", name, *trusted, data=seal).returncode == 0:
                 return name
     key = good.stdout.decode().strip().rpartition(" with ")[2]
-    raise UnknownSignerError(f"the dataset was signed by somebody whom {allowed_signers} does not allow, with {key}")
+    raise UnknownSignerError(
+        f"the dataset was signed by somebody whom {allowed_signers} does not allow, with {key}"
+    )
 
 
 def _keygen(verb: str, *options: str, data: bytes = b"") -> "subprocess.CompletedProcess[bytes]":
     try:
-        return subprocess.run(["ssh-keygen", "-Y", verb, *options], input=data, capture_output=True, check=False)
+        return subprocess.run(
+            ["ssh-keygen", "-Y", verb, *options], input=data, capture_output=True, check=False
+        )
     except FileNotFoundError as error:
-        raise ClientError("signatures need the program ssh-keygen, of OpenSSH 8.9 or newer") from error
+        raise ClientError(
+            "signatures need the program ssh-keygen, of OpenSSH 8.9 or newer"
+        ) from error
 
 
 def _last_line(ended: "subprocess.CompletedProcess[bytes]") -> str:

@@ -1,11 +1,13 @@
-"""Transactions on the database (SQLite in the data directory, or PostgreSQL at a URL), statements, documents and pages.
+"""Transactions on the database (SQLite in the data directory, or PostgreSQL at a URL), statements,
+documents and pages.
 
-A write transaction excludes other writers from its first statement on, so it never conflicts at its end, and needs no
-retries.
+A write transaction excludes other writers from its first statement on, so it never conflicts at its
+end, and needs no retries.
 
-SQLAlchemy takes 0.1 ms of CPU to execute a statement that SQLite runs in 0.01 ms, and a lease and its report execute
-thirty. So the queue has prepared statements, compiled once, and executed by the driver directly. They have two limits:
-they return the driver's values (a Boolean is 0 or 1), and trigger no SQLAlchemy events.
+SQLAlchemy takes 0.1 ms of CPU to execute a statement that SQLite runs in 0.01 ms, and a lease and
+its report execute thirty. So the queue has prepared statements, compiled once, and executed by the
+driver directly. They have two limits: they return the driver's values (a Boolean is 0 or 1), and
+trigger no SQLAlchemy events.
 """
 
 import os
@@ -23,7 +25,19 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
-from sqlalchemy import URL, Column, Connection, Dialect, Engine, Row, Select, Table, create_engine, event, text
+from sqlalchemy import (
+    URL,
+    Column,
+    Connection,
+    Dialect,
+    Engine,
+    Row,
+    Select,
+    Table,
+    create_engine,
+    event,
+    text,
+)
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.sql.base import Executable
 from sqlalchemy.sql.compiler import SQLCompiler
@@ -39,7 +53,10 @@ BATCH = 5000
 
 
 class Role(Enum):
-    """The purpose of a connection. Any number of coordinators may share a database; upkeep needs it exclusively."""
+    """The purpose of a connection.
+
+    Any number of coordinators may share a database; upkeep needs it exclusively.
+    """
 
     coordinator = auto()
     upkeep = auto()
@@ -52,7 +69,8 @@ class Database:
         self._reader = reader
         self._writer = writer
         self._engines = {reader, writer, *others}
-        # The database's own waiting is unfair, or takes a connection, so threads of this process wait here.
+        # The database's own waiting is unfair, or takes a connection, so threads of this process
+        # wait here.
         self._writing = threading.Lock()
         self._ahead = time.time() - time.monotonic()
 
@@ -84,7 +102,9 @@ class Database:
         return self.write()
 
     def analyse(self) -> None:
-        """Tell the database how large its tables have become, where it must know that to choose plans."""
+        """Tell the database how large its tables have become, where it must know that to choose
+        plans.
+        """
         return
 
     def is_alone(self, connection: Connection) -> bool:
@@ -109,13 +129,17 @@ def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
         yield batch
 
 
-def rows_with(connection: Connection, query: Select[Any], column: Column[Any], values: Iterable[Any]) -> Iterator[Any]:
+def rows_with(
+    connection: Connection, query: Select[Any], column: Column[Any], values: Iterable[Any]
+) -> Iterator[Any]:
     """Yield the rows of `query` whose `column` has one of many values."""
     for batch in batches(values):
         yield from connection.execute(query.where(column.in_(batch)))
 
 
-def insert_rows(connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> None:
+def insert_rows(
+    connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]
+) -> None:
     """Insert many rows with the driver's executemany, at a fifth of the cost of SQL expressions."""
     mark = {"qmark": "?", "format": "%s"}[connection.dialect.paramstyle]
     statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({', '.join([mark] * len(columns))})"
@@ -147,7 +171,11 @@ def document_of(model: type[M], row: Any, **more: Any) -> M:
 
     Times, in seconds since 1970, become dates in UTC.
     """
-    found = {name: getattr(row, name) for name in model.model_fields if name not in more and hasattr(row, name)}
+    found = {
+        name: getattr(row, name)
+        for name in model.model_fields
+        if name not in more and hasattr(row, name)
+    }
     return model.model_validate(found | more)
 
 
@@ -160,13 +188,18 @@ def read_page(
     *,
     newest_first: bool = True,
 ) -> Page[T]:
-    """Return a page of the rows of `query`, ordered by the column `position`; `items` converts rows."""
+    """Return a page of the rows of `query`, ordered by the column `position`.
+
+    `items` converts rows.
+    """
     query = query.order_by(position.desc() if newest_first else position).limit(page.size + 1)
     if page.after is not None:
         query = query.where(position < page.after if newest_first else position > page.after)
     rows = connection.execute(query).all()
     shown = rows[: page.size]
-    token = str(getattr(shown[-1], position.key)) if len(rows) > page.size else None  # one row more than a page
+    token = (
+        str(getattr(shown[-1], position.key)) if len(rows) > page.size else None
+    )  # one row more than a page
     return Page[T](items=tuple(items(shown)), next_page_token=token)
 
 
@@ -179,25 +212,32 @@ _PRAGMAS = (
 
 
 class SqliteDatabase(Database):
-    """Transactions on one file. A write takes SQLite's write lock with its first statement (`BEGIN IMMEDIATE`)."""
+    """Transactions on one file.
+
+    A write takes SQLite's write lock with its first statement (`BEGIN IMMEDIATE`).
+    """
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
         _close_to_others(path)
-        # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync; leases and reports
-        # come in batches, so there are only a few a second.
+        # FULL: accepted jobs and dataset versions survive a power cut. A commit costs an fsync;
+        # leases and reports come in batches, so there are only a few a second.
         pragmas = (*_PRAGMAS, "synchronous=FULL" if durable else "synchronous=OFF")
         url = URL.create("sqlite+pysqlite", database=str(path))
         reader = create_engine(url, connect_args={"timeout": 30}, pool_size=8, max_overflow=40)
         writer = create_engine(url, connect_args={"timeout": 30}, pool_size=1, max_overflow=0)
         for engine, begin in ((reader, "BEGIN"), (writer, "BEGIN IMMEDIATE")):
             event.listen(engine, "connect", partial(_prepare, pragmas))
-            event.listen(engine, "begin", lambda connection, begin=begin: connection.exec_driver_sql(begin))
+            event.listen(
+                engine, "begin", lambda connection, begin=begin: connection.exec_driver_sql(begin)
+            )
         super().__init__(reader, writer)
 
 
 def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # the listeners begin transactions, not the driver
-    connection.text_factory = partial(str, encoding="utf-8", errors="replace")  # damaged text shows by its digest
+    connection.text_factory = partial(
+        str, encoding="utf-8", errors="replace"
+    )  # damaged text shows by its digest
     for pragma in pragmas:
         connection.execute(f"PRAGMA {pragma}")
 
@@ -225,13 +265,17 @@ class _Compiled:
     """The parameters in the order of the SQL."""
     defaults: Values
     lists: Mapping[str, str]
-    """Parameters that are the values of an IN (...), each with a query for an empty list: `IN ()` is invalid. None
-    where a list is one parameter, an array: the SQL is then the same for all lists, and the server plans it once."""
+    """Parameters that are the values of an IN (...), each with a query for an empty list: `IN ()`
+    is invalid. None where a list is one parameter, an array: the SQL is then the same for all
+    lists, and the server plans it once."""
     mark: str
 
 
 class Prepared:
-    """A statement with its parameters as `bindparam`s, or SQL with `:parameters`; an expanding one takes a list."""
+    """A statement with its parameters as `bindparam`s, or SQL with `:parameters`.
+
+    An expanding one takes a list.
+    """
 
     def __init__(self, statement: Executable | str) -> None:
         self._statement = text(statement) if isinstance(statement, str) else statement
@@ -257,7 +301,10 @@ class Prepared:
         self._executed(connection, values, lambda _: None)
 
     def run_all(self, connection: Connection, values: Sequence[Values]) -> None:
-        """Execute it with each of the values, if there are any; it must not have expanding parameters."""
+        """Execute it with each of the values, if there are any.
+
+        It must not have expanding parameters.
+        """
         if not values:
             return
         compiled = self._compile(connection.dialect)
@@ -296,7 +343,9 @@ class Prepared:
                 for name in dict.fromkeys(names)
                 if made.binds[name].expanding
             }
-            defaults = {name: value for name, value in made.params.items() if not made.binds[name].required}
+            defaults = {
+                name: value for name, value in made.params.items() if not made.binds[name].required
+            }
             mark = {"qmark": "?", "format": "%s"}[dialect.paramstyle]
             sql = str(made)
             if dialect.name == "postgresql":
@@ -313,14 +362,18 @@ RowType = TypeVar("RowType", bound=tuple[Any, ...])
 
 
 class RowQuery(Prepared, Generic[RowType]):
-    """A prepared SELECT whose rows have a type: a NamedTuple with one field for each selected column, in order."""
+    """A prepared SELECT whose rows have a type: a NamedTuple with one field for each selected
+    column, in order.
+    """
 
     def __init__(self, row_type: type[RowType], statement: Select[Any]) -> None:
         super().__init__(statement)
         fields = row_type._fields  # type: ignore[attr-defined]  # of every NamedTuple
         selected = tuple(statement.selected_columns.keys())
         if fields != selected:
-            raise TypeError(f"{row_type.__name__} has the fields {fields}, and the query selects {selected}")
+            raise TypeError(
+                f"{row_type.__name__} has the fields {fields}, and the query selects {selected}"
+            )
         self._make = row_type._make  # type: ignore[attr-defined]
 
     def rows(self, connection: Connection, values: Values | None = None) -> list[RowType]:
@@ -328,7 +381,9 @@ class RowQuery(Prepared, Generic[RowType]):
 
 
 class Counters(Prepared):
-    """Adds to the counters of a table, whose last column is the counter and whose others are its key."""
+    """Adds to the counters of a table, whose last column is the counter and whose others are its
+    key.
+    """
 
     def __init__(self, table: Table) -> None:
         self._names = table.columns.keys()
@@ -340,7 +395,10 @@ class Counters(Prepared):
 
     def add(self, connection: Connection, changes: Mapping[tuple[Any, ...], int]) -> None:
         """Add changes by key; a row that is missing is made."""
-        self.run_all(connection, [dict(zip(self._names, (*key, n), strict=True)) for key, n in changes.items()])
+        self.run_all(
+            connection,
+            [dict(zip(self._names, (*key, n), strict=True)) for key, n in changes.items()],
+        )
 
 
 def _list_mark(name: str) -> str:

@@ -1,4 +1,6 @@
-"""Opening a coordinator's database and migrating it, or refusing it with one sentence on what to do."""
+"""Opening a coordinator's database and migrating it, or refusing it with one sentence on what to
+do.
+"""
 
 import sqlite3
 from collections.abc import Iterator
@@ -22,7 +24,10 @@ MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
-    """Return the database of a coordinator, unchanged. Raise DatabaseRefusedError where its driver is missing."""
+    """Return the database of a coordinator, unchanged.
+
+    Raise DatabaseRefusedError where its driver is missing.
+    """
     url = settings.database_url
     if url is None:
         return SqliteDatabase(settings.database_path, durable=settings.durable)
@@ -67,7 +72,9 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
 
 
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
-    """Return whether the database exists; raise DatabaseRefusedError where it cannot be used in a role.
+    """Return whether the database exists.
+
+    Raise DatabaseRefusedError where it cannot be used in a role.
 
     With `with_store`, a missing database is refused where the store holds datasets: it was lost.
     """
@@ -111,8 +118,13 @@ def _sqlite_revision(path: Path) -> str | None:
     try:
         with closing(sqlite3.connect(path, timeout=30)) as connection:
             (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if found == "ok" and connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone():
-                (revision,) = connection.execute("SELECT version_num FROM alembic_version").fetchone()
+            if (
+                found == "ok"
+                and connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
+            ):
+                (revision,) = connection.execute(
+                    "SELECT version_num FROM alembic_version"
+                ).fetchone()
     except (sqlite3.OperationalError, TypeError) as error:
         if isinstance(error, sqlite3.OperationalError) and "no such table" not in str(error):
             raise DatabaseRefusedError(f"{path} cannot be opened: {error}") from error
@@ -138,7 +150,9 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
         )
     database = connect(settings, role)
     try:
-        with database.write() as connection:  # it is refused where another role has the database exclusively
+        with (
+            database.write() as connection
+        ):  # it is refused where another role has the database exclusively
             tables = inspect(connection).get_table_names()
             encoding = connection.scalar(text("SHOW server_encoding"))
             if encoding != "UTF8":
@@ -147,7 +161,9 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
                     "make another one with `createdb --encoding UTF8 --template template0`"
                 )
             if not tables:
-                if not connection.scalar(text("SELECT has_schema_privilege(current_schema(), 'CREATE')")):
+                if not connection.scalar(
+                    text("SELECT has_schema_privilege(current_schema(), 'CREATE')")
+                ):
                     raise DatabaseRefusedError(
                         f"its user may not make tables in the database {name}: make the user its owner, "
                         "for example with `createdb --owner`"
@@ -159,6 +175,8 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
                 )
             return str(connection.scalar(text("SELECT version_num FROM alembic_version")))
     except DBAPIError as error:
-        raise DatabaseRefusedError(f"{name} cannot be opened: {str(error.orig).splitlines()[0]}") from error
+        raise DatabaseRefusedError(
+            f"{name} cannot be opened: {str(error.orig).splitlines()[0]}"
+        ) from error
     finally:
         database.close()

@@ -1,8 +1,9 @@
 """PostgreSQL: one database for any number of coordinators.
 
-Writers exclude each other by one advisory lock, as on SQLite, so the queue never sees an unfinished change of another
-coordinator. One writer at a time suffices for a thousand cores. The statement that takes the lock also reads the
-database's clock and announces the change to the other coordinators; PostgreSQL delivers that with the commit.
+Writers exclude each other by one advisory lock, as on SQLite, so the queue never sees an unfinished
+change of another coordinator. One writer at a time suffices for a thousand cores. The statement
+that takes the lock also reads the database's clock and announces the change to the other
+coordinators; PostgreSQL delivers that with the commit.
 """
 
 import asyncio
@@ -23,7 +24,9 @@ from stickslip_services.errors import DatabaseRefusedError
 logger = logging.getLogger(__name__)
 
 _LOCKS = 0x736C6970
-"""First number of our advisory locks, "slip". The second is 1 for the writer, 2 for every connected process."""
+"""First number of our advisory locks, "slip". The second is 1 for the writer, 2 for every connected
+process.
+"""
 
 _CHANNEL = "stickslip"
 
@@ -69,8 +72,8 @@ _OTHERS = (
 class PostgresqlDatabase(Database):
     """Transactions on one PostgreSQL database.
 
-    Reads see a snapshot (REPEATABLE READ). Writes go through one connection, which also holds the lock of the role. The
-    first write raises DatabaseRefusedError where the role is refused.
+    Reads see a snapshot (REPEATABLE READ). Writes go through one connection, which also holds the
+    lock of the role. The first write raises DatabaseRefusedError where the role is refused.
     """
 
     def __init__(self, url: URL, *, durable: bool = True, role: Role = Role.coordinator) -> None:
@@ -80,14 +83,23 @@ class PostgresqlDatabase(Database):
         self._role = role
         self._durable = durable
         given = {name: value for name, value in _CONNECT.items() if name not in url.query}
-        # 24 readers, 4 touchers, a writer: three coordinators fit into the 100 connections of a server by default.
-        reader = create_engine(url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=16)
-        writer = create_engine(url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0)
+        # 24 readers, 4 touchers, a writer: three coordinators fit into the 100 connections of a
+        # server by default.
+        reader = create_engine(
+            url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=16
+        )
+        writer = create_engine(
+            url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0
+        )
         own = {"pool_size": 4, "max_overflow": 0, "isolation_level": "AUTOCOMMIT"}
         self._toucher = create_engine(url, paramstyle="format", connect_args=given, **own)
         self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
         for engine in (reader, writer, self._toucher):
-            event.listen(engine, "connect", lambda connection, _: connection.adapters.register_dumper(str, _TextDumper))
+            event.listen(
+                engine,
+                "connect",
+                lambda connection, _: connection.adapters.register_dumper(str, _TextDumper),
+            )
         event.listen(reader, "connect", _prepare_reader)
         event.listen(writer, "connect", self._prepare_writer)
         event.listen(writer, "close", _leave)
@@ -98,16 +110,23 @@ class PostgresqlDatabase(Database):
     def write(self) -> Iterator[Connection]:
         with super().write() as connection:
             _, _, now = connection.exec_driver_sql(_BEGIN, (self._token,)).one()
-            # Leases are granted, renewed and taken back in writes: all coordinators do it by the same clock.
+            # Leases are granted, renewed and taken back in writes: all coordinators do it by the
+            # same clock.
             self._ahead = now - time.monotonic()
             yield connection
 
     def touch(self) -> AbstractContextManager[Connection]:
-        """Connect beside writers; each statement is a transaction. A crash of the server may lose it."""
+        """Connect beside writers; each statement is a transaction.
+
+        A crash of the server may lose it.
+        """
         return self._toucher.begin()
 
     def analyse(self) -> None:
-        """Tell the server what it would learn a minute later; until then its plans are those for empty tables."""
+        """Tell the server what it would learn a minute later.
+
+        Until then its plans are those for empty tables.
+        """
         with self._toucher.connect() as connection:
             connection.exec_driver_sql("ANALYZE tasks, job_tasks, task_dependencies, samples")
 
@@ -117,7 +136,9 @@ class PostgresqlDatabase(Database):
     async def listen(self, notify: Callable[[], None]) -> None:
         while True:
             try:
-                connection = await psycopg.AsyncConnection.connect(**self._arguments, autocommit=True)
+                connection = await psycopg.AsyncConnection.connect(
+                    **self._arguments, autocommit=True
+                )
                 async with connection:
                     await connection.execute(f"LISTEN {_CHANNEL}")
                     notify()  # for writes before this connection listened
@@ -156,7 +177,9 @@ def _prepare_toucher(connection: Any, _record: Any) -> None:
 
 
 class _TextDumper(StrDumper):
-    """Replaces the character 0, which PostgreSQL cannot store, and which messages and URLs may contain."""
+    """Replaces the character 0, which PostgreSQL cannot store, and which messages and URLs may
+    contain.
+    """
 
     def dump(self, obj: str) -> Any:
         return super().dump(obj.replace("\0", "\N{REPLACEMENT CHARACTER}"))

@@ -1,7 +1,8 @@
 """The tables of the coordinator's database.
 
-Tasks are global and keyed by content; jobs point at the tasks that they need. Inside the database a task is its `seq`
-(8 bytes in five indexes, where its name would be 73); outside it is `<stage>-<key>`. Times are seconds since 1970.
+Tasks are global and keyed by content; jobs point at the tasks that they need. Inside the database a
+task is its `seq` (8 bytes in five indexes, where its name would be 73); outside it is
+`<stage>-<key>`. Times are seconds since 1970.
 """
 
 from typing import Any
@@ -32,7 +33,9 @@ def _table(name: str, *columns: sa.Column[Any] | sa.Index, **options: Any) -> sa
 
 def _numbered(name: str, *columns: sa.Column[Any] | sa.Index) -> sa.Table:
     """Return a table whose rows have numbers, `seq`, none of which is given again."""
-    return _table(name, sa.Column("seq", _Wide, primary_key=True), *columns, sqlite_autoincrement=True)
+    return _table(
+        name, sa.Column("seq", _Wide, primary_key=True), *columns, sqlite_autoincrement=True
+    )
 
 
 def _key(name: str) -> sa.Column[Any]:
@@ -55,17 +58,25 @@ jobs = _numbered(
     "jobs",
     sa.Column("id", sa.String, nullable=False, unique=True),
     sa.Column("name", sa.String),
-    sa.Column("project", sa.String, nullable=False, server_default=""),  # of the key that it was submitted with
+    sa.Column(
+        "project", sa.String, nullable=False, server_default=""
+    ),  # of the key that it was submitted with
     sa.Column("kind", sa.String, nullable=False),
     sa.Column("spec", sa.Text, nullable=False),  # JSON
     sa.Column("sample_count", sa.Integer, nullable=False),
     sa.Column("builds", sa.Text),  # JSON; null until its planning begins
     sa.Column("certificate", sa.String),  # digest of its certificate when planning began
-    sa.Column("digest", _Wide, nullable=False),  # of spec, builds and certificate (queue/recompute.py)
-    sa.Column("planned", sa.Integer, nullable=False, server_default="0"),  # number of samples whose tasks are inserted
+    sa.Column(
+        "digest", _Wide, nullable=False
+    ),  # of spec, builds and certificate (queue/recompute.py)
+    sa.Column(
+        "planned", sa.Integer, nullable=False, server_default="0"
+    ),  # number of samples whose tasks are inserted
     sa.Column("planner", sa.String),  # the coordinator that plans it
     sa.Column("planner_until", sa.Float),  # when another coordinator may go on with that
-    sa.Column("given_up", _Wide),  # the last task that was given up, while a cancelled job has more that wait
+    sa.Column(
+        "given_up", _Wide
+    ),  # the last task that was given up, while a cancelled job has more that wait
     sa.Column("publish_task", _Wide, index=True),  # null until the job is planned
     sa.Column("state", sa.String, nullable=False),
     sa.Column("reason", sa.String),
@@ -101,21 +112,35 @@ tasks = _table(
     sa.Column("key", sa.LargeBinary(32), nullable=False, unique=True),
     sa.Column("stage", sa.String, nullable=False),
     sa.Column("kind", sa.String, nullable=False),
-    sa.Column("build", sa.String, nullable=False),  # of its stage: what a worker must have to run it
-    sa.Column("payload", sa.Text, nullable=False),  # JSON; what the task is besides the results it waits for
+    sa.Column(
+        "build", sa.String, nullable=False
+    ),  # of its stage: what a worker must have to run it
+    sa.Column(
+        "payload", sa.Text, nullable=False
+    ),  # JSON; what the task is besides the results it waits for
     sa.Column("preview", sa.Boolean, nullable=False),
-    sa.Column("cost_group", sa.String, nullable=False, server_default=""),  # tasks of one group cost about the same
-    sa.Column("job", _Wide, nullable=False),  # the oldest live job that needs it, while it is pending
+    sa.Column(
+        "cost_group", sa.String, nullable=False, server_default=""
+    ),  # tasks of one group cost about the same
+    sa.Column(
+        "job", _Wide, nullable=False
+    ),  # the oldest live job that needs it, while it is pending
     sa.Column("state", sa.String, nullable=False),
     sa.Column("reason", sa.String),
     sa.Column("message", sa.Text, nullable=False, server_default=""),
     sa.Column("waiting_on", sa.Integer, nullable=False),  # dependencies that are not settled
-    sa.Column("token", sa.Integer, nullable=False, server_default="0"),  # fencing: increments at each lease
+    sa.Column(
+        "token", sa.Integer, nullable=False, server_default="0"
+    ),  # fencing: increments at each lease
     sa.Column("owner", sa.String),  # worker id, while leased or running
     sa.Column("expires_at", sa.Float),
-    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),  # times that it was started
+    sa.Column(
+        "attempts", sa.Integer, nullable=False, server_default="0"
+    ),  # times that it was started
     sa.Column("tries", sa.Integer, nullable=False, server_default="0"),  # of these, the failed ones
-    sa.Column("losses", sa.Integer, nullable=False, server_default="0"),  # of these, the ones that a lost worker ended
+    sa.Column(
+        "losses", sa.Integer, nullable=False, server_default="0"
+    ),  # of these, the ones that a lost worker ended
     sa.Column("retry_at", sa.Float),
     sa.Column("reported_token", sa.Integer),
     sa.Column("reported_by", sa.String),
@@ -139,8 +164,8 @@ tasks = _table(
     sa.Index("ix_tasks_retry", "retry_at", **_partial("state = 'soft_failed'")),
 )
 
-# The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only ever written by
-# plan.py, and the tests check that both ends exist.
+# The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only
+# ever written by plan.py, and the tests check that both ends exist.
 
 task_dependencies = _table(
     "task_dependencies",
@@ -170,9 +195,12 @@ samples = _table(
     sqlite_with_rowid=False,
 )
 
-previews = _table("previews", _key("task"), sa.Column("digest", sa.String, nullable=False, index=True))
+previews = _table(
+    "previews", _key("task"), sa.Column("digest", sa.String, nullable=False, index=True)
+)
 
-# Counters, updated by the ledger in the transaction that moves the tasks, so that showing progress counts no rows.
+# Counters, updated by the ledger in the transaction that moves the tasks, so that showing progress
+# counts no rows.
 
 job_counts = _table(
     "job_counts",
@@ -213,7 +241,9 @@ cost_groups = _table(
     sa.Column("stage", sa.String, primary_key=True),
     sa.Column("kind", sa.String, primary_key=True),
     sa.Column("cost_group", sa.String, primary_key=True),
-    sa.Column("count", sa.Integer, nullable=False),  # of finished tasks; halved with the sums at times (queue/eta.py)
+    sa.Column(
+        "count", sa.Integer, nullable=False
+    ),  # of finished tasks; halved with the sums at times (queue/eta.py)
     sa.Column("wall_sum", sa.Float, nullable=False),  # of a task's share of the call that made it
     sa.Column("wall_squares", sa.Float, nullable=False),
     sa.Column("call_sum", sa.Float, nullable=False),  # of the whole call
@@ -240,7 +270,9 @@ dataset_versions = _table(
     sa.Column("valid_count", sa.Integer),
     sa.Column("bytes", _Wide),
     sa.Column("scrubbed_at", sa.Float),  # when all its files were read last, or made
-    sa.Column("damaged", sa.Integer, nullable=False, server_default="0"),  # files that were damaged then
+    sa.Column(
+        "damaged", sa.Integer, nullable=False, server_default="0"
+    ),  # files that were damaged then
 )
 
 certificates = _numbered(
@@ -251,20 +283,26 @@ certificates = _numbered(
     sa.Column("sim_core", sa.String, nullable=False),
     sa.Column("extent", sa.String, nullable=False),
     sa.Column("passed", sa.Boolean, nullable=False),
-    sa.Column("protocols", sa.String, nullable=False, server_default=""),  # names, with spaces between
+    sa.Column(
+        "protocols", sa.String, nullable=False, server_default=""
+    ),  # names, with spaces between
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Index("ix_certificates_preset_sim_core", "preset", "sim_core"),
 )
 
 uploads = _table(  # who has uploaded which artifact
-    "uploads", sa.Column("project", sa.String, primary_key=True), sa.Column("digest", sa.String, primary_key=True)
+    "uploads",
+    sa.Column("project", sa.String, primary_key=True),
+    sa.Column("digest", sa.String, primary_key=True),
 )
 
 api_keys = _numbered(
     "api_keys",
     sa.Column("id", sa.String, nullable=False, unique=True),
     sa.Column("name", sa.String, nullable=False),
-    sa.Column("digest", sa.String, nullable=False, unique=True),  # SHA-256 of the secret, which is nowhere
+    sa.Column(
+        "digest", sa.String, nullable=False, unique=True
+    ),  # SHA-256 of the secret, which is nowhere
     sa.Column("scopes", sa.String, nullable=False),  # words, with spaces between
     sa.Column("project", sa.String, nullable=False, server_default=""),
     sa.Column("created_at", sa.Float, nullable=False),
@@ -293,8 +331,12 @@ webhooks = _numbered(
     sa.Column("project", sa.String, nullable=False),
     sa.Column("url", sa.String, nullable=False),
     sa.Column("secret", sa.String, nullable=False),  # sealed (access/keys.py)
-    sa.Column("position", _Wide, nullable=False),  # id of the last event that was delivered, or needs no delivery
-    sa.Column("next_at", sa.Float, nullable=False),  # when to try again; ahead, while a coordinator is at it
+    sa.Column(
+        "position", _Wide, nullable=False
+    ),  # id of the last event that was delivered, or needs no delivery
+    sa.Column(
+        "next_at", sa.Float, nullable=False
+    ),  # when to try again; ahead, while a coordinator is at it
     sa.Column("failures", sa.Integer, nullable=False),  # tries in a row that failed
     sa.Column("failing_since", sa.Float),
     sa.Column("fault", sa.Text, nullable=False),  # of the last try; empty where it went well

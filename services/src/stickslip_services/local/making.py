@@ -1,4 +1,5 @@
-"""What the workers' program makes on this machine: certificates of its build, and single samples of scenes.
+"""What the workers' program makes on this machine: certificates of its build, and single samples of
+scenes.
 
 The core is not imported here: the program writes files.
 """
@@ -31,12 +32,17 @@ TRAJECTORY_NAME = "trajectory.npz"
 
 
 def _asked(arguments: list[str], refusal: str) -> str:
-    """Run the workers' program and return what it printed; raise CommandError where it made nothing."""
+    """Run the workers' program and return what it printed.
+
+    Raise CommandError where it made nothing.
+    """
     # The matrices of master curves are too small for the threads of NumPy's linear algebra.
     environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
     command = [sys.executable, "-m", "stickslip_workers", *arguments]
     try:
-        ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+        ended = subprocess.run(
+            command, env=environment, stdout=subprocess.PIPE, text=True, check=False
+        )
     except OSError as error:
         raise CommandError(f"the workers' program does not start: {error}") from error
     if ended.returncode not in (0, 1) or not ended.stdout.strip():
@@ -45,7 +51,9 @@ def _asked(arguments: list[str], refusal: str) -> str:
 
 
 def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
-    """Run the protocols of a preset and write the certificate into `out`; progress goes to standard error.
+    """Run the protocols of a preset and write the certificate into `out`.
+
+    Progress goes to standard error.
 
     Raises CommandError where the program failed, or `out` holds another certificate.
     """
@@ -53,7 +61,9 @@ def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     digest = _asked(arguments, "no certificate was made").strip()
     certificate = read_certificate(out)
     if certificate.digest != digest:
-        raise CommandError(f"{out} holds another certificate than the one just made; is somebody else writing there?")
+        raise CommandError(
+            f"{out} holds another certificate than the one just made; is somebody else writing there?"
+        )
     return certificate
 
 
@@ -62,7 +72,9 @@ def read_certificate(directory: Path) -> Certificate:
     try:
         return Certificate.model_validate_json((directory / DOCUMENT_NAME).read_bytes())
     except FileNotFoundError as error:
-        raise CommandError(f"{directory} holds no certificate: there is no {DOCUMENT_NAME}") from error
+        raise CommandError(
+            f"{directory} holds no certificate: there is no {DOCUMENT_NAME}"
+        ) from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the document"
@@ -72,12 +84,18 @@ def read_certificate(directory: Path) -> Certificate:
 
 
 def simulate(
-    spec: ClothSceneSpec, files: Mapping[str, bytes], out: Path, *, certificate: Certificate | None, obj: bool
+    spec: ClothSceneSpec,
+    files: Mapping[str, bytes],
+    out: Path,
+    *,
+    certificate: Certificate | None,
+    obj: bool,
 ) -> dict[str, Any]:
     """Simulate the first sample of a spec into a new directory, with progress on standard error.
 
-    `files` are those that it names, by digest. `out`, which must not exist, appears when all is written; with `obj`, it
-    has `SHEET/0000.obj` and so on, too. Returns what `scene.json` holds; raises CommandError where it was not run.
+    `files` are those that it names, by digest. `out`, which must not exist, appears when all is
+    written; with `obj`, it has `SHEET/0000.obj` and so on, too. Returns what `scene.json` holds;
+    raises CommandError where it was not run.
     """
     import numpy as np  # the extra `arrays`
 
@@ -94,7 +112,9 @@ def simulate(
             raise CommandError(f"the scene was not simulated: {result.message}")
         arrays: dict[str, Any] = {}
         if isinstance(result.output, SimulateOutput):
-            with np.load(io.BytesIO(store.read(result.output.record.digest)), allow_pickle=False) as record:
+            with np.load(
+                io.BytesIO(store.read(result.output.record.digest)), allow_pickle=False
+            ) as record:
                 arrays = {name: values[result.output.record.row] for name, values in record.items()}
     said = {
         "scene": spec.stage.model_dump(mode="json"),
@@ -120,15 +140,23 @@ def simulate(
 
 
 def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
-    """Draw the start and the motions of a scene into a directory; return names of pictures, or raise CommandError."""
+    """Draw the start and the motions of a scene into a directory.
+
+    Return names of pictures, or raise CommandError.
+    """
     with _handed_over(scene, files) as (given, _):
         pictures: list[str] = _workers(["preview", *given, "--out", str(out)])["pictures"]
     return pictures
 
 
 @contextmanager
-def _handed_over(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tuple[list[str], Store]]:
-    """Write a document and the files that it names; yield the arguments that name them, and their store."""
+def _handed_over(
+    document: BaseModel, files: Mapping[str, bytes]
+) -> Iterator[tuple[list[str], Store]]:
+    """Write a document and the files that it names.
+
+    Yield the arguments that name them, and their store.
+    """
     with tempfile.TemporaryDirectory(prefix="stickslip-scene-") as temporary:
         store = open_store(temporary)
         for data in (*files.values(), *built_in_files().values()):
@@ -139,14 +167,20 @@ def _handed_over(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tu
 
 
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
-    """Return why no certificate vouches for the samples of a spec with a build of the solver, or an empty text."""
+    """Return why no certificate vouches for the samples of a spec with a build of the solver, or an
+    empty text.
+    """
     preset = spec.certified_preset
     if certificate is None:
         return f"there is no certificate of preset {preset}"
     if certificate.preset != preset:
         return f"the certificate is of preset {certificate.preset}, and the scene has {preset}"
     if not certificate.certifies:
-        return "the certificate is a quick one" if certificate.passed else "the preset did not pass its protocols"
+        return (
+            "the certificate is a quick one"
+            if certificate.passed
+            else "the preset did not pass its protocols"
+        )
     if certificate.sim_core != build:
         return "the certificate is of another build of the solver"
     measured = {report.protocol for report in certificate.protocols}
@@ -160,7 +194,9 @@ def _workers(arguments: list[str]) -> dict[str, Any]:
     return answer
 
 
-def _write(out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], said: dict[str, Any], *, obj: bool) -> None:
+def _write(
+    out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], said: dict[str, Any], *, obj: bool
+) -> None:
     import numpy as np
 
     (out / RESULT_NAME).write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
@@ -170,7 +206,9 @@ def _write(out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], said: dict[s
     np.savez_compressed(out / TRAJECTORY_NAME, times=times, **arrays)
     for sheet in spec.stage.sheets if obj else ():
         (out / sheet).mkdir()
-        faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (arrays[f"{sheet}.triangles"] + 1).tolist())
+        faces = "".join(
+            f"f {a} {b} {c}\n" for a, b, c in (arrays[f"{sheet}.triangles"] + 1).tolist()
+        )
         for frame, vertices in enumerate(arrays[f"{sheet}.positions"].tolist()):
             moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
             (out / sheet / f"{frame:04d}.obj").write_text(moved + faces, encoding="ascii")

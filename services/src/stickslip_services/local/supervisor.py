@@ -1,9 +1,9 @@
 """The processes on a machine: their memory, lock, socket and log, and `stickslip up`.
 
-`stickslip up` runs a coordinator, a Ray and a dispatcher, restarted until the supervisor stops. All files are below one
-directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and `lock` (against a second supervisor).
-Children that die are restarted with growing delays. A child that dies repeatedly at its start ends the supervisor,
-which prints the end of its log.
+`stickslip up` runs a coordinator, a Ray and a dispatcher, restarted until the supervisor stops. All
+files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (the address) and
+`lock` (against a second supervisor). Children that die are restarted with growing delays. A child
+that dies repeatedly at its start ends the supervisor, which prints the end of its log.
 """
 
 import ctypes
@@ -32,17 +32,21 @@ _M_ARENA_MAX = -8  # of glibc's malloc.h
 
 
 def limit_arenas() -> None:
-    """Let all threads allocate from two arenas of glibc. With one for each, every arena keeps memory that it freed."""
+    """Let all threads allocate from two arenas of glibc.
+
+    With one for each, every arena keeps memory that it freed.
+    """
     with suppress(AttributeError):  # another C library
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
 @contextmanager
 def locked(data: Path) -> Iterator[int]:
-    """Hold the lock of a data directory, which one coordinator or one `stickslip up` may use at a time.
+    """Hold the lock of a data directory, which one coordinator or one `stickslip up` may use at a
+    time.
 
-    Yield the file descriptor of the lock. A process that inherits it holds the lock, too, until it ends.
-    Raise DatabaseRefusedError if another process holds it.
+    Yield the file descriptor of the lock. A process that inherits it holds the lock, too, until it
+    ends. Raise DatabaseRefusedError if another process holds it.
     """
     data.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = data / "lock"
@@ -66,7 +70,9 @@ def locked(data: Path) -> Iterator[int]:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a port, but does not accept connections yet; raise CommandError."""
+    """Return a socket that is bound to a port, but does not accept connections yet; raise
+    CommandError.
+    """
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listener = socket.socket(family, kind, protocol)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -81,7 +87,9 @@ def listen(host: str, port: int) -> socket.socket:
 
 def configure_logging() -> None:
     """Log to standard error, one event a line: `time level logger: message`, in UTC."""
-    formatter = logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s", "%Y-%m-%dT%H:%M:%S")
+    formatter = logging.Formatter(
+        "%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s", "%Y-%m-%dT%H:%M:%S"
+    )
     formatter.converter = time.gmtime
     handler = logging.StreamHandler()
     handler.setFormatter(formatter)
@@ -90,7 +98,9 @@ def configure_logging() -> None:
 
 
 START_SECONDS = 180.0
-"""Time limit for the coordinator's first answer [s]; migrations may be slow while simulations use all cores."""
+"""Time limit for the coordinator's first answer [s]; migrations may be slow while simulations use
+all cores.
+"""
 SOON_SECONDS = 5.0
 """A child that dies within this time of its start has failed to start [s]."""
 MAX_FAILED_STARTS = 5
@@ -116,7 +126,9 @@ class _Child:
     start_again_at: float = field(default=0.0)
 
     def start(self) -> None:
-        """Start in a new session, so that Ctrl-C reaches only the supervisor, which stops children in order."""
+        """Start in a new session, so that Ctrl-C reaches only the supervisor, which stops children
+        in order.
+        """
         others = {name: value for name, value in os.environ.items() if name not in _PRIVATE}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -175,9 +187,14 @@ class _Child:
         return "\n".join(f"  {line}" for line in lines[-15:]) or "  (empty)"
 
     def _has_ended(self) -> bool:
-        """Return whether it has ended. It stays a zombie, because its pid names its group and must not be reused."""
+        """Return whether it has ended.
+
+        It stays a zombie, because its pid names its group and must not be reused.
+        """
         assert self.process is not None
-        return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        return (
+            os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        )
 
     def _kill_group(self) -> None:
         assert self.process is not None
@@ -186,12 +203,18 @@ class _Child:
 
 
 def run(
-    settings: Settings, *, name: str, slots: int | None, workers: str | None, on_ready: Callable[[str], None]
+    settings: Settings,
+    *,
+    name: str,
+    slots: int | None,
+    workers: str | None,
+    on_ready: Callable[[str], None],
 ) -> int:
     """Run until a signal to stop; return the exit status. Raise CommandError.
 
-    `settings` are those of the coordinator, with an absolute path of `data`; `name` is that of the dispatcher among all
-    that have the same database. `workers` is another command than `python -m stickslip_workers`, for tests.
+    `settings` are those of the coordinator, with an absolute path of `data`; `name` is that of the
+    dispatcher among all that have the same database. `workers` is another command than `python -m
+    stickslip_workers`, for tests.
     """
     data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
@@ -202,15 +225,31 @@ def run(
         listener = stack.enter_context(listen(settings.host, settings.port))
         listener.listen(512)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
-        program = [sys.executable, "-m", "stickslip_workers"] if workers is None else shlex.split(workers)
+        program = (
+            [sys.executable, "-m", "stickslip_workers"] if workers is None else shlex.split(workers)
+        )
         coordinator = _Child(
             "coordinator",
-            [sys.executable, "-m", "stickslip_services.app", "--data", str(data), "--fd", str(listener.fileno())],
+            [
+                sys.executable,
+                "-m",
+                "stickslip_services.app",
+                "--data",
+                str(data),
+                "--fd",
+                str(listener.fileno()),
+            ],
             data / "logs" / "coordinator.log",
             (lock, listener.fileno()),
             settings.variables,
         )
-        head = [*program, "head", "--ray-data", str(data), *([] if slots is None else ["--cpus", str(slots)])]
+        head = [
+            *program,
+            "head",
+            "--ray-data",
+            str(data),
+            *([] if slots is None else ["--cpus", str(slots)]),
+        ]
         ray = _Child("ray", head, data / "logs" / "ray.log")
         places = {
             "--ray-data": data,
@@ -221,7 +260,9 @@ def run(
             "--tls-certificate": settings.tls_certificate,
         }
         words = [str(word) for place in places.items() if place[1] is not None for word in place]
-        dispatcher = _Child("dispatcher", [*program, "dispatch", "--once", *words], data / "logs" / "dispatcher.log")
+        dispatcher = _Child(
+            "dispatcher", [*program, "dispatch", "--once", *words], data / "logs" / "dispatcher.log"
+        )
         children = [coordinator, ray, dispatcher]
         try:
             coordinator.start()
@@ -270,7 +311,10 @@ def _stop_signals() -> list[int]:
 
     def note(number: int, _frame: FrameType | None) -> None:
         if not caught:
-            os.write(2, b"stopping; another Ctrl-C stops at once. Jobs go on when you start the service again\n")
+            os.write(
+                2,
+                b"stopping; another Ctrl-C stops at once. Jobs go on when you start the service again\n",
+            )
         caught.append(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,4 +1,6 @@
-"""Arrays of single samples, read from the shards in the store, and what moves in a sample over time."""
+"""Arrays of single samples, read from the shards in the store, and what moves in a sample over
+time.
+"""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -7,7 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base import Sha256
-from stickslip_schemas.format.codecs import MISSING, decode_chunk, decode_sample, decode_shard_index, shard_index_size
+from stickslip_schemas.format.codecs import (
+    MISSING,
+    decode_chunk,
+    decode_sample,
+    decode_shard_index,
+    shard_index_size,
+)
 from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection, layout
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
@@ -41,7 +49,9 @@ class SampleData:
     def label(self, name: str) -> Array:
         array = self.arrays[name]
         size = self.manifest.spec.samples_per_file(array)
-        files = (self._file(array, number) for number in range(-(-self.manifest.sample_count // size)))
+        files = (
+            self._file(array, number) for number in range(-(-self.manifest.sample_count // size))
+        )
         columns = [_column(self.store, file.sha256, array, size) for file in files]
         return np.concatenate(columns)[: self.manifest.sample_count]
 
@@ -62,7 +72,9 @@ class SampleData:
         if array.categories:
             code = int(value)
             return array.categories[code] if 0 <= code < len(array.categories) else "none"
-        return value.item() if value.ndim == 0 else ", ".join(f"{item:.4g}" for item in value.ravel())
+        return (
+            value.item() if value.ndim == 0 else ", ".join(f"{item:.4g}" for item in value.ravel())
+        )
 
 
 @lru_cache(maxsize=4)
@@ -88,7 +100,9 @@ def _column(store: Store, digest: Sha256, array: ArrayLayout, slots: int) -> Arr
 
 
 MOST_NUMBERS = 600_000
-"""Coordinates that a page is sent, about 3 MB: of a longer motion it gets fewer instants, evenly spread."""
+"""Coordinates that a page is sent, about 3 MB: of a longer motion it gets fewer instants, evenly
+spread.
+"""
 
 LEAST_INSTANTS = 20
 
@@ -99,15 +113,23 @@ Floats = npt.NDArray[np.float64]
 
 
 def is_path(array: ArrayLayout) -> bool:
-    """Return whether an array holds points in space: of a rod, of a cloth, or of a sheet of a scene."""
-    is_place = array.dimensions[-2:-1] and array.dimensions[-2].split(".")[-1] in ("point", "vertex")
+    """Return whether an array holds points in space: of a rod, of a cloth, or of a sheet of a
+    scene.
+    """
+    is_place = array.dimensions[-2:-1] and array.dimensions[-2].split(".")[-1] in (
+        "point",
+        "vertex",
+    )
     return bool(is_place) and array.dimensions[-1] == "xyz" and len(array.shape) in (2, 3)
 
 
 def motion(data: SampleData, slot: int) -> dict[str, Any]:
-    """Return what the view of a sample draws, as JSON; raise KeyError where the sample or its paths are missing.
+    """Return what the view of a sample draws, as JSON.
 
-    Coordinates (instant, vertex x xyz) are whole numbers of `UNIT`; poses (instant, 12) are rows of x -> A x + b [m].
+    Raise KeyError where the sample or its paths are missing.
+
+    Coordinates (instant, vertex x xyz) are whole numbers of `UNIT`; poses (instant, 12) are rows of
+    x -> A x + b [m].
     """
     named = [name for name, array in data.arrays.items() if is_path(array)]
     tracks = {name: np.asarray(data.read(name, slot), dtype=float) for name in named}
@@ -132,10 +154,18 @@ def motion(data: SampleData, slot: int) -> dict[str, Any]:
     holders = _holders(data, slot, tracks)
     for thing in (*bodies, *holders):
         thing |= {
-            key: thing[key][chosen].reshape(len(chosen), -1).tolist() for key in ("poses", "holds") if key in thing
+            key: thing[key][chosen].reshape(len(chosen), -1).tolist()
+            for key in ("poses", "holds")
+            if key in thing
         }
         thing |= {key: _whole(thing[key], chosen) for key in ("points",) if key in thing}
-    return {"unit": UNIT, "instants": chosen.tolist(), "sheets": sheets, "bodies": bodies, "holders": holders}
+    return {
+        "unit": UNIT,
+        "instants": chosen.tolist(),
+        "sheets": sheets,
+        "bodies": bodies,
+        "holders": holders,
+    }
 
 
 def _whole(track: Floats, chosen: npt.NDArray[np.int64]) -> list[list[int]]:
@@ -144,20 +174,30 @@ def _whole(track: Floats, chosen: npt.NDArray[np.int64]) -> list[list[int]]:
 
 
 def _bodies(data: SampleData, slot: int) -> list[dict[str, Any]]:
-    """Return the bodies of the scene with the sample's own numbers, and their poses (instant, 3, 4)."""
+    """Return the bodies of the scene with the sample's own numbers, and their poses (instant, 3,
+    4).
+    """
     spec = data.manifest.spec
     if isinstance(spec, ClothDragSpec):
         return [{"type": "plane", "normal": [0, 0, 1]}]  # its floor, at z = 0
     if not isinstance(spec, ClothSceneSpec) or "body_pose" not in data.arrays:
         return []
-    numbers = [name for name in spec.stage.parameters if isinstance(spec.stage.default(name), float)]
-    own = {place: float(data.read(name, slot)) for name in numbers for place in spec.stage.places(name)}
+    numbers = [
+        name for name in spec.stage.parameters if isinstance(spec.stage.default(name), float)
+    ]
+    own = {
+        place: float(data.read(name, slot)) for name in numbers for place in spec.stage.places(name)
+    }
     document = with_arrays(spec.stage.checked(own), data.store.read)
     poses = np.asarray(data.read("body_pose", slot), dtype=float)
     times = np.arange(len(poses)) / spec.instants_per_second
     found = []
     for number, (name, body) in enumerate(document["bodies"].items()):
-        shown = {key: body[key] for key in ("type", "normal", "radius", "length", "size", "rounding") if key in body}
+        shown = {
+            key: body[key]
+            for key in ("type", "normal", "radius", "length", "size", "rounding")
+            if key in body
+        }
         if body["type"] == "mesh":
             shown["points"] = deformed(body["file"], body["strength"], times)
             shown["triangles"] = body["file"]["triangles"].ravel().tolist()
@@ -166,9 +206,11 @@ def _bodies(data: SampleData, slot: int) -> list[dict[str, Any]]:
 
 
 def deformed(file: Mapping[str, Any], strength: float, times: Floats) -> Floats:
-    """Return the vertices (time, vertex, xyz) [m] of a body of triangles, straight between the frames of its file.
+    """Return the vertices (time, vertex, xyz) [m] of a body of triangles, straight between the
+    frames of its file.
 
-    A skin's vertices are sums over bones of w (A x + b); `strength` scales all displacements since the first time.
+    A skin's vertices are sums over bones of w (A x + b); `strength` scales all displacements since
+    the first time.
     """
     frames = np.asarray(file["bones"] if "bones" in file else file["positions"], dtype=float)
     place = np.interp(times, file["times"], np.arange(len(frames)))
@@ -176,7 +218,9 @@ def deformed(file: Mapping[str, Any], strength: float, times: Floats) -> Floats:
     share = (place - low).reshape(-1, *[1] * (frames.ndim - 1))
     moved = (1 - share) * frames[low] + share * frames[np.minimum(low + 1, len(frames) - 1)]
     if "bones" in file:
-        turned = np.einsum("nb,tbij,nj->tni", file["weights"], moved[..., :3], file["rest"], optimize=True)
+        turned = np.einsum(
+            "nb,tbij,nj->tni", file["weights"], moved[..., :3], file["rest"], optimize=True
+        )
         moved = turned + np.einsum("nb,tbi->tni", file["weights"], moved[..., 3])
     found: Floats = moved[:1] + strength * (moved - moved[:1])
     return found
@@ -195,5 +239,7 @@ def _holders(data: SampleData, slot: int, tracks: Mapping[str, Floats]) -> list[
         return []
     poses, holds = (np.asarray(data.read(name, slot)) for name in ("holder_pose", "grasped"))
     all_ = [spec.stage.sheets[sheet].holders[name] for sheet, name in spec.stage.holders]
-    grips = [number for number, holder in enumerate(all_) if holder.rim is None]  # a rim has no one place
+    grips = [
+        number for number, holder in enumerate(all_) if holder.rim is None
+    ]  # a rim has no one place
     return [{"poses": poses[:, number], "holds": holds[:, number]} for number in grips]

@@ -1,4 +1,6 @@
-"""Composition of a task when it is leased: its document, with references to the results of its dependencies."""
+"""Composition of a task when it is leased: its document, with references to the results of its
+dependencies.
+"""
 
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -8,7 +10,13 @@ from typing import Any
 from sqlalchemy import Connection, bindparam, select
 from sqlalchemy.exc import NoResultFound
 from stickslip_schemas.base import Sha256, Stage, TaskState, content_key
-from stickslip_schemas.documents.tasks import AnyTask, PackTask, PublishTask, RenderTask, task_adapter
+from stickslip_schemas.documents.tasks import (
+    AnyTask,
+    PackTask,
+    PublishTask,
+    RenderTask,
+    task_adapter,
+)
 from stickslip_schemas.format.manifest import section_samples
 from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.jobs import JobSpec
@@ -34,17 +42,26 @@ STORED_TASK = [*TASK_COLUMNS, *(tasks.c[name] for name in ("key", "build", "payl
 
 
 def compose_task(connection: Connection, task: Any, publish: Publish) -> AnyTask:
-    """Return the document of a task, a row with `STORED_TASK`; all its dependencies must be settled.
+    """Return the document of a task, a row with `STORED_TASK`.
 
-    Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with `publish`, which takes a
-    while: do not call this in a write transaction.
+    All its dependencies must be settled.
+
+    Raises one of UNSOUND where rows are damaged. Sections of a publish task are stored with
+    `publish`, which takes a while: do not call this in a write transaction.
     """
     if task.stage == Stage.simulate:
-        _check_key(task, content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}))
+        _check_key(
+            task,
+            content_key("simulate", {"simulation": json.loads(task.payload), "build": task.build}),
+        )
         return task_adapter.validate_json(f'{{"stage":"simulate","simulation":{task.payload}}}')
     if task.stage == Stage.render:
         return _render_task(connection, task)
-    return _pack_task(connection, task) if task.stage == Stage.pack else _publish_task(connection, task, publish)
+    return (
+        _pack_task(connection, task)
+        if task.stage == Stage.pack
+        else _publish_task(connection, task, publish)
+    )
 
 
 def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
@@ -58,7 +75,9 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     if key is None or row is None or task_id(row.stage, key) != name:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:
-        raise ConflictError(f"task {name} builds on {row.waiting_on} others that have not ended yet")
+        raise ConflictError(
+            f"task {name} builds on {row.waiting_on} others that have not ended yet"
+        )
     return compose_task(connection, row, publish)
 
 
@@ -74,21 +93,32 @@ def _render_task(connection: Connection, task: Any) -> RenderTask:
     document = {"render": render, "simulation": simulation.key.hex(), "build": task.build}
     _check_key(task, content_key("render", document))
     if simulation.output is None:
-        raise ConflictError(f"the render {task.key.hex()} has nothing to render: its simulation was rejected")
+        raise ConflictError(
+            f"the render {task.key.hex()} has nothing to render: its simulation was rejected"
+        )
     record = json.loads(simulation.output)["record"]
-    return RenderTask.model_validate({"render": render, "record": record, "preview": bool(task.preview)})
+    return RenderTask.model_validate(
+        {"render": render, "record": record, "preview": bool(task.preview)}
+    )
 
 
-_NEEDED = Prepared(select(task_dependencies.c.depends_on).where(task_dependencies.c.task == bindparam("b_task")))
+_NEEDED = Prepared(
+    select(task_dependencies.c.depends_on).where(task_dependencies.c.task == bindparam("b_task"))
+)
 _RESULTS = Prepared(
     select(
-        *(tasks.c[name] for name in ("seq", "key", "state", "reason", "message", "output", "payload", "digest"))
+        *(
+            tasks.c[name]
+            for name in ("seq", "key", "state", "reason", "message", "output", "payload", "digest")
+        )
     ).where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
 )
 _SAMPLES = Prepared(
     select(samples)
     .where(
-        samples.c.job == bindparam("b_job"), samples.c.slot >= bindparam("b_first"), samples.c.slot < bindparam("b_end")
+        samples.c.job == bindparam("b_job"),
+        samples.c.slot >= bindparam("b_first"),
+        samples.c.slot < bindparam("b_end"),
     )
     .order_by(samples.c.slot)
 )
@@ -99,7 +129,10 @@ def _needed(connection: Connection, task: Any) -> set[int]:
 
 
 def _results(connection: Connection, seqs: Collection[int]) -> dict[int, Any]:
-    """Return the rows of settled tasks by `seq`; raise DamagedRowsError where what they made is damaged."""
+    """Return the rows of settled tasks by `seq`.
+
+    Raise DamagedRowsError where what they made is damaged.
+    """
     rows = [row for batch in batches(seqs) for row in _RESULTS.rows(connection, {"b_tasks": batch})]
     check_results(rows)
     return {row.seq: row for row in rows}
@@ -118,20 +151,33 @@ def _pack_task(connection: Connection, task: Any) -> PackTask:
     first = payload["shard"] * spec.samples_per_shard
     end = min(first + spec.samples_per_shard, spec.sample_count)
     rows = _samples(connection, payload["job"], first, end)
-    _check_key(task, pack_key(spec, payload["shard"], [(row.key.hex(), row.split) for row in rows], terms.builds))
-    return PackTask.model_validate({"spec": spec, "shard": payload["shard"], "slots": _slots(connection, rows)})
+    _check_key(
+        task,
+        pack_key(
+            spec, payload["shard"], [(row.key.hex(), row.split) for row in rows], terms.builds
+        ),
+    )
+    return PackTask.model_validate(
+        {"spec": spec, "shard": payload["shard"], "slots": _slots(connection, rows)}
+    )
 
 
 def _slots(connection: Connection, rows: Sequence[Any]) -> list[dict[str, Any]]:
     made = _results(
-        connection, {seq for row in rows for seq in (row.simulate_task, row.render_task) if seq is not None}
+        connection,
+        {seq for row in rows for seq in (row.simulate_task, row.render_task) if seq is not None},
     )
     slots = []
     for row in rows:
         simulated = made[row.simulate_task]
         rendered = made.get(row.render_task)
         labels = json.loads(row.labels)
-        slot: dict[str, Any] = {"slot": row.slot, "sample_key": row.key.hex(), "split": row.split, "labels": labels}
+        slot: dict[str, Any] = {
+            "slot": row.slot,
+            "sample_key": row.key.hex(),
+            "split": row.split,
+            "labels": labels,
+        }
         last = rendered or simulated
         if last.state == TaskState.rejected:
             slot["rejection"] = _rejection(row, last)
@@ -171,7 +217,12 @@ def _publish_task(connection: Connection, task: Any, publish: Publish) -> Publis
 
 
 def _section(
-    connection: Connection, job: int, spec: JobSpec, outputs: Sequence[Mapping[str, Any]], first: int, end: int
+    connection: Connection,
+    job: int,
+    spec: JobSpec,
+    outputs: Sequence[Mapping[str, Any]],
+    first: int,
+    end: int,
 ) -> bytes:
     """Return the slots from `first` to `end`, which are whole shards, as a `PublishSection`."""
     rows = _samples(connection, job, first, end)
@@ -207,4 +258,6 @@ def reserve_version(connection: Connection, task: Any) -> None:
     with suppress(*UNSOUND):  # composing it finds the damage
         if find_reserved(connection, task.seq) is None:
             dataset = read_plan(connection, json.loads(task.payload)["job"])[0].dataset_id
-            reserve_number(connection, dataset, version_number(connection, dataset, task.seq), task.seq)
+            reserve_number(
+                connection, dataset, version_number(connection, dataset, task.seq), task.seq
+            )

@@ -1,7 +1,7 @@
 """The context of one coordinator: what the verbs of the queue share, and its state in memory.
 
-The store is watched: while it takes no results, jobs are paused; afterwards they resume. Trouble is found by a look of
-the coordinator, or reported by a worker that could not write.
+The store is watched: while it takes no results, jobs are paused; afterwards they resume. Trouble is
+found by a look of the coordinator, or reported by a worker that could not write.
 """
 
 import asyncio
@@ -29,7 +29,9 @@ PROBE_SECONDS = 10.0
 class StoreWatch:
     """Monitors the store and the directory of the database."""
 
-    def __init__(self, store: Store, data: Path, *, min_free_bytes: int, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, store: Store, data: Path, *, min_free_bytes: int, clock: Callable[[], float]
+    ) -> None:
         self._places: tuple[Store, ...] = (store, DirectoryStore(data))
         self._min_free_bytes = min_free_bytes
         self._clock = clock
@@ -75,7 +77,8 @@ class Notifier:
         self._lock = threading.Lock()
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self.count = 0
-        """Number of notifications so far: read it before looking for news, and pass it to `wait`."""
+        """Number of notifications so far: read it before looking for news, and pass it to `wait`.
+        """
 
     def notify(self) -> None:
         with self._lock:
@@ -102,7 +105,10 @@ class Notifier:
 
 @dataclass(slots=True)
 class Context:
-    """Database, store, clock and settings of a coordinator. What is in memory only is lost with a restart."""
+    """Database, store, clock and settings of a coordinator.
+
+    What is in memory only is lost with a restart.
+    """
 
     settings: Settings
     database: Database
@@ -111,17 +117,28 @@ class Context:
     store_watch: StoreWatch
     notifier: Notifier = field(default_factory=Notifier)
     frames_by_worker: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
-    """Progress of simulations from the last heartbeat of each worker: (frames done, frames total) by task."""
+    """Progress of simulations from the last heartbeat of each worker: (frames done, frames total)
+    by task.
+    """
     sections: dict[str, tuple[Sha256, ...]] = field(default_factory=dict)
-    """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an earlier process."""
+    """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an
+    earlier process.
+    """
     is_closing: bool = False
 
     @classmethod
-    def open(cls, settings: Settings, clock: Clock | None = None, role: Role = Role.coordinator) -> "Context":
-        """Connect to the database and the store; `clock` replaces the clock of the database, for tests."""
+    def open(
+        cls, settings: Settings, clock: Clock | None = None, role: Role = Role.coordinator
+    ) -> "Context":
+        """Connect to the database and the store.
+
+        `clock` replaces the clock of the database, for tests.
+        """
         database, store = connect(settings, role), open_store(settings.store_place)
         clock = clock or database.clock
-        watch = StoreWatch(store, settings.data, min_free_bytes=settings.min_free_bytes, clock=clock)
+        watch = StoreWatch(
+            store, settings.data, min_free_bytes=settings.min_free_bytes, clock=clock
+        )
         return cls(settings, database, clock, store, watch)
 
     def close(self) -> None:
@@ -138,7 +155,11 @@ class Context:
     @property
     def frames(self) -> dict[str, tuple[int, int]]:
         """Progress of running simulations by task: (frames done, frames total)."""
-        return {task: frames for by_task in list(self.frames_by_worker.values()) for task, frames in by_task.items()}
+        return {
+            task: frames
+            for by_task in list(self.frames_by_worker.values())
+            for task, frames in by_task.items()
+        }
 
     @property
     def alive_since(self) -> float:

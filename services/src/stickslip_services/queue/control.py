@@ -1,9 +1,9 @@
 """Control of jobs by users (cancel, pause, resume, prioritise), and the coordinator's own work.
 
-Each change of a job is one transaction with an audit entry. Only the tasks of a job that ends are given up in more
-transactions, since a job of a million has millions. The coordinator's own work is done at its start, at each sweep,
-once a second, and while no job runs: scrubbing, which reads whole datasets now and then, to find damaged files that are
-not read otherwise.
+Each change of a job is one transaction with an audit entry. Only the tasks of a job that ends are
+given up in more transactions, since a job of a million has millions. The coordinator's own work is
+done at its start, at each sweep, once a second, and while no job runs: scrubbing, which reads whole
+datasets now and then, to find damaged files that are not read otherwise.
 """
 
 import logging
@@ -27,10 +27,21 @@ from stickslip_services.errors import ConflictError, DamagedRowsError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import find_job, has_runnable_job, show_job
 from stickslip_services.queue.plan import begin_planning, insert_job
-from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, fail_damaged_jobs, read_plan
+from stickslip_services.queue.recompute import (
+    CHECKED_AT_ONCE,
+    check_made_datasets,
+    fail_damaged_jobs,
+    read_plan,
+)
 from stickslip_services.queue.report import expire_leases
 from stickslip_services.queue.submit import plan_waiting_jobs, release_claims
-from stickslip_services.queue.transaction import IS_LEASED, RUNNABLE, QueueTransaction, reassign_waiting, release_tasks
+from stickslip_services.queue.transaction import (
+    IS_LEASED,
+    RUNNABLE,
+    QueueTransaction,
+    reassign_waiting,
+    release_tasks,
+)
 from stickslip_services.queue.workers import NO_WORKER, update_unschedulable_jobs
 
 logger = logging.getLogger(__name__)
@@ -42,22 +53,31 @@ IDLE_RATE = 50e6
 
 
 def cancel_job(context: Context, job_id: str) -> JobDetail:
-    """Cancel a job; one that is cancelled, or being cancelled, stays so. Raise ConflictError if it has ended."""
+    """Cancel a job; one that is cancelled, or being cancelled, stays so.
+
+    Raise ConflictError if it has ended.
+    """
     with _change(context, job_id, "job.cancel") as (tx, job):
         if job.state not in (JobState.cancelling, JobState.cancelled):
             if not JobState(job.state).is_open:
-                raise ConflictError(f"job {job_id} has ended ({job.state}); there is nothing left to cancel")
+                raise ConflictError(
+                    f"job {job_id} has ended ({job.state}); there is nothing left to cancel"
+                )
             message = "tasks that are running are being stopped"
             tx.set_job_state(job.seq, JobState.cancelling, reason=Reason.cancelled, message=message)
             release_tasks(tx, job.seq)
     return _shown(context, job.seq)
 
 
-_TO_GIVE_UP = Prepared(select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1))
+_TO_GIVE_UP = Prepared(
+    select(jobs.c.seq, jobs.c.given_up).where(jobs.c.given_up.is_not(None)).limit(1)
+)
 
 
 def release_ended_jobs(context: Context) -> None:
-    """Give up the remaining waiting tasks of jobs that end, piece by piece, with pauses for other writers."""
+    """Give up the remaining waiting tasks of jobs that end, piece by piece, with pauses for other
+    writers.
+    """
     while not context.is_closing:
         with context.database.read() as connection:
             if not _TO_GIVE_UP.tuples(connection):
@@ -70,20 +90,27 @@ def release_ended_jobs(context: Context) -> None:
 
 
 def pause_job(context: Context, job_id: str) -> JobDetail:
-    """Pause a job: no further tasks are leased, running ones finish. Raise ConflictError if it has ended."""
+    """Pause a job: no further tasks are leased, running ones finish.
+
+    Raise ConflictError if it has ended.
+    """
     with _change(context, job_id, "job.pause") as (tx, job):
         pausing = (JobState.pausing, JobState.paused)
         if job.state not in (*RUNNABLE, *pausing):
             raise ConflictError(
                 f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
             )
-        if job.state not in pausing or job.reason is not None:  # a job that waits for the store stays paused after it
+        if (
+            job.state not in pausing or job.reason is not None
+        ):  # a job that waits for the store stays paused after it
             pause(tx, job.seq, message="nothing more is started; tasks that are running finish")
     return _shown(context, job.seq)
 
 
 def resume_job(context: Context, job_id: str) -> JobDetail:
-    """Resume a paused job with the builds that it was planned for; a job that is not paused is left as it is.
+    """Resume a paused job with the builds that it was planned for.
+
+    A job that is not paused is left as it is.
 
     Raises ConflictError if it has ended, or while the store takes no results.
     """
@@ -100,15 +127,22 @@ def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
     """Set the priority of a job. Raise ConflictError if it has ended."""
     with _change(context, job_id, "job.prioritise", priority=priority) as (tx, job):
         if not JobState(job.state).is_open:
-            raise ConflictError(f"job {job_id} has ended ({job.state}); its priority cannot be changed")
+            raise ConflictError(
+                f"job {job_id} has ended ({job.state}); its priority cannot be changed"
+            )
         tx.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(priority=priority))
         reassign_waiting(tx, job.seq)
     return _shown(context, job.seq)
 
 
 @contextmanager
-def _change(context: Context, job_id: str, action: str, **details: Any) -> Iterator[tuple[QueueTransaction, Row[Any]]]:
-    """Open a transaction that changes a job; yield its ledger and the job's row. It ends with an audit entry."""
+def _change(
+    context: Context, job_id: str, action: str, **details: Any
+) -> Iterator[tuple[QueueTransaction, Row[Any]]]:
+    """Open a transaction that changes a job; yield its ledger and the job's row.
+
+    It ends with an audit entry.
+    """
     with context.transaction() as tx:
         job = find_job(tx.connection, job_id)
         yield tx, job
@@ -130,7 +164,9 @@ def resume(tx: QueueTransaction, job: Any) -> None:
     state = JobState.queued if job.started_at is None else JobState.running
     if job.builds is not None and job.planned < job.sample_count:
         state = JobState.planning
-    reason, message = (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
+    reason, message = (
+        (None, "") if job.builds is not None else (Reason.waiting_for_worker, NO_WORKER)
+    )
     tx.set_job_state(job.seq, state, reason=reason, message=message)
     reassign_waiting(tx, job.seq)
 
@@ -145,7 +181,9 @@ def start(context: Context) -> None:
     with context.database.write() as connection:
         upgrade(connection)
         admit_local_worker(connection, context.settings.worker_key_path, context.clock())
-        if context.database.is_alone(connection):  # no other coordinator could have taken a heartbeat
+        if context.database.is_alone(
+            connection
+        ):  # no other coordinator could have taken a heartbeat
             now = context.clock()
             expires_at = now + context.settings.lease_seconds
             connection.execute(update(tasks).where(IS_LEASED).values(expires_at=expires_at))
@@ -156,7 +194,9 @@ def start(context: Context) -> None:
 
 
 def sweep(context: Context) -> None:
-    """Watch the store, plan jobs that wait, take back expired leases, retry tasks, and update messages."""
+    """Watch the store, plan jobs that wait, take back expired leases, retry tasks, and update
+    messages.
+    """
     fail_damaged_jobs(context)
     _watch_store(context)
     plan_waiting_jobs(context)
@@ -168,7 +208,10 @@ def sweep(context: Context) -> None:
 _RUNNABLE_JOBS = Prepared(select(jobs).where(jobs.c.state.in_(RUNNABLE)))
 _HELD_JOBS = Prepared(
     select(jobs)
-    .where(jobs.c.state.in_((JobState.pausing, JobState.paused)), jobs.c.reason == Reason.store_unavailable)
+    .where(
+        jobs.c.state.in_((JobState.pausing, JobState.paused)),
+        jobs.c.reason == Reason.store_unavailable,
+    )
     .order_by(jobs.c.seq)
 )
 
@@ -187,21 +230,30 @@ def _watch_store(context: Context) -> None:
                 pause(tx, job.seq, reason=Reason.store_unavailable, message=message)
             else:
                 resume(tx, job)
-    logger.warning("jobs are paused: %s", trouble) if trouble else logger.info("the store takes results again")
+    logger.warning("jobs are paused: %s", trouble) if trouble else logger.info(
+        "the store takes results again"
+    )
 
 
 def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, list[str]] | None:
-    """Read the version that was read longest ago, at `rate` [bytes/s]; return its name, and paths of damaged files.
+    """Read the version that was read longest ago, at `rate` [bytes/s].
 
-    A damaged version gets a job with the terms that it was made with, which recomputes the files (`recompute`). With a
-    signing key, a version without a good signature is signed again. Returns None if all versions were read since
-    `before` [s]. Raises OSError where the store is out of reach, ClientError if the key cannot sign.
+    Return its name, and paths of damaged files.
+
+    A damaged version gets a job with the terms that it was made with, which recomputes the files
+    (`recompute`). With a signing key, a version without a good signature is signed again. Returns
+    None if all versions were read since `before` [s]. Raises OSError where the store is out of
+    reach, ClientError if the key cannot sign.
     """
     columns = dataset_versions.c
-    is_due = or_(columns.scrubbed_at < before, columns.scrubbed_at > context.clock())  # by a clock that was ahead
+    is_due = or_(
+        columns.scrubbed_at < before, columns.scrubbed_at > context.clock()
+    )  # by a clock that was ahead
     due = select(dataset_versions).where(columns.manifest.is_not(None), is_due)
     with context.database.read() as connection:
-        row = connection.execute(due.order_by(columns.scrubbed_at, columns.publish_task).limit(1)).one_or_none()
+        row = connection.execute(
+            due.order_by(columns.scrubbed_at, columns.publish_task).limit(1)
+        ).one_or_none()
     if row is None:
         return None
     found = damaged_files(context.store, row.manifest, row.group_digest, rate=rate)
@@ -209,14 +261,20 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
     with context.transaction() as tx:
         own = update(dataset_versions).where(columns.publish_task == row.publish_task)
         tx.connection.execute(own.values(scrubbed_at=tx.now, damaged=len(damaged)))
-        made = tx.connection.execute(select(jobs).where(jobs.c.publish_task == row.publish_task)).all()
+        made = tx.connection.execute(
+            select(jobs).where(jobs.c.publish_task == row.publish_task)
+        ).all()
         if damaged and made and not any(JobState(job.state).is_open for job in made):
             with suppress(DamagedRowsError):  # then it is only named
                 spec, terms = read_plan(tx.connection, made[0].seq)
                 job = insert_job(tx, spec, project=made[0].project)
                 begin_planning(tx, job, terms)
     key, seal = context.settings.signing_key, seal_text(row.manifest, row.group_digest)
-    if found is not None and key is not None and mend_signature(context.store, row.dataset, row.version, seal, key):
+    if (
+        found is not None
+        and key is not None
+        and mend_signature(context.store, row.dataset, row.version, seal, key)
+    ):
         damaged.append(SIGNATURE_NAME)
     return f"{row.dataset}:v{row.version}", damaged
 

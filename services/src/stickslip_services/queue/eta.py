@@ -1,18 +1,21 @@
-"""Progress of jobs, what tasks cost, and the time that is left, from measured durations, with its uncertainty.
+"""Progress of jobs, what tasks cost, and the time that is left, from measured durations, with its
+uncertainty.
 
-With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over k_g measured tasks,
-and p slots to run them on,
+With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over
+k_g measured tasks, and p slots to run them on,
 
     T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  (over the stages left, which run one after the other)
     var T = sum_g (n_g d_g^2 + n_g^2 d_g^2 / k_g + n_g^2 m_g^2 f^2) / p^2
 
-where M_s is the mean duration of the tasks left of stage s. A running task that reports its progress counts as the
-fraction that is left of it.
+where M_s is the mean duration of the tasks left of stage s. A running task that reports its
+progress counts as the fraction that is left of it.
 
-The three terms: the spread of the durations, the standard error of the mean, and a relative error f for what the model
-leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 % of a normal distribution.
+The three terms: the spread of the durations, the standard error of the mean, and a relative error f
+for what the model leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 %
+of a normal distribution.
 
-The cost of a task is its share of the wall time of the call that made it; the call is what can hang.
+The cost of a task is its share of the wall time of the call that made it; the call is what can
+hang.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,7 +29,14 @@ from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
 from stickslip_schemas.documents.tasks import TaskResult
 
 from stickslip_services.database.database import Prepared
-from stickslip_services.database.tables import cost_groups, job_counts, job_groups, job_stages, job_tasks, tasks
+from stickslip_services.database.tables import (
+    cost_groups,
+    job_counts,
+    job_groups,
+    job_stages,
+    job_tasks,
+    tasks,
+)
 from stickslip_services.queue.ids import task_key
 
 QUANTILE_80 = 1.2816
@@ -105,16 +115,26 @@ class StageWork:
 def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | None:
     """Return the time left, or None if it is unknown or nothing is left.
 
-    Packing and publishing are a few short tasks at the end. Until one has been measured they are assumed to take
-    `PACK_GUESS`, or the mean of the slowest measured group where that is less, with an error of 100 %. Simulations and
-    renders are not guessed.
+    Packing and publishing are a few short tasks at the end. Until one has been measured they are
+    assumed to take `PACK_GUESS`, or the mean of the slowest measured group where that is less, with
+    an error of 100 %. Simulations and renders are not guessed.
     """
-    left = {stage: rest for stage, items in work.items() if (rest := [item for item in items if item.left > 0])}
+    left = {
+        stage: rest
+        for stage, items in work.items()
+        if (rest := [item for item in items if item.left > 0])
+    }
     if not left or slots < 1:
         return None
-    if any(item.timings is None for stage in (Stage.simulate, Stage.render) for item in left.get(stage, ())):
+    if any(
+        item.timings is None
+        for stage in (Stage.simulate, Stage.render)
+        for item in left.get(stage, ())
+    ):
         return None
-    measured = [item.timings for items in work.values() for item in items if item.timings is not None]
+    measured = [
+        item.timings for items in work.values() for item in items if item.timings is not None
+    ]
     if not measured:
         return None
     longest = min(PACK_GUESS, max(timings.mean for timings in measured))
@@ -126,7 +146,9 @@ def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | 
             timings = item.timings or guess
             n, mean, spread = item.left, timings.mean, timings.variance
             total += n * mean
-            variance += (n * spread + n**2 * spread / timings.count + (n * mean * MODEL_ERROR) ** 2) / slots**2
+            variance += (
+                n * spread + n**2 * spread / timings.count + (n * mean * MODEL_ERROR) ** 2
+            ) / slots**2
         seconds += total / slots
         chain += total / max(1.0, sum(item.left for item in items))
     seconds = max(seconds, chain)
@@ -135,7 +157,10 @@ def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | 
 
 
 def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings | None:
-    """Return the shares of all groups of a stage and kind together, as one measurement; None where none is known."""
+    """Return the shares of all groups of a stage and kind together, as one measurement.
+
+    None where none is known.
+    """
     found = [
         cost.share
         for (of_stage, of_kind, _), cost in costs.items()
@@ -147,8 +172,12 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
     return StageTimings(1, mean, mean**2)
 
 
-def timings_of(costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str) -> StageTimings | None:
-    """Return the shares of a group, or of all groups of the stage and kind where too little is known of it."""
+def timings_of(
+    costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str
+) -> StageTimings | None:
+    """Return the shares of a group, or of all groups of the stage and kind where too little is
+    known of it.
+    """
     cost = costs.get((stage, kind, group))
     if cost is not None and (cost.is_known or stage in (Stage.pack, Stage.publish)):
         return cost.share
@@ -163,18 +192,25 @@ def read_costs(connection: Connection) -> dict[Group, Cost]:
         (Stage(stage), kind, group): Cost(
             StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
         )
-        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in _ALL_COSTS.tuples(connection)
+        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in _ALL_COSTS.tuples(
+            connection
+        )
     }
 
 
 def limit_seconds(cost: Cost | None, tries: int, *, floor: float) -> float | None:
-    """Return the timeout of a call [s], at least `floor`; each failed try doubles it. None: the cost is unknown."""
+    """Return the timeout of a call [s], at least `floor`; each failed try doubles it.
+
+    None: the cost is unknown.
+    """
     if cost is None or not cost.is_known:
         return None
     return float(max(floor, TIMES * cost.expected_call) * 2**tries)
 
 
-def long_groups(costs: Mapping[Group, Cost], stage: Stage, kind: str, at_most: float | None) -> list[str]:
+def long_groups(
+    costs: Mapping[Group, Cost], stage: Stage, kind: str, at_most: float | None
+) -> list[str]:
     """Return the cost groups of a stage and kind whose calls take longer than `at_most` seconds."""
     if at_most is None:
         return []
@@ -194,8 +230,16 @@ def add_costs(connection: Connection, runs: Sequence[tuple[Any, TaskResult]]) ->
             group.append((run.wall_seconds, run.call_seconds))
     for (stage, kind, cost_group), costs in by_group.items():
         wall, call = (StageTimings.of(seconds) for seconds in zip(*costs, strict=True))
-        sums = {"n": wall.count, "wall": wall.total, "wall2": wall.squares, "call": call.total, "call2": call.squares}
-        _ADD_TO_COST_GROUPS.run(connection, {"stage": stage, "kind": kind, "cost_group": cost_group, **sums})
+        sums = {
+            "n": wall.count,
+            "wall": wall.total,
+            "wall2": wall.squares,
+            "call": call.total,
+            "call2": call.squares,
+        }
+        _ADD_TO_COST_GROUPS.run(
+            connection, {"stage": stage, "kind": kind, "cost_group": cost_group, **sums}
+        )
 
 
 _DIVISOR = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
@@ -215,20 +259,31 @@ Frames = Mapping[str, tuple[int, int]]
 
 
 def read_progress(
-    connection: Connection, rows: Collection[Row[tuple[object, ...]]], slots: Mapping[int, int], frames: Frames
+    connection: Connection,
+    rows: Collection[Row[tuple[object, ...]]],
+    slots: Mapping[int, int],
+    frames: Frames,
 ) -> dict[int, Progress]:
-    """Return the progress of jobs (rows of `jobs`) by `seq`; `slots` is the number of tasks that can run at once."""
+    """Return the progress of jobs (rows of `jobs`) by `seq`.
+
+    `slots` is the number of tasks that can run at once.
+    """
     seqs, costs = [row.seq for row in rows], read_costs(connection)
     counts: dict[tuple[int, str], dict[TaskState, int]] = {}
-    for job, stage, state, count in connection.execute(select(job_counts).where(job_counts.c.job.in_(seqs))):
+    for job, stage, state, count in connection.execute(
+        select(job_counts).where(job_counts.c.job.in_(seqs))
+    ):
         counts.setdefault((job, stage), {})[TaskState(state)] = count
     stages = {
-        (row.job, row.stage): row for row in connection.execute(select(job_stages).where(job_stages.c.job.in_(seqs)))
+        (row.job, row.stage): row
+        for row in connection.execute(select(job_stages).where(job_stages.c.job.in_(seqs)))
     }
     running = [row.seq for row in rows if row.state in (JobState.queued, JobState.running)]
     groups: dict[tuple[int, str], list[tuple[str, int]]] = {}
     if running:
-        for job, stage, group, left in connection.execute(select(job_groups).where(job_groups.c.job.in_(running))):
+        for job, stage, group, left in connection.execute(
+            select(job_groups).where(job_groups.c.job.in_(running))
+        ):
             groups.setdefault((job, stage), []).append((group, left))
     told = _frames(connection, seqs, frames)
 
@@ -239,22 +294,40 @@ def read_progress(
             kept = stages.get((row.seq, stage))
             if kept is None:  # not planned yet
                 continue
-            mine = [each for key, of_group in told.items() if key[:2] == (row.seq, stage) for each in of_group]
+            mine = [
+                each
+                for key, of_group in told.items()
+                if key[:2] == (row.seq, stage)
+                for each in of_group
+            ]
             shown[stage] = StageProgress(
                 counts={state: count for state, count in counts[row.seq, stage].items() if count},
                 cached=kept.cached,
                 cpu_seconds=kept.cpu_seconds,
-                frames=(sum(done for done, _ in mine), sum(total for _, total in mine)) if mine else None,
+                frames=(sum(done for done, _ in mine), sum(total for _, total in mine))
+                if mine
+                else None,
             )
             work[stage] = []
             for group, left in groups.get((row.seq, stage), ()):
-                finished = sum(done / max(total, 1) for done, total in told.get((row.seq, stage, group), ()))
-                work[stage].append(StageWork(left - finished, timings_of(costs, stage, row.kind, group)))
+                finished = sum(
+                    done / max(total, 1) for done, total in told.get((row.seq, stage, group), ())
+                )
+                work[stage].append(
+                    StageWork(left - finished, timings_of(costs, stage, row.kind, group))
+                )
         eta = None
-        if row.state in (JobState.queued, JobState.running) and row.builds is not None:  # else the work is not known
+        if (
+            row.state in (JobState.queued, JobState.running) and row.builds is not None
+        ):  # else the work is not known
             eta = estimate(work, slots=slots.get(row.seq, 0))
         return Progress(
-            done=sum(count for stage in shown.values() for state, count in stage.counts.items() if state.is_over),
+            done=sum(
+                count
+                for stage in shown.values()
+                for state, count in stage.counts.items()
+                if state.is_over
+            ),
             total=sum(count for stage in shown.values() for count in stage.counts.values()),
             planned=row.planned,
             stages=shown,
@@ -267,7 +340,9 @@ def read_progress(
 def _frames(
     connection: Connection, seqs: list[int], frames: Frames
 ) -> dict[tuple[int, str, str], list[tuple[int, int]]]:
-    """Return what running simulations report, (frames done, frames total), by job, stage and cost group."""
+    """Return what running simulations report, (frames done, frames total), by job, stage and cost
+    group.
+    """
     found: dict[tuple[int, str, str], list[tuple[int, int]]] = {}
     by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
     if not by_key:
@@ -275,7 +350,9 @@ def _frames(
     rows = connection.execute(
         select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, tasks.c.key)
         .join(tasks, tasks.c.seq == job_tasks.c.task)
-        .where(tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs))
+        .where(
+            tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs)
+        )
     )
     for job, stage, group, key in rows:
         found.setdefault((job, stage, group), []).append(by_key[key])
@@ -285,5 +362,9 @@ def _frames(
 def rejected_samples(progress: Progress) -> int:
     """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
     rendered = progress.stages.get(Stage.render)
-    last = rendered if rendered is not None and rendered.counts else progress.stages.get(Stage.simulate)
+    last = (
+        rendered
+        if rendered is not None and rendered.counts
+        else progress.stages.get(Stage.simulate)
+    )
     return 0 if last is None else last.counts.get(TaskState.rejected, 0)

@@ -1,4 +1,7 @@
-"""Names: random ones, and those of tasks, `<stage>-<content key>`; and digests of rows (`recompute`)."""
+"""Names: random ones, and those of tasks, `<stage>-<content key>`.
+
+And digests of rows (`recompute`).
+"""
 
 import hashlib
 import json

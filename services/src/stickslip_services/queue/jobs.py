@@ -21,7 +21,15 @@ from stickslip_schemas.documents.responses import (
 
 from stickslip_services.access.keys import own, own_task
 from stickslip_services.database.database import PageRequest, Prepared, document_of, read_page
-from stickslip_services.database.tables import events, job_stages, job_tasks, jobs, previews, samples, tasks
+from stickslip_services.database.tables import (
+    events,
+    job_stages,
+    job_tasks,
+    jobs,
+    previews,
+    samples,
+    tasks,
+)
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import Frames, StageTimings, read_progress, rejected_samples
@@ -46,7 +54,9 @@ def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     """Return the row of a job; raise NotFoundError."""
-    row = connection.execute(select(jobs).where(jobs.c.id == job_id, own(jobs.c.project))).one_or_none()
+    row = connection.execute(
+        select(jobs).where(jobs.c.id == job_id, own(jobs.c.project))
+    ).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no job {job_id!r}")
     return row
@@ -57,8 +67,12 @@ def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
     (shown,) = _shown(connection, [row], alive_workers(context, connection), context.frames)
     detail = JobDetail(**dict(shown), spec=terms_of(row)[0])
-    if context.store_watch.trouble and detail.state in RUNNABLE:  # the database may not be writable either
-        return detail.model_copy(update={"reason": Reason.store_unavailable, "message": context.store_watch.trouble})
+    if (
+        context.store_watch.trouble and detail.state in RUNNABLE
+    ):  # the database may not be writable either
+        return detail.model_copy(
+            update={"reason": Reason.store_unavailable, "message": context.store_watch.trouble}
+        )
     return detail
 
 
@@ -72,7 +86,9 @@ def list_jobs(
     *,
     newest_first: bool = True,
 ) -> Page[Job]:
-    """Return a page of jobs: those of a state and of a project, with `search` in the name, kind, id or dataset."""
+    """Return a page of jobs: those of a state and of a project, with `search` in the name, kind, id
+    or dataset.
+    """
     workers = alive_workers(context, connection)
     query = select(jobs).where(own(jobs.c.project))
     if search:
@@ -89,7 +105,9 @@ def job_projects(connection: Connection) -> list[str]:
     return list(connection.scalars(query.order_by(jobs.c.project)))
 
 
-def list_samples(connection: Connection, job: int, page: PageRequest, state: TaskState | None) -> Page[SampleState]:
+def list_samples(
+    connection: Connection, job: int, page: PageRequest, state: TaskState | None
+) -> Page[SampleState]:
     """Return a page of the samples of a job by slot, each with the state of its last task."""
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     query = (
@@ -107,19 +125,31 @@ def list_samples(connection: Connection, job: int, page: PageRequest, state: Tas
         check_samples(rows, page_slots if state is None else [row.slot for row in rows])
         settled = [row.seq for row in rows if row.state not in _UNSETTLED]  # a damaged state, too
         check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
-        return [document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels)) for row in rows]
+        return [
+            document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels))
+            for row in rows
+        ]
 
     return read_page(connection, query, page, samples.c.slot, checked, newest_first=False)
 
 
-def list_previews(connection: Connection, job: int, *, count: int = 1000, newest: bool = False) -> list[Preview]:
-    """Return at most `count` previews of a job: the first ones by slot, or the newest ones, newest first."""
+def list_previews(
+    connection: Connection, job: int, *, count: int = 1000, newest: bool = False
+) -> list[Preview]:
+    """Return at most `count` previews of a job: the first ones by slot, or the newest ones, newest
+    first.
+    """
     query = select(samples.c.slot, samples.c.labels, previews.c.digest).where(samples.c.job == job)
     query = query.join(previews, previews.c.task == samples.c.render_task)
     if newest:
-        query = query.join(tasks, tasks.c.seq == previews.c.task).order_by(tasks.c.finished_at.desc())
+        query = query.join(tasks, tasks.c.seq == previews.c.task).order_by(
+            tasks.c.finished_at.desc()
+        )
     rows = connection.execute(query.order_by(samples.c.slot).limit(count))
-    return [Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}") for row in rows]
+    return [
+        Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}")
+        for row in rows
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +162,17 @@ class StoredEvent:
 
     @property
     def is_last(self) -> bool:
-        return self.name is EventName.job_state and not JobStateEvent.model_validate_json(self.data).state.is_open
+        return (
+            self.name is EventName.job_state
+            and not JobStateEvent.model_validate_json(self.data).state.is_open
+        )
 
 
 def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
     """Return the events of a job after the one with the id `after`."""
-    query = select(events.c.id, events.c.name, events.c.data).where(events.c.job == job, events.c.id > after)
+    query = select(events.c.id, events.c.name, events.c.data).where(
+        events.c.job == job, events.c.id > after
+    )
     rows = connection.execute(query.order_by(events.c.id).limit(limit))
     return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
 
@@ -145,13 +180,23 @@ def read_events(connection: Connection, job: int, *, after: int, limit: int) -> 
 def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTimings]:
     """Return the measured durations of the tasks that a job had to run, by stage."""
     rows = connection.execute(select(job_stages).where(job_stages.c.job == job))
-    return {Stage(row.stage): StageTimings(row.wall_count, row.wall_sum, row.wall_squares) for row in rows}
+    return {
+        Stage(row.stage): StageTimings(row.wall_count, row.wall_sum, row.wall_squares)
+        for row in rows
+    }
 
 
 def slowest_tasks(connection: Connection, job: int, count: int) -> list[dict[str, Any]]:
-    """Return the finished tasks of a job that took longest, with names, cost groups and durations [s]."""
+    """Return the finished tasks of a job that took longest, with names, cost groups and durations
+    [s].
+    """
     rows = connection.execute(
-        select(*(tasks.c[name] for name in ("key", "stage", "cost_group", "cpu_seconds", "wall_seconds")))
+        select(
+            *(
+                tasks.c[name]
+                for name in ("key", "stage", "cost_group", "cpu_seconds", "wall_seconds")
+            )
+        )
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)
         .where(job_tasks.c.job == job, tasks.c.wall_seconds.is_not(None))
         .order_by(tasks.c.wall_seconds.desc())
@@ -161,7 +206,9 @@ def slowest_tasks(connection: Connection, job: int, count: int) -> list[dict[str
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
-    """Return whether an artifact is a preview that the asker sees, which is served without a dataset."""
+    """Return whether an artifact is a preview that the asker sees, which is served without a
+    dataset.
+    """
     query = select(previews.c.task).where(previews.c.digest == digest, own_task(previews.c.task))
     return connection.scalar(query.limit(1)) is not None
 
@@ -173,7 +220,9 @@ def _shown(
     frames: Frames,
 ) -> list[Job]:
     served = (JobState.queued, JobState.running)
-    slots = {row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served}
+    slots = {
+        row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served
+    }
     progress = read_progress(connection, rows, slots, frames)
     return [
         document_of(

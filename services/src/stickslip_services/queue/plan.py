@@ -1,8 +1,10 @@
-"""The plan of a job: its tasks simulate -> render -> pack -> publish, each keyed by what its result depends on.
+"""The plan of a job: its tasks simulate -> render -> pack -> publish, each keyed by what its result
+depends on.
 
-Planning is pure and slow: a job of many samples is planned piece by piece, outside any transaction. A task that exists
-in the database already is shared. If it is settled, the job gets its result for free; if it waits or runs, both jobs
-wait for it; if it failed or was cancelled, the new job starts it again.
+Planning is pure and slow: a job of many samples is planned piece by piece, outside any transaction.
+A task that exists in the database already is shared. If it is settled, the job gets its result for
+free; if it waits or runs, both jobs wait for it; if it failed or was cancelled, the new job starts
+it again.
 """
 
 import json
@@ -50,7 +52,9 @@ _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """The builds of the workers that make a job, and the certificate of their physics, if there is one."""
+    """The builds of the workers that make a job, and the certificate of their physics, if there is
+    one.
+    """
 
     builds: Builds
     certificate: Sha256 | None
@@ -59,15 +63,19 @@ class Terms:
 def terms_for(connection: Connection, spec: JobSpec) -> Terms | None:
     """Return builds and certificate for a job of `spec`, None if no worker has ever registered.
 
-    Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is not registered,
-    and PresetNotCertifiedError where the spec needs a certificate and its preset has none that passed for the workers'
-    build with all protocols that the spec needs.
+    Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is
+    not registered, and PresetNotCertifiedError where the spec needs a certificate and its preset
+    has none that passed for the workers' build with all protocols that the spec needs.
     """
     builds = builds_for(connection, registered(spec).kind)
     if builds is None:
         return None
     standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)
-    missing = [] if standing is None else [name for name in spec.certified_protocols if name not in standing[1]]
+    missing = (
+        []
+        if standing is None
+        else [name for name in spec.certified_protocols if name not in standing[1]]
+    )
     certificate = None if standing is None or missing else standing[0]
     if certificate is None and spec.needs_certificate:
         raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core, missing)
@@ -94,7 +102,9 @@ class PlannedSample(NamedTuple):
 
 @dataclass(slots=True)
 class Plan:
-    """Tasks by content key, in the order of execution, and samples: of a whole job, or of one piece."""
+    """Tasks by content key, in the order of execution, and samples: of a whole job, or of one
+    piece.
+    """
 
     spec: JobSpec
     first: int
@@ -124,29 +134,41 @@ def expand(spec: JobSpec, terms: Terms, *, previews: int = 0) -> Plan:
 
 
 def pieces(
-    spec: JobSpec, terms: Terms, *, size: int, previews: int = 0, first: int = 0, packed: Sequence[str] = ()
+    spec: JobSpec,
+    terms: Terms,
+    *,
+    size: int,
+    previews: int = 0,
+    first: int = 0,
+    packed: Sequence[str] = (),
 ) -> Iterator[Plan]:
     """Yield the plan of `spec` in pieces of whole shards, of about `size` samples each.
 
-    Together the pieces are the plan that `expand` returns, for any `size`. To continue from slot `first`, pass the keys
-    of the pack tasks before it as `packed`, in order.
+    Together the pieces are the plan that `expand` returns, for any `size`. To continue from slot
+    `first`, pass the keys of the pack tasks before it as `packed`, in order.
     """
     per_shard = spec.samples_per_shard
     count = min(spec.sample_count, previews)
-    previewed = {position * spec.sample_count // count for position in range(count)}  # the first, and evenly spread
+    previewed = {
+        position * spec.sample_count // count for position in range(count)
+    }  # the first, and evenly spread
     pack_keys = list(packed)
     waiting = shards(spec, terms.builds, first=first // per_shard)
     while some := list(islice(waiting, -(-size // per_shard))):
         yield _piece(spec, terms, some, previewed, pack_keys)
 
 
-def _piece(spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[int], pack_keys: list[str]) -> Plan:
+def _piece(
+    spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[int], pack_keys: list[str]
+) -> Plan:
     """Return the plan of some shards; add the keys of their pack tasks to `pack_keys`."""
     builds = terms.builds
     plan = Plan(spec, some[0].points[0].slot)
     tasks_by_key = plan.tasks
     packs: dict[bytes, PlannedTask] = {}
-    renders: dict[tuple[Any, ...], dict[bytes, PlannedTask]] = {}  # by shading: those that can be made together
+    renders: dict[
+        tuple[Any, ...], dict[bytes, PlannedTask]
+    ] = {}  # by shading: those that can be made together
     for shard in some:
         last: dict[bytes, None] = {}  # an ordered set: a grid may have one sample in two slots
         for point in shard.points:
@@ -154,17 +176,25 @@ def _piece(spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[in
             render: bytes | None = None
             if simulate not in tasks_by_key:
                 cost = spec.cost_group(Stage.simulate, point.labels)
-                tasks_by_key[simulate] = PlannedTask(_SIMULATE, builds.simulate, point.simulation_text, cost_group=cost)
+                tasks_by_key[simulate] = PlannedTask(
+                    _SIMULATE, builds.simulate, point.simulation_text, cost_group=cost
+                )
             if point.render_key is not None and point.render_text is not None:
                 key = render = bytes.fromhex(point.render_key)
-                shared = (value for axis, value in point.labels.items() if axis != spec.variant_axis)
+                shared = (
+                    value for axis, value in point.labels.items() if axis != spec.variant_axis
+                )
                 group = renders.setdefault((simulate, *shared), {})
                 if render not in group:
                     preview = point.slot in previewed
                     cost = spec.cost_group(Stage.render, point.labels)
-                    group[render] = PlannedTask(_RENDER, builds.render, point.render_text, (simulate,), preview, cost)
+                    group[render] = PlannedTask(
+                        _RENDER, builds.render, point.render_text, (simulate,), preview, cost
+                    )
             last[key] = None
-            plan.samples.append(PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text))
+            plan.samples.append(
+                PlannedSample(point.slot, key, simulate, render, point.split, point.labels_text)
+            )
         pack_keys.append(shard.pack_key)
         payload = json.dumps({"shard": shard.number})
         packs[bytes.fromhex(shard.pack_key)] = PlannedTask(_PACK, builds.pack, payload, tuple(last))
@@ -173,7 +203,9 @@ def _piece(spec: JobSpec, terms: Terms, some: Sequence[Shard], previewed: set[in
     tasks_by_key.update(packs)
     if plan.is_last:
         publish = bytes.fromhex(publish_key(spec, pack_keys, builds, terms.certificate))
-        payload = json.dumps({} if terms.certificate is None else {"certificate": terms.certificate})
+        payload = json.dumps(
+            {} if terms.certificate is None else {"certificate": terms.certificate}
+        )
         depends_on = tuple(map(bytes.fromhex, pack_keys))
         tasks_by_key[publish] = PlannedTask(_PUBLISH, builds.digest, payload, depends_on)
     return plan
@@ -205,14 +237,18 @@ def insert_job(tx: QueueTransaction, spec: JobSpec, *, priority: int = 0, projec
 
 
 def begin_planning(tx: QueueTransaction, job: int, terms: Terms, plan: Plan | None = None) -> None:
-    """Store the terms of a job, start its counters, and write its whole plan, or have it planned piece by piece."""
+    """Store the terms of a job, start its counters, and write its whole plan, or have it planned
+    piece by piece.
+    """
     spec = tx.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
     values = {"builds": terms.builds.model_dump_json(), "certificate": terms.certificate}
     digest = row_digest(spec, *values.values())
     tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(values | {"digest": digest}))
     rows = [(job, stage, state, 0) for stage in Stage for state in TaskState]
     insert_rows(tx.connection, job_counts, ("job", "stage", "state", "count"), rows)
-    insert_rows(tx.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage])
+    insert_rows(
+        tx.connection, job_stages, ("job", "stage", "cached"), [(job, stage, 0) for stage in Stage]
+    )
     tx.set_job_state(job, JobState.planning if plan is None else JobState.queued)
     if plan is not None:
         write_plan(tx, job, plan)
@@ -264,11 +300,25 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> str:
         (
             (*row, row_digest(*row))
             for slot, key, simulate, render, split, labels in plan.samples
-            for row in [(job, slot, key, seqs[simulate], None if render is None else seqs[render], split, labels)]
+            for row in [
+                (
+                    job,
+                    slot,
+                    key,
+                    seqs[simulate],
+                    None if render is None else seqs[render],
+                    split,
+                    labels,
+                )
+            ]
         ),
     )
     new = Counter(
-        (task.stage, task.cost_group, TaskState.rejected if seqs[key] in rejected else TaskState.pending)
+        (
+            task.stage,
+            task.cost_group,
+            TaskState.rejected if seqs[key] in rejected else TaskState.pending,
+        )
         for key, task in plan.tasks.items()
         if key not in known
     )
@@ -276,7 +326,9 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> str:
     for (stage, _, state), count in new.items():
         overall[stage, state] += count
     TASK_COUNTS.add(connection, overall)
-    _add_counts(connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared))
+    _add_counts(
+        connection, job, new + Counter((task.stage, task.cost_group, task.state) for task in shared)
+    )
     lost = [task for task in shared if task.state in _LOST]
     tx.set_task_state(lost, TaskState.pending, **RESET_ATTEMPTS)  # which changes the counts
     for key, old in known.items():
@@ -284,7 +336,11 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> str:
             values = {"payload": _payload(plan.tasks[key], job), "build": plan.tasks[key].build}
             connection.execute(update(tasks).where(tasks.c.seq == old.seq).values(values))
     reassign(tx, [task for task in shared if task.state not in SETTLED])
-    return known[plan.publish_key].state if plan.is_last and plan.publish_key in known else TaskState.pending
+    return (
+        known[plan.publish_key].state
+        if plan.is_last and plan.publish_key in known
+        else TaskState.pending
+    )
 
 
 def _insert_tasks(
@@ -292,7 +348,8 @@ def _insert_tasks(
 ) -> tuple[dict[bytes, int], set[int]]:
     """Insert the tasks that are new, in the order of the plan.
 
-    Return the `seq` of every task of the plan, and those of new renders whose simulation has been rejected before.
+    Return the `seq` of every task of the plan, and those of new renders whose simulation has been
+    rejected before.
     """
     seqs = {key: task.seq for key, task in known.items()}
     settled = {task.seq: task for task in known.values() if task.state in SETTLED}
@@ -320,15 +377,34 @@ def _insert_tasks(
                 why = ("rejected", settled[needed].reason, settled[needed].message)
                 fate = (*why, row_digest(key, *why, None))
                 rejected.add(seq)
-        rows.append((seq, key, stage, kind, build, _payload(task, job), preview, cost_group, job, *fate, waiting_on))
+        rows.append(
+            (
+                seq,
+                key,
+                stage,
+                kind,
+                build,
+                _payload(task, job),
+                preview,
+                cost_group,
+                job,
+                *fate,
+                waiting_on,
+            )
+        )
     columns = ("seq", "key", "stage", "kind", "build", "payload", "preview", "cost_group", "job")
-    insert_rows(connection, tasks, (*columns, "state", "reason", "message", "digest", "waiting_on"), rows)
+    insert_rows(
+        connection, tasks, (*columns, "state", "reason", "message", "digest", "waiting_on"), rows
+    )
     insert_rows(connection, task_dependencies, ("task", "depends_on"), dependencies)
     return seqs, rejected
 
 
 def _payload(task: PlannedTask, job: int) -> str:
-    """Return the document of a task; the slots of pack and publish are those of the job that came first."""
+    """Return the document of a task.
+
+    The slots of pack and publish are those of the job that came first.
+    """
     if task.stage in (Stage.pack, Stage.publish):
         return json.dumps(json.loads(task.payload) | {"job": job})
     return task.payload
@@ -345,4 +421,6 @@ def _add_counts(connection: Connection, job: int, held: Mapping[tuple[str, str, 
     JOB_GROUPS.add(connection, left)
     for stage, count in (+cached).items():
         own = (job_stages.c.job == job, job_stages.c.stage == stage)
-        connection.execute(update(job_stages).where(*own).values(cached=job_stages.c.cached + count))
+        connection.execute(
+            update(job_stages).where(*own).values(cached=job_stages.c.cached + count)
+        )

@@ -1,12 +1,14 @@
-"""How leased tasks end: with results, with failures that are retried, or with the loss of their worker.
+"""How leased tasks end: with results, with failures that are retried, or with the loss of their
+worker.
 
-The first result from the holder of the lease is final. A dataset version is committed by the transaction that accepts
-the report of its publish task.
+The first result from the holder of the lease is final. A dataset version is committed by the
+transaction that accepts the report of its publish task.
 
-Losing a worker does not count as a failed try, and neither does a task that had not been started. After the n-th failed
-try the task waits `retry_seconds` 2^(n-1); after `max_tries` of them it fails. A task that ended its process each time
-is quarantined, and the jobs that need it continue with everything else. Any other failure ends all jobs that need the
-task: they start no further tasks, and running ones finish and are kept.
+Losing a worker does not count as a failed try, and neither does a task that had not been started.
+After the n-th failed try the task waits `retry_seconds` 2^(n-1); after `max_tries` of them it
+fails. A task that ended its process each time is quarantined, and the jobs that need it continue
+with everything else. Any other failure ends all jobs that need the task: they start no further
+tasks, and running ones finish and are kept.
 """
 
 import shlex
@@ -32,12 +34,26 @@ from stickslip_services.catalog.versions import (
 )
 from stickslip_services.client.http import ClientError
 from stickslip_services.database.database import Prepared, RowQuery, batches
-from stickslip_services.database.tables import job_counts, job_tasks, jobs, previews, task_dependencies, tasks
+from stickslip_services.database.tables import (
+    job_counts,
+    job_tasks,
+    jobs,
+    previews,
+    task_dependencies,
+    tasks,
+)
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import row_digest, task_id, task_key
 from stickslip_services.queue.recompute import add_dependencies, recompute
 from stickslip_services.queue.rows import LeasedTask, Task, TaskRow, columns
-from stickslip_services.queue.transaction import IS_LEASED, LIVE, RUNNABLE, SETTLED, QueueTransaction, reassign
+from stickslip_services.queue.transaction import (
+    IS_LEASED,
+    LIVE,
+    RUNNABLE,
+    SETTLED,
+    QueueTransaction,
+    reassign,
+)
 from stickslip_services.queue.workers import find_worker, touch_workers
 from stickslip_services.settings import Settings
 
@@ -48,12 +64,26 @@ _NOTE_REPORT = Prepared(
     .where(tasks.c.seq.in_(bindparam("b_tasks", expanding=True)))
     .values(reported_by=bindparam("b_worker"), reported_token=tasks.c.token)
 )
-_FIND = RowQuery(LeasedTask, select(*columns(LeasedTask)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True))))
-_WRITTEN = ("state", "reason", "message", "output", "digest", "cpu_seconds", "wall_seconds", "finished_at")
+_FIND = RowQuery(
+    LeasedTask,
+    select(*columns(LeasedTask)).where(tasks.c.key.in_(bindparam("b_keys", expanding=True))),
+)
+_WRITTEN = (
+    "state",
+    "reason",
+    "message",
+    "output",
+    "digest",
+    "cpu_seconds",
+    "wall_seconds",
+    "finished_at",
+)
 _SETTLE = Prepared(
     update(tasks)
     .where(tasks.c.seq == bindparam("b_seq"))
-    .values({name: bindparam(f"b_{name}") for name in _WRITTEN} | {"owner": None, "expires_at": None})
+    .values(
+        {name: bindparam(f"b_{name}") for name in _WRITTEN} | {"owner": None, "expires_at": None}
+    )
 )
 _DEPENDENTS = Prepared(
     select(task_dependencies.c.depends_on, tasks.c.seq, tasks.c.key, tasks.c.stage, tasks.c.state)
@@ -74,11 +104,15 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
         # Who reports a result has started the task, whether or not a heartbeat said so in between.
         tx.mark_started([task for task, _ in ended if task.state == TaskState.leased])
         ended = [(task._replace(state=TaskState.running), result) for task, result in ended]
-        _take_results(tx, [(task, result) for task, result in ended if result.outcome != "failed"], versions)
+        _take_results(
+            tx, [(task, result) for task, result in ended if result.outcome != "failed"], versions
+        )
         failures: list[tuple[LeasedTask, Reason, str]] = []
         for task, result in ended:
             if result.reason is Reason.store_unavailable:
-                context.store_watch.note(f"worker {worker.name} cannot use the store: {result.message}")
+                context.store_watch.note(
+                    f"worker {worker.name} cannot use the store: {result.message}"
+                )
                 requeue(tx, [task])
             elif result.reason is Reason.worker_lost:
                 requeue_lost(tx, [task], context.settings, message=result.message)
@@ -97,7 +131,10 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
 
 
 def _checked_in_store(context: Context, report: Report, versions: dict[str, Manifest]) -> Report:
-    """Return the report, or a failure where the store lacks its artifacts; add the summary of a manifest, signed."""
+    """Return the report, or a failure where the store lacks its artifacts.
+
+    Add the summary of a manifest, signed.
+    """
     if report.result is None or report.result.output is None:
         return report
     output = report.result.output
@@ -106,7 +143,13 @@ def _checked_in_store(context: Context, report: Report, versions: dict[str, Mani
             version = read_version(context.store, output)
             if context.settings.signing_key is not None:
                 seal = seal_text(output.manifest, output.group)
-                sign_version(context.store, version.dataset, version.version, seal, context.settings.signing_key)
+                sign_version(
+                    context.store,
+                    version.dataset,
+                    version.version,
+                    seal,
+                    context.settings.signing_key,
+                )
             versions[report.task_id] = version
         else:
             check_output(context.store, output)
@@ -127,9 +170,12 @@ def _failed(result: TaskResult, reason: Reason, message: str) -> TaskResult:
 def _judged(
     tx: QueueTransaction, worker_id: str, reports: Sequence[Report], versions: dict[str, Manifest]
 ) -> tuple[list[ReportVerdict], list[LeasedTask], list[Ended]]:
-    """Judge each report; return the verdicts, the tasks that were given back, and those that have ended.
+    """Judge each report.
 
-    `versions` has the summaries of manifests by publish task; they were read before the transaction.
+    Return the verdicts, the tasks that were given back, and those that have ended.
+
+    `versions` has the summaries of manifests by publish task; they were read before the
+    transaction.
     """
     verdicts: list[ReportVerdict] = []
     released: list[LeasedTask] = []
@@ -145,17 +191,23 @@ def _judged(
             verdicts.append(ReportVerdict(task_id=report.task_id, verdict="stale"))
         else:
             verdicts.append(ReportVerdict(task_id=report.task_id, verdict="accepted"))
-            rows[report.task_id] = row._replace(owner=None, reported_by=worker_id, reported_token=report.token)
+            rows[report.task_id] = row._replace(
+                owner=None, reported_by=worker_id, reported_token=report.token
+            )
             if report.result is None:
                 released.append(row)
             else:
                 ended.append((row, _checked(tx, row, report.result, versions)))
     for batch in batches([*released, *(task for task, _ in ended)]):
-        _NOTE_REPORT.run(tx.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id})
+        _NOTE_REPORT.run(
+            tx.connection, {"b_tasks": [task.seq for task in batch], "b_worker": worker_id}
+        )
     return verdicts, released, ended
 
 
-def _checked(tx: QueueTransaction, task: LeasedTask, result: TaskResult, versions: dict[str, Manifest]) -> TaskResult:
+def _checked(
+    tx: QueueTransaction, task: LeasedTask, result: TaskResult, versions: dict[str, Manifest]
+) -> TaskResult:
     """Return the result, or a failure where it does not fit the task."""
     if result.output is not None and result.output.stage != task.stage:
         wrong = f"the worker answered with the output of stage {result.output.stage}"
@@ -164,20 +216,27 @@ def _checked(tx: QueueTransaction, task: LeasedTask, result: TaskResult, version
         wrong = f"the worker rejected a {task.stage} task, which has no sample to reject: {result.message}"
         return _failed(result, Reason.internal_error, wrong)
     if result.output is not None and task.stage == Stage.publish:
-        reserved, version = find_reserved(tx.connection, task.seq), versions.get(task_id(task.stage, task.key))
+        reserved, version = (
+            find_reserved(tx.connection, task.seq),
+            versions.get(task_id(task.stage, task.key)),
+        )
         if version is None or (version.dataset, version.version) != reserved:
             return _failed(result, Reason.storage_error, f"the manifest is not that of {reserved}")
     return result
 
 
-def _take_results(tx: QueueTransaction, settled: Sequence[Ended], versions: dict[str, Manifest]) -> None:
+def _take_results(
+    tx: QueueTransaction, settled: Sequence[Ended], versions: dict[str, Manifest]
+) -> None:
     """Store results, release the tasks that depend on them, and commit versions."""
     written = []
     rejected: dict[int, tuple[Reason, str]] = {}
     for task, result in settled:
         output = None if result.output is None else result.output.model_dump_json()
         costs = {"b_cpu_seconds": result.cpu_seconds, "b_wall_seconds": result.wall_seconds}
-        written.append(_written(tx, task, result.outcome, result.reason, result.message, output) | costs)
+        written.append(
+            _written(tx, task, result.outcome, result.reason, result.message, output) | costs
+        )
         tx.record_transition([task], TaskState(result.outcome))
         tx.record_cost(task, result)
         if result.reason is not None:
@@ -187,17 +246,25 @@ def _take_results(tx: QueueTransaction, settled: Sequence[Ended], versions: dict
     _release_dependents(tx, [task.seq for task, _ in settled], rejected)
     for task, result in settled:
         if isinstance(result.output, RenderOutput) and result.output.preview is not None:
-            tx.connection.execute(delete(previews).where(previews.c.task == task.seq))  # of an earlier run
-            tx.connection.execute(insert(previews).values(task=task.seq, digest=result.output.preview))
+            tx.connection.execute(
+                delete(previews).where(previews.c.task == task.seq)
+            )  # of an earlier run
+            tx.connection.execute(
+                insert(previews).values(task=task.seq, digest=result.output.preview)
+            )
         elif isinstance(result.output, PublishOutput):
             _commit(tx, task.seq, versions[task_id(task.stage, task.key)], result.output)
 
 
-def _commit(tx: QueueTransaction, publish_task: int, manifest: Manifest, output: PublishOutput) -> None:
+def _commit(
+    tx: QueueTransaction, publish_task: int, manifest: Manifest, output: PublishOutput
+) -> None:
     """Commit a version, and end the jobs that wait for it."""
     connection = tx.connection
     of_task = (jobs.c.seq.in_(tx.open_jobs_of(publish_task)), jobs.c.state.in_(LIVE))
-    waiting = connection.execute(select(jobs.c.seq, jobs.c.name).where(*of_task).order_by(jobs.c.seq)).all()
+    waiting = connection.execute(
+        select(jobs.c.seq, jobs.c.name).where(*of_task).order_by(jobs.c.seq)
+    ).all()
     name = next((row.name for row in waiting if row.name is not None), None)
     commit_version(connection, publish_task, manifest, output, name=name, now=tx.now)
     for row in waiting:
@@ -205,7 +272,12 @@ def _commit(tx: QueueTransaction, publish_task: int, manifest: Manifest, output:
 
 
 def _written(
-    tx: QueueTransaction, task: Any, state: str, reason: Reason | None, message: str, output: str | None
+    tx: QueueTransaction,
+    task: Any,
+    state: str,
+    reason: Reason | None,
+    message: str,
+    output: str | None,
 ) -> dict[str, Any]:
     """Return the parameters of `_SETTLE` for a task whose run took no time."""
     made = {"b_state": state, "b_reason": reason, "b_message": message, "b_output": output}
@@ -213,25 +285,41 @@ def _written(
     return {"b_seq": task.seq, **made, "b_digest": row_digest(task.key, *made.values()), **free}
 
 
-def _release_dependents(tx: QueueTransaction, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]) -> None:
-    """Decrement `waiting_on` of dependents; a rejected simulation rejects its renders, which settles them in turn."""
-    edges = [edge for batch in batches(settled) for edge in _DEPENDENTS.rows(tx.connection, {"b_tasks": batch})]
+def _release_dependents(
+    tx: QueueTransaction, settled: Sequence[int], rejected: dict[int, tuple[Reason, str]]
+) -> None:
+    """Decrement `waiting_on` of dependents.
+
+    A rejected simulation rejects its renders, which settles them in turn.
+    """
+    edges = [
+        edge
+        for batch in batches(settled)
+        for edge in _DEPENDENTS.rows(tx.connection, {"b_tasks": batch})
+    ]
     if not edges:
         return
-    add_dependencies(tx, {seq: -count for seq, count in Counter(edge.seq for edge in edges).items()})
+    add_dependencies(
+        tx, {seq: -count for seq, count in Counter(edge.seq for edge in edges).items()}
+    )
     doomed = [
         edge
         for edge in edges
         if edge.stage == Stage.render and edge.depends_on in rejected and edge.state not in SETTLED
     ]
-    why = [_written(tx, edge, TaskState.rejected, *rejected[edge.depends_on], None) for edge in doomed]
+    why = [
+        _written(tx, edge, TaskState.rejected, *rejected[edge.depends_on], None) for edge in doomed
+    ]
     _SETTLE.run_all(tx.connection, why)
     tx.record_transition(doomed, TaskState.rejected)
     _release_dependents(tx, [edge.seq for edge in doomed], {})
 
 
 _LEASED_TASKS = RowQuery(
-    LeasedTask, select(*columns(LeasedTask)).where(IS_LEASED, tasks.c.owner.in_(bindparam("b_owners", expanding=True)))
+    LeasedTask,
+    select(*columns(LeasedTask)).where(
+        IS_LEASED, tasks.c.owner.in_(bindparam("b_owners", expanding=True))
+    ),
 )
 
 
@@ -241,15 +329,24 @@ def leased_tasks_of(connection: Connection, owners: Sequence[str]) -> list[Lease
 
 
 def requeue(tx: QueueTransaction, held: Sequence[TaskRow], **values: Any) -> None:
-    """Return tasks to `pending`, with other values of their columns; cancel those that no live job needs."""
+    """Return tasks to `pending`, with other values of their columns.
+
+    Cancel those that no live job needs.
+    """
     tx.set_task_state(reassign(tx, held), TaskState.pending, **values)
 
 
-def requeue_lost(tx: QueueTransaction, held: Sequence[LeasedTask], settings: Settings, *, message: str) -> None:
+def requeue_lost(
+    tx: QueueTransaction, held: Sequence[LeasedTask], settings: Settings, *, message: str
+) -> None:
     """Take back the leases of a lost worker. A task fails after `max_losses` lost workers."""
     started = [task for task in held if task.state == TaskState.running]
     requeue(tx, [task for task in held if task.state == TaskState.leased])
-    requeue(tx, [task for task in started if task.losses + 1 < settings.max_losses], losses=tasks.c.losses + 1)
+    requeue(
+        tx,
+        [task for task in started if task.losses + 1 < settings.max_losses],
+        losses=tasks.c.losses + 1,
+    )
     for task in started:
         if task.losses + 1 >= settings.max_losses and reassign(tx, [task]):
             _fail(tx, task, Reason.worker_lost, message, task.losses + 1, settings)
@@ -272,14 +369,23 @@ def record_failures(
         tx.emit_task_event(task, TaskState.soft_failed, **why)
 
 
-def _fail(tx: QueueTransaction, task: LeasedTask, reason: Reason, message: str, times: int, settings: Settings) -> None:
+def _fail(
+    tx: QueueTransaction,
+    task: LeasedTask,
+    reason: Reason,
+    message: str,
+    times: int,
+    settings: Settings,
+) -> None:
     """Let a task fail for good after `times` failures or losses, and quarantine it or end its jobs."""
     name = task_id(task.stage, task.key)
     command = reproducer(name, settings)
     why = f"task {name} failed {times} times, at last with {reason}: {message}"
     tries = task.tries + (reason is not Reason.worker_lost)
     if is_quarantined := reason.ends_a_process:
-        message = f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {command}"
+        message = (
+            f"quarantined after {times} tries, at last {reason}: {message}. To reproduce: {command}"
+        )
         reason = Reason.quarantined
     tx.set_task_state([task], TaskState.failed, tries=tries, reason=reason, message=message)
     tx.emit_task_event(task, TaskState.failed, reason, message)
@@ -294,11 +400,15 @@ def _fail(tx: QueueTransaction, task: LeasedTask, reason: Reason, message: str, 
         if is_quarantined:
             why = f"{failed} of its tasks were quarantined, at last {name}: {message}"
         kept = "No further tasks are started; what is done is kept, and submitting the job again tries again"
-        tx.end_job(job, JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}")
+        tx.end_job(
+            job, JobState.failed, Reason.failed_tasks, f"{why}. {kept}. To reproduce: {command}"
+        )
 
 
 _FAILED = (
-    select(jobs.c.state, func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.failed))
+    select(
+        jobs.c.state, func.sum(job_counts.c.count).filter(job_counts.c.state == TaskState.failed)
+    )
     .join(job_counts, job_counts.c.job == jobs.c.seq)
     .group_by(jobs.c.seq)
 )
@@ -311,7 +421,9 @@ _EXPIRED = (
 _DUE = "tasks.state = 'soft_failed' AND tasks.retry_at <= :b_now"
 _FIND_EXPIRED = RowQuery(LeasedTask, select(*columns(LeasedTask)).where(text(_EXPIRED)))
 _FIND_DUE = RowQuery(Task, select(*columns(Task)).where(text(_DUE)))
-_IS_DUE = Prepared(f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) OR EXISTS (SELECT 1 FROM tasks WHERE {_DUE})")
+_IS_DUE = Prepared(
+    f"SELECT EXISTS (SELECT 1 FROM tasks WHERE {_EXPIRED}) OR EXISTS (SELECT 1 FROM tasks WHERE {_DUE})"
+)
 
 
 def is_expiry_due(connection: Connection, now: float, alive_since: float) -> bool:
@@ -326,7 +438,9 @@ def expire_leases(context: Context) -> None:
             return
     seconds = context.settings.lease_seconds
     with context.transaction() as tx:
-        expired = _FIND_EXPIRED.rows(tx.connection, {"b_now": tx.now, "b_alive_since": tx.now - seconds})
+        expired = _FIND_EXPIRED.rows(
+            tx.connection, {"b_now": tx.now, "b_alive_since": tx.now - seconds}
+        )
         requeue_lost(tx, expired, context.settings, message=f"no heartbeat for {seconds:g} s")
         tx.set_task_state(_FIND_DUE.rows(tx.connection, {"b_now": tx.now}), TaskState.pending)
 
@@ -337,8 +451,12 @@ def reproducer(name: str, settings: Settings) -> str:
     return f"{fetch} && python -m stickslip_workers replay task.json --store {shlex.quote(settings.store_place)}"
 
 
-def failed_tasks(connection: Connection, job: int, settings: Settings, count: int) -> list[dict[str, Any]]:
-    """Return the tasks of a job that have failed or wait for a retry, newest first, with names and reproducers."""
+def failed_tasks(
+    connection: Connection, job: int, settings: Settings, count: int
+) -> list[dict[str, Any]]:
+    """Return the tasks of a job that have failed or wait for a retry, newest first, with names and
+    reproducers.
+    """
     rows = connection.execute(
         select(tasks.c.key, tasks.c.stage, tasks.c.tries, tasks.c.reason, tasks.c.message)
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)
@@ -347,6 +465,10 @@ def failed_tasks(connection: Connection, job: int, settings: Settings, count: in
         .limit(count)
     )
     return [
-        {**row, "task_id": (name := task_id(row.stage, row.key)), "reproducer": reproducer(name, settings)}
+        {
+            **row,
+            "task_id": (name := task_id(row.stage, row.key)),
+            "reproducer": reproducer(name, settings),
+        }
         for row in rows.mappings()
     ]

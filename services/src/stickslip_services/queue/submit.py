@@ -1,9 +1,9 @@
 """Submission of jobs, what a job of a spec would be, and planning in the background.
 
-Jobs that waited for the first worker, and jobs of many samples, are planned later. A job of many samples is planned
-piece by piece, each piece in a transaction of its own. Of several coordinators one plans a job at a time: it claims the
-job, and renews the claim with each piece. When it dies, another coordinator, or its successor, continues after the last
-piece that was written.
+Jobs that waited for the first worker, and jobs of many samples, are planned later. A job of many
+samples is planned piece by piece, each piece in a transaction of its own. Of several coordinators
+one plans a job at a time: it claims the job, and renews the claim with each piece. When it dies,
+another coordinator, or its successor, continues after the last piece that was written.
 """
 
 import json
@@ -25,13 +25,33 @@ from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_services.access.keys import check_quota, note, this_asker
 from stickslip_services.catalog.inputs import check_files
 from stickslip_services.database.database import Database, Prepared, batches, document_of
-from stickslip_services.database.tables import dataset_versions, idempotency_keys, job_stages, job_tasks, jobs, tasks
-from stickslip_services.errors import IdempotencyKeyReusedError, KindNotAvailableError, PresetNotCertifiedError
+from stickslip_services.database.tables import (
+    dataset_versions,
+    idempotency_keys,
+    job_stages,
+    job_tasks,
+    jobs,
+    tasks,
+)
+from stickslip_services.errors import (
+    IdempotencyKeyReusedError,
+    KindNotAvailableError,
+    PresetNotCertifiedError,
+)
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import show_job, unplanned_jobs
-from stickslip_services.queue.plan import Plan, Terms, begin_planning, expand, insert_job, pieces, terms_for, write_plan
+from stickslip_services.queue.plan import (
+    Plan,
+    Terms,
+    begin_planning,
+    expand,
+    insert_job,
+    pieces,
+    terms_for,
+    write_plan,
+)
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, terms_of
 from stickslip_services.queue.transaction import SETTLED, queue_transaction
 from stickslip_services.queue.workers import NO_WORKER, alive_workers, present_workers
@@ -53,7 +73,8 @@ class Replay:
 def submit_job(
     context: Context, spec: JobSpec, idempotency_key: str | None = None, *, priority: int = 0
 ) -> JobDetail | Replay:
-    """Make a job of a spec, or return the answer to an earlier request with the same idempotency key.
+    """Make a job of a spec, or return the answer to an earlier request with the same idempotency
+    key.
 
     Raises UnknownFileError, QuotaExceededError, KindNotAvailableError, PresetNotCertifiedError, or
     IdempotencyKeyReusedError.
@@ -68,22 +89,35 @@ def submit_job(
         with queue_transaction(connection, now) as tx:
             job = insert_job(tx, spec, priority=priority, project=project)
             if terms is None:
-                tx.set_job_state(job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER)
+                tx.set_job_state(
+                    job, JobState.queued, reason=Reason.waiting_for_worker, message=NO_WORKER
+                )
             else:
                 begin_planning(tx, job, terms, plan_at_once(context, spec, terms))
         shown = show_job(context, connection, job)
         details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
         note(connection, "job.submit", shown.id, now, **details)
         if idempotency_key:
-            row = {"project": project, "key": idempotency_key, "fingerprint": print_, "job": job, "created_at": now}
-            connection.execute(insert(idempotency_keys).values(row | {"response": shown.model_dump_json()}))
+            row = {
+                "project": project,
+                "key": idempotency_key,
+                "fingerprint": print_,
+                "job": job,
+                "created_at": now,
+            }
+            connection.execute(
+                insert(idempotency_keys).values(row | {"response": shown.model_dump_json()})
+            )
     context.notifier.notify()
     check_made_datasets(context, at_most=CHECKED_AT_ONCE)
     return shown
 
 
 def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> Replay | None:
-    """Return the answer to an earlier request with this key; raise IdempotencyKeyReusedError for another document."""
+    """Return the answer to an earlier request with this key.
+
+    Raise IdempotencyKeyReusedError for another document.
+    """
     if not key:
         return None
     row = connection.execute(
@@ -94,14 +128,18 @@ def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> R
     if row is None:
         return None
     if row.fingerprint != fingerprint:
-        raise IdempotencyKeyReusedError(f"the Idempotency-Key {key!r} came with another document before")
+        raise IdempotencyKeyReusedError(
+            f"the Idempotency-Key {key!r} came with another document before"
+        )
     return Replay(row.id, row.response)
 
 
 def validate_spec(context: Context, spec: JobSpec) -> Validation:
-    """Return counts and sizes of a job of `spec`, and why it would be refused, if so, without making one.
+    """Return counts and sizes of a job of `spec`, and why it would be refused, if so, without
+    making one.
 
-    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises UnknownFileError.
+    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises
+    UnknownFileError.
     """
     check_files(context.database, context.store, spec)
     database = context.database
@@ -134,19 +172,32 @@ def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Sta
     """Return what the stages cost of which tasks were measured."""
     costs, points = read_costs(connection), list(islice(spec.grid(), LOOKED_UP))
     work = {Stage.pack: [StageWork(counts.shards, timings_of(costs, Stage.pack, spec.kind, ""))]}
-    for stage, number in ((Stage.simulate, counts.simulation_count), (Stage.render, counts.render_count)):
+    for stage, number in (
+        (Stage.simulate, counts.simulation_count),
+        (Stage.render, counts.render_count),
+    ):
         groups = Counter(spec.cost_group(stage, point) for point in points)
         work[stage] = [
             StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))
             for group, share in groups.items()
         ]
-    kept = job_stages.c  # groups have slot time, whose share of CPU time is that of all jobs of the kind
-    spent = select(kept.stage, func.sum(kept.cpu_seconds) / func.sum(kept.wall_sum)).join(jobs, jobs.c.seq == kept.job)
-    share: dict[str, float] = dict(
-        connection.execute(spent.where(jobs.c.kind == spec.kind, kept.wall_sum > 0).group_by(kept.stage)).all()
+    kept = (
+        job_stages.c
+    )  # groups have slot time, whose share of CPU time is that of all jobs of the kind
+    spent = select(kept.stage, func.sum(kept.cpu_seconds) / func.sum(kept.wall_sum)).join(
+        jobs, jobs.c.seq == kept.job
     )
-    known = [stage for stage, items in work.items() if all(item.timings is not None for item in items)]
-    found = [(estimate({stage: work[stage]}, slots=1), stage, share.get(stage, 1.0)) for stage in known]
+    share: dict[str, float] = dict(
+        connection.execute(
+            spent.where(jobs.c.kind == spec.kind, kept.wall_sum > 0).group_by(kept.stage)
+        ).all()
+    )
+    known = [
+        stage for stage, items in work.items() if all(item.timings is not None for item in items)
+    ]
+    found = [
+        (estimate({stage: work[stage]}, slots=1), stage, share.get(stage, 1.0)) for stage in known
+    ]
     return {
         stage: Interval(median=cpu * eta.seconds, low=cpu * eta.low, high=cpu * eta.high)
         for eta, stage, cpu in found
@@ -165,7 +216,9 @@ def _cached(database: Database, spec: JobSpec, terms: Terms) -> int | None:
     plan = expand(spec, terms)
     with database.read() as connection:
         found = (
-            connection.scalar(select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(SETTLED)))
+            connection.scalar(
+                select(func.count()).where(tasks.c.key.in_(batch), tasks.c.state.in_(SETTLED))
+            )
             for batch in batches(plan.tasks)
         )
         return sum(number or 0 for number in found)
@@ -180,7 +233,11 @@ def _compression(connection: Connection, kind: str) -> float | None:
         .order_by(dataset_versions.c.created_at.desc())
         .limit(1)
     ).one_or_none()
-    return None if row is None else row.bytes / bytes_estimate(job_spec_adapter.validate_json(row.spec))
+    return (
+        None
+        if row is None
+        else row.bytes / bytes_estimate(job_spec_adapter.validate_json(row.spec))
+    )
 
 
 _WAITING = Prepared(select(jobs.c.seq).where(jobs.c.state == JobState.planning).limit(1))
@@ -188,11 +245,15 @@ _WAITING = Prepared(select(jobs.c.seq).where(jobs.c.state == JobState.planning).
 
 def release_claims(connection: Connection) -> None:
     """Release the claims of all planners; only for a coordinator that is alone on its database."""
-    connection.execute(update(jobs).where(jobs.c.planner.is_not(None)).values(planner=None, planner_until=None))
+    connection.execute(
+        update(jobs).where(jobs.c.planner.is_not(None)).values(planner=None, planner_until=None)
+    )
 
 
 def plan_waiting_jobs(context: Context) -> None:
-    """Plan the jobs that were submitted before the first worker registered, or fail those that cannot be planned."""
+    """Plan the jobs that were submitted before the first worker registered, or fail those that
+    cannot be planned.
+    """
     with context.database.read() as connection:
         waiting = unplanned_jobs(connection)
         is_known = any(worker.builds for worker in present_workers(connection))
@@ -219,7 +280,9 @@ def plan_at_once(context: Context, spec: JobSpec, terms: Terms) -> Plan | None:
 
 
 class Planner:
-    """Plans the jobs that are `planning`: those of the highest priority first, and of these the oldest."""
+    """Plans the jobs that are `planning`: those of the highest priority first, and of these the
+    oldest.
+    """
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -259,7 +322,9 @@ class Planner:
     def _claim(self, connection: Connection) -> Row[tuple[object, ...]] | None:
         """Claim a job that nobody plans, or whose claim is over, and return its row."""
         now = self._context.clock()
-        free = or_(jobs.c.planner.is_(None), jobs.c.planner == self._name, jobs.c.planner_until <= now)
+        free = or_(
+            jobs.c.planner.is_(None), jobs.c.planner == self._name, jobs.c.planner_until <= now
+        )
         row = connection.execute(
             select(jobs)
             .where(jobs.c.state == JobState.planning, free)
@@ -269,7 +334,9 @@ class Planner:
         if row is not None:
             until = now + self._context.settings.lease_seconds
             connection.execute(
-                update(jobs).where(jobs.c.seq == row.seq).values(planner=self._name, planner_until=until)
+                update(jobs)
+                .where(jobs.c.seq == row.seq)
+                .values(planner=self._name, planner_until=until)
             )
         return row
 
@@ -291,19 +358,31 @@ class Planner:
 
     def _write(self, job: int, piece: Plan) -> None:
         with self._context.transaction() as tx:
-            still = (jobs.c.seq == job, jobs.c.state == JobState.planning, jobs.c.planner == self._name)
+            still = (
+                jobs.c.seq == job,
+                jobs.c.state == JobState.planning,
+                jobs.c.planner == self._name,
+            )
             if tx.connection.scalar(select(jobs.c.planned).where(*still)) != piece.first:
-                self._job = None  # paused, cancelled or failed meanwhile, or another coordinator goes on with it
+                # paused, cancelled or failed meanwhile, or another coordinator goes on with it
+                self._job = None
                 return
             write_plan(tx, job, piece)
         self._end = piece.end
-        if piece.is_last or piece.end.bit_length() > piece.first.bit_length():  # at each power of two
+        if (
+            piece.is_last or piece.end.bit_length() > piece.first.bit_length()
+        ):  # at each power of two
             self._context.database.analyse()
 
     def _fail(self, row: Row[tuple[object, ...]], error: Exception) -> None:
-        message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[:2000]
+        message = f"planning it failed after {row.planned} of {row.sample_count} samples: {error}"[
+            :2000
+        ]
         with self._context.transaction() as tx:
-            if tx.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq)) == JobState.planning:
+            if (
+                tx.connection.scalar(select(jobs.c.state).where(jobs.c.seq == row.seq))
+                == JobState.planning
+            ):
                 tx.end_job(row.seq, JobState.failed, Reason.internal_error, message)
 
 

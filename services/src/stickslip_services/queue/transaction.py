@@ -1,18 +1,24 @@
-"""The ledger of a write transaction: how the states of tasks and jobs change, and what follows from that.
+"""The ledger of a write transaction: how the states of tasks and jobs change, and what follows from
+that.
 
 Between any two transactions (`stickslip_testing.invariants` looks at all of it):
 
-1. A task has an owner exactly while it is `leased` or `running`, and a retry time exactly while it is `soft_failed`.
+1. A task has an owner exactly while it is `leased` or `running`, and a retry time exactly while it
+   is `soft_failed`.
 2. The counters, those of all tasks and those of each open job, say what the rows say.
-3. A task that waits is charged to the job that it will run for: of the live jobs that need it a runnable one, if there
-   is any, of these the one with the highest priority, and of these the oldest. No task waits that no live job needs.
-4. A `queued` job has no task on lease. A `pausing` job has one that no runnable job needs, and a `cancelling` job one
-   that no live job needs. A job of which only quarantined tasks and their dependents are left has failed.
+3. A task that waits is charged to the job that it will run for: of the live jobs that need it a
+   runnable one, if there is any, of these the one with the highest priority, and of these the
+   oldest. No task waits that no live job needs.
+4. A `queued` job has no task on lease. A `pausing` job has one that no runnable job needs, and a
+   `cancelling` job one that no live job needs. A job of which only quarantined tasks and their
+   dependents are left has failed.
 
-`move` keeps the first, `reassign` the third, and `_close`, at the end of the transaction, the second and the fourth.
-A job of a million tasks that ends would keep other writers waiting: its tasks are given up in pieces (`give_up`).
+`move` keeps the first, `reassign` the third, and `_close`, at the end of the transaction, the
+second and the fourth. A job of a million tasks that ends would keep other writers waiting: its
+tasks are given up in pieces (`give_up`).
 
-Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were before the transaction changed them.
+Tasks are rows of `tasks` with at least `seq`, `stage` and `state`, as they were before the
+transaction changed them.
 """
 
 from collections import Counter
@@ -32,7 +38,15 @@ from stickslip_schemas.documents.responses import (
 from stickslip_schemas.documents.tasks import TaskResult
 
 from stickslip_services.database.database import Counters, Prepared, batches, document_of
-from stickslip_services.database.tables import events, job_counts, job_groups, job_tasks, jobs, task_counts, tasks
+from stickslip_services.database.tables import (
+    events,
+    job_counts,
+    job_groups,
+    job_tasks,
+    jobs,
+    task_counts,
+    tasks,
+)
 from stickslip_services.queue.eta import add_costs
 from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.rows import Task, TaskRow, columns
@@ -56,7 +70,9 @@ IS_LEASED = text("tasks.owner IS NOT NULL")
 """The condition of tasks on lease, likewise."""
 
 RELEASE_BATCH = 250
-"""Tasks of an ended job that one transaction gives up: it takes 10 to 30 ms, for which other writers wait."""
+"""Tasks of an ended job that one transaction gives up: it takes 10 to 30 ms, for which other
+writers wait.
+"""
 
 RESET_ATTEMPTS: Mapping[str, Any] = {"reason": None, "message": "", "tries": 0, "losses": 0}
 """Values of a task that has all its tries."""
@@ -66,7 +82,9 @@ TASK_COLUMNS = columns(Task)
 
 Row = TypeVar("Row", bound=TaskRow)
 
-_OPEN = text("jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')")  # of its index, too
+_OPEN = text(
+    "jobs.state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"
+)  # of its index, too
 _HOLDERS = Prepared(
     select(job_tasks.c.task, job_tasks.c.job, job_tasks.c.cached, tasks.c.cost_group)
     .join(jobs, jobs.c.seq == job_tasks.c.job)
@@ -81,7 +99,11 @@ _ADD_TO_JOB_STAGES = Prepared(
     "wall_sum = wall_sum + :b_wall, wall_squares = wall_squares + :b_wall * :b_wall "
     "WHERE job = :b_job AND stage = :b_stage"
 )
-TASK_COUNTS, JOB_COUNTS, JOB_GROUPS = Counters(task_counts), Counters(job_counts), Counters(job_groups)
+TASK_COUNTS, JOB_COUNTS, JOB_GROUPS = (
+    Counters(task_counts),
+    Counters(job_counts),
+    Counters(job_groups),
+)
 
 
 class QueueTransaction:
@@ -93,7 +115,9 @@ class QueueTransaction:
         self._moves: list[tuple[TaskRow, TaskState]] = []
         self._runs: list[tuple[Any, TaskResult]] = []
         self.released_jobs: set[int] = set()
-        """Jobs whose tasks this transaction gives up: their counters follow, also after they have ended."""
+        """Jobs whose tasks this transaction gives up: their counters follow, also after they have
+        ended.
+        """
 
     def set_task_state(self, rows: Collection[TaskRow], state: TaskState, **values: Any) -> None:
         """Put tasks into a state, and write other values of their columns."""
@@ -113,7 +137,9 @@ class QueueTransaction:
 
     def mark_started(self, rows: Collection[TaskRow]) -> None:
         """Note that leased tasks have been started: from here on they may fail."""
-        self.set_task_state(rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now)
+        self.set_task_state(
+            rows, TaskState.running, attempts=tasks.c.attempts + 1, started_at=self.now
+        )
 
     def record_cost(self, task: Any, result: TaskResult) -> None:
         """Note the cost of a task, whose row has its kind and its cost group."""
@@ -122,11 +148,15 @@ class QueueTransaction:
     def emit_task_event(self, task: Any, state: TaskState, reason: Reason, message: str) -> None:
         """Store an event of a task, whose row has its `key`, for each of its open jobs."""
         name = task_id(task.stage, task.key)
-        event = TaskStateEvent(task_id=name, stage=task.stage, state=state, reason=reason, message=message)
+        event = TaskStateEvent(
+            task_id=name, stage=task.stage, state=state, reason=reason, message=message
+        )
         for job in self.open_jobs_of(task.seq):
             self._append_event(job, EventName.task_state, event)
 
-    def set_job_state(self, job: int, state: JobState, *, reason: Reason | None = None, message: str = "") -> None:
+    def set_job_state(
+        self, job: int, state: JobState, *, reason: Reason | None = None, message: str = ""
+    ) -> None:
         """Set the state of a job with its reason and message, and store the event."""
         values: dict[str, object] = {"state": state, "reason": reason, "message": message}
         if state is JobState.running:
@@ -134,17 +164,24 @@ class QueueTransaction:
         if not state.is_open:
             values["finished_at"] = self.now
         self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
-        self._append_event(job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message))
+        self._append_event(
+            job, EventName.job_state, JobStateEvent(state=state, reason=reason, message=message)
+        )
 
     def complete_job(self, job: int, version: Any, note: str = "") -> None:
         """End a live job, whose dataset version, a row of `dataset_versions`, exists."""
-        reference, lost = document_of(DatasetRef, version), version.sample_count - version.valid_count
+        reference, lost = (
+            document_of(DatasetRef, version),
+            version.sample_count - version.valid_count,
+        )
         rejects = f"{lost} of {version.sample_count} samples were rejected; the dataset lists them with their reasons"
         state = JobState.succeeded_with_rejects if lost else JobState.succeeded
         if self._is_live(job):
             values = {**reference.model_dump(), "rejected_count": lost}
             self.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
-            self._append_event(job, EventName.dataset_published, DatasetPublishedEvent(dataset=reference))
+            self._append_event(
+                job, EventName.dataset_published, DatasetPublishedEvent(dataset=reference)
+            )
             self.end_job(job, state, None, ". ".join(filter(None, [note, rejects if lost else ""])))
 
     def end_job(self, job: int, state: JobState, reason: Reason | None, message: str) -> None:
@@ -178,12 +215,19 @@ class QueueTransaction:
                 overall[task.stage, state] += change
                 for holder in holders.get(task.seq, ()):
                     by_job[holder.job, task.stage, state] += change
-                    left[holder.job, task.stage, holder.cost_group] += change * (state not in FINISHED)
+                    left[holder.job, task.stage, holder.cost_group] += change * (
+                        state not in FINISHED
+                    )
         TASK_COUNTS.add(self.connection, overall)
         JOB_COUNTS.add(self.connection, by_job)
         JOB_GROUPS.add(self.connection, {group: change for group, change in left.items() if change})
         spent = [
-            {"b_job": holder.job, "b_stage": task.stage, "b_cpu": run.cpu_seconds, "b_wall": run.wall_seconds}
+            {
+                "b_job": holder.job,
+                "b_stage": task.stage,
+                "b_cpu": run.cpu_seconds,
+                "b_wall": run.wall_seconds,
+            }
             for task, run in runs
             for holder in holders.get(task.seq, ())
             if not holder.cached
@@ -195,7 +239,9 @@ class QueueTransaction:
         """Return the open jobs of each task, rows of `_HOLDERS`."""
         found: dict[int, list[Any]] = {}
         for batch in batches(task_seqs):
-            for row in _HOLDERS.rows(self.connection, {"b_tasks": batch, "b_given_up": list(self.released_jobs)}):
+            for row in _HOLDERS.rows(
+                self.connection, {"b_tasks": batch, "b_given_up": list(self.released_jobs)}
+            ):
                 found.setdefault(row.task, []).append(row)
         return found
 
@@ -205,7 +251,12 @@ class QueueTransaction:
 
 
 _LIVE_JOBS = Prepared(
-    select(job_tasks.c.task, case((jobs.c.state.in_(RUNNABLE), 0), else_=1), jobs.c.priority, job_tasks.c.job)
+    select(
+        job_tasks.c.task,
+        case((jobs.c.state.in_(RUNNABLE), 0), else_=1),
+        jobs.c.priority,
+        job_tasks.c.job,
+    )
     .join(jobs, jobs.c.seq == job_tasks.c.job)
     .where(
         job_tasks.c.task.in_(bindparam("b_tasks", expanding=True)),
@@ -214,11 +265,18 @@ _LIVE_JOBS = Prepared(
 )
 
 
-def live_jobs(connection: Connection, task_seqs: Iterable[int], states: Sequence[JobState] = LIVE) -> dict[int, int]:
-    """Return the job to charge each task to, of those in some states; tasks without any are left out."""
+def live_jobs(
+    connection: Connection, task_seqs: Iterable[int], states: Sequence[JobState] = LIVE
+) -> dict[int, int]:
+    """Return the job to charge each task to, of those in some states.
+
+    Tasks without any are left out.
+    """
     found: dict[int, tuple[int, int, int]] = {}
     for batch in batches(task_seqs):
-        for task, halted, priority, job in _LIVE_JOBS.tuples(connection, {"b_tasks": batch, "b_states": list(states)}):
+        for task, halted, priority, job in _LIVE_JOBS.tuples(
+            connection, {"b_tasks": batch, "b_states": list(states)}
+        ):
             mine = (halted, -priority, job)
             found[task] = min(mine, found.get(task, mine))
     return {task: job for task, (_, _, job) in found.items()}
@@ -232,7 +290,10 @@ def assign(connection: Connection, job_of: Mapping[int, int]) -> None:
 
 
 def reassign(tx: QueueTransaction, rows: Sequence[Row]) -> list[Row]:
-    """Charge unfinished tasks to the jobs that they will run for; cancel the needless, and return the others."""
+    """Charge unfinished tasks to the jobs that they will run for.
+
+    Cancel the needless, and return the others.
+    """
     job_of = live_jobs(tx.connection, [row.seq for row in rows])
     assign(tx.connection, job_of)
     cancel(tx, [row for row in rows if row.seq not in job_of])
@@ -245,15 +306,23 @@ def cancel(tx: QueueTransaction, rows: Collection[TaskRow]) -> None:
 
 
 def reassign_waiting(tx: QueueTransaction, job: int) -> None:
-    """Reassign the waiting tasks of a job that starts or stops being runnable, or that changes its priority."""
+    """Reassign the waiting tasks of a job that starts or stops being runnable, or that changes its
+    priority.
+    """
     kind = select(jobs.c.kind).where(jobs.c.seq == job).scalar_subquery()
-    others = select(jobs.c.seq).where(jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE))
-    if tx.connection.scalar(others.limit(1)) is not None:  # otherwise all are charged to this one already
+    others = select(jobs.c.seq).where(
+        jobs.c.seq != job, jobs.c.kind == kind, jobs.c.state.in_(LIVE)
+    )
+    if (
+        tx.connection.scalar(others.limit(1)) is not None
+    ):  # otherwise all are charged to this one already
         reassign(tx, _waiting(tx.connection, job_tasks.c.job == job))
 
 
 def release_tasks(tx: QueueTransaction, job: int, after: int = 0) -> None:
-    """Reassign the next `PIECE_TASKS` tasks of a job that is not live any more, and store where to go on."""
+    """Reassign the next `PIECE_TASKS` tasks of a job that is not live any more, and store where to
+    go on.
+    """
     tx.released_jobs.add(job)
     piece = select(job_tasks.c.task).where(job_tasks.c.job == job, job_tasks.c.task > after)
     seqs = list(tx.connection.scalars(piece.order_by(job_tasks.c.task).limit(RELEASE_BATCH)))
@@ -298,14 +367,24 @@ def _close(tx: QueueTransaction) -> None:
     for job in _OPEN_JOBS.rows(tx.connection):
         if job.state == JobState.queued and job.on_lease:
             tx.set_job_state(job.seq, JobState.running)
-        elif job.state == JobState.planning and job.on_lease and job.started_at is None:  # it runs when it is planned
-            tx.connection.execute(update(jobs).where(jobs.c.seq == job.seq).values(started_at=tx.now))
-        elif job.state in (JobState.queued, JobState.running) and job.failed and not (job.on_lease or job.retried):
+        elif (
+            job.state == JobState.planning and job.on_lease and job.started_at is None
+        ):  # it runs when it is planned
+            tx.connection.execute(
+                update(jobs).where(jobs.c.seq == job.seq).values(started_at=tx.now)
+            )
+        elif (
+            job.state in (JobState.queued, JobState.running)
+            and job.failed
+            and not (job.on_lease or job.retried)
+        ):
             _end_if_blocked(tx, job.seq)
         elif job.state == JobState.pausing and not (
             job.on_lease and has_exclusive_lease(tx.connection, job.seq, RUNNABLE)
         ):
-            why = tx.connection.execute(select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job.seq)).one()
+            why = tx.connection.execute(
+                select(jobs.c.reason, jobs.c.message).where(jobs.c.seq == job.seq)
+            ).one()
             message = why.message if why.reason else "paused; resume it to go on"
             tx.set_job_state(job.seq, JobState.paused, reason=why.reason, message=message)
         elif job.state == JobState.cancelling and not (
@@ -326,11 +405,15 @@ def has_exclusive_lease(connection: Connection, job: int, states: Sequence[JobSt
 
 def _end_if_blocked(tx: QueueTransaction, job: int) -> None:
     """End a job with quarantined tasks of which nothing runs, unless one can be leased."""
-    own = select(*TASK_COLUMNS, tasks.c.key, tasks.c.message).join(job_tasks, job_tasks.c.task == tasks.c.seq)
+    own = select(*TASK_COLUMNS, tasks.c.key, tasks.c.message).join(
+        job_tasks, job_tasks.c.task == tasks.c.seq
+    )
     own = own.where(job_tasks.c.job == job)
     if tx.connection.execute(own.where(IS_READY).limit(1)).first() is not None:
         return
-    failed = tx.connection.execute(own.where(tasks.c.state == TaskState.failed).order_by(tasks.c.seq)).all()
+    failed = tx.connection.execute(
+        own.where(tasks.c.state == TaskState.failed).order_by(tasks.c.seq)
+    ).all()
     message = (
         f"everything else is done, but {len(failed)} of its tasks were quarantined; the first is "
         f"{task_id(failed[0].stage, failed[0].key)}: {failed[0].message}. What is done is kept; submit the job again "

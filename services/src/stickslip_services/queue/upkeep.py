@@ -1,11 +1,13 @@
-"""Upkeep of a stopped coordinator: removing versions, finding unused artifacts, and recovering a lost database.
+"""Upkeep of a stopped coordinator: removing versions, finding unused artifacts, and recovering a
+lost database.
 
-A removed version goes with the jobs that made it, and the tasks that no other job needs. Its files stay in the store,
-where other versions may use them, until `unused` finds them.
+A removed version goes with the jobs that made it, and the tasks that no other job needs. Its files
+stay in the store, where other versions may use them, until `unused` finds them.
 
-A version in the store is identified by its manifest, the metadata of its root, and the seal that binds both. For each
-intact version, `reindex` inserts the job that made it, so that the dataset is listed and can be pulled, and a spec that
-is submitted again finds it. Results of single simulations and renders, and certificates, are not restored.
+A version in the store is identified by its manifest, the metadata of its root, and the seal that
+binds both. For each intact version, `reindex` inserts the job that made it, so that the dataset is
+listed and can be pulled, and a spec that is submitted again finds it. Results of single simulations
+and renders, and certificates, are not restored.
 """
 
 import time
@@ -16,7 +18,14 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, delete, select, update
 from stickslip_schemas.base import JobState, Sha256, Stage, TaskState, is_sha256, sha256
 from stickslip_schemas.documents.tasks import PublishOutput
-from stickslip_schemas.format.manifest import GROUP_NAME, MANIFEST_NAME, SEAL_NAME, Contents, Manifest, check_seal
+from stickslip_schemas.format.manifest import (
+    GROUP_NAME,
+    MANIFEST_NAME,
+    SEAL_NAME,
+    Contents,
+    Manifest,
+    check_seal,
+)
 from stickslip_schemas.store import ShownVersion, Store, Stored, in_parallel
 
 from stickslip_services.access.keys import note
@@ -65,9 +74,21 @@ def remove(database: Database, store: Store, dataset: str, version: int) -> tupl
         if publish_task is not None:
             jobs_, tasks_ = _remove_jobs(connection, publish_task)
             connection.execute(delete(dataset_versions).where(*own))
-            if connection.scalar(select(columns.version).where(columns.dataset == dataset).limit(1)) is None:
+            if (
+                connection.scalar(
+                    select(columns.version).where(columns.dataset == dataset).limit(1)
+                )
+                is None
+            ):
                 connection.execute(delete(datasets).where(datasets.c.id == dataset))
-        note(connection, "version.remove", f"{dataset}:v{version}", time.time(), jobs=jobs_, tasks=tasks_)
+        note(
+            connection,
+            "version.remove",
+            f"{dataset}:v{version}",
+            time.time(),
+            jobs=jobs_,
+            tasks=tasks_,
+        )
     store.hide(dataset, version)  # last: a version that is in the database is always in the store
     return jobs_, tasks_
 
@@ -78,20 +99,25 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
     ).all()
     for row in rows:
         if JobState(row.state).is_open:
-            raise ConflictError(f"the job {row.id} is {row.state} and makes this version: cancel it first")
+            raise ConflictError(
+                f"the job {row.id} is {row.state} and makes this version: cancel it first"
+            )
     own = [row.seq for row in rows]
     held = set(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(own))))
     for table in metadata.sorted_tables:
         if "job" in table.c and table is not tasks:  # a task stays where another job needs it
             connection.execute(delete(table).where(table.c.job.in_(own)))
     connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
-    still = {row.task for row in rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, held)}
+    still = {
+        row.task for row in rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, held)
+    }
     lost = held - still  # a job has all dependencies of its tasks, too
     counts: Counter[tuple[str, str]] = Counter()
     for batch in batches(lost):
         of_batch = tasks.c.seq.in_(batch)
         counts.update(
-            (row.stage, row.state) for row in connection.execute(select(tasks.c.stage, tasks.c.state).where(of_batch))
+            (row.stage, row.state)
+            for row in connection.execute(select(tasks.c.stage, tasks.c.state).where(of_batch))
         )
         connection.execute(delete(task_dependencies).where(task_dependencies.c.task.in_(batch)))
         connection.execute(delete(previews).where(previews.c.task.in_(batch)))
@@ -103,8 +129,9 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
 def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Stored]:
     """Yield artifacts and temporary files without references, unchanged for `older_than` seconds.
 
-    References are those of tasks, jobs, versions and certificates in the database, and of versions in the store.
-    Raises CorruptArtifactError, OSError or ValueError where the manifest of a version cannot be read.
+    References are those of tasks, jobs, versions and certificates in the database, and of versions
+    in the store. Raises CorruptArtifactError, OSError or ValueError where the manifest of a version
+    cannot be read.
     """
     needed = _needed(database, store)
     latest = time.time() - older_than
@@ -127,7 +154,9 @@ def _needed(database: Database, store: Store) -> set[bytes]:
                 add(*DIGEST.findall(text or ""))
         add(*connection.scalars(select(previews.c.digest)))
         for manifest, spec in connection.execute(select(jobs.c.manifest, jobs.c.spec)):
-            add(manifest, *DIGEST.findall(spec))  # a spec names textures, also before its tasks are planned
+            add(
+                manifest, *DIGEST.findall(spec)
+            )  # a spec names textures, also before its tasks are planned
         add(*connection.scalars(select(certificates.c.artifact)))
         columns = dataset_versions.c
         versions = connection.execute(
@@ -150,7 +179,10 @@ class Found:
 
 
 def reindex(database: Database, store: Store) -> Iterator[Found]:
-    """Insert the versions that only the store has, one transaction each; yield all versions of the store."""
+    """Insert the versions that only the store has, one transaction each.
+
+    Yield all versions of the store.
+    """
     for shown in store.versions(MANIFEST_NAME):
         name = f"{shown.dataset}:v{shown.version}"
         try:
@@ -165,7 +197,9 @@ def reindex(database: Database, store: Store) -> Iterator[Found]:
 def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     """Read a version; restore lost artifacts from the files of the version."""
     place = shown.dataset, shown.version
-    content, group, seal = (store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME))
+    content, group, seal = (
+        store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
+    )
     check_seal(content, group, seal)
     manifest = Manifest.model_validate_json(content)
     if (manifest.spec.dataset_id, manifest.version) != place:
@@ -185,11 +219,15 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     return manifest, output
 
 
-def _insert(database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float) -> bool:
+def _insert(
+    database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float
+) -> bool:
     """Insert a version as the result of an ended job; return False where it is known."""
     terms = Terms(manifest.builds, manifest.certificate)
     with database.write() as connection:
-        known = select(dataset_versions).filter_by(dataset=manifest.dataset, version=manifest.version)
+        known = select(dataset_versions).filter_by(
+            dataset=manifest.dataset, version=manifest.version
+        )
         if connection.execute(known).first() is not None:
             return False
         with queue_transaction(connection, made_at) as tx:
@@ -202,11 +240,17 @@ def _insert(database: Database, store: Store, manifest: Manifest, output: Publis
             connection.execute(
                 update(tasks)
                 .where(tasks.c.seq == task)
-                .values(state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at)
+                .values(
+                    state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at
+                )
             )
-            tx.record_transition([Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded)
+            tx.record_transition(
+                [Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded
+            )
             reserve_number(connection, manifest.dataset, manifest.version, task)
             commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
             for holder in tx.open_jobs_of(task):
-                tx.complete_job(holder, find_committed(connection, task), "found again in the store")
+                tx.complete_job(
+                    holder, find_committed(connection, task), "found again in the store"
+                )
     return True

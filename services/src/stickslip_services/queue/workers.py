@@ -21,7 +21,9 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import new_id, task_id
 from stickslip_services.queue.transaction import IS_LEASED, RUNNABLE
 
-NO_WORKER = "no worker has told its builds yet; the job is planned when one does (see the workers page)"
+NO_WORKER = (
+    "no worker has told its builds yet; the job is planned when one does (see the workers page)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +39,21 @@ class RegisteredWorker:
     superseded: bool
 
 
-def insert_worker(connection: Connection, registration: WorkerRegistration, now: float) -> RegisteredWorker:
+def insert_worker(
+    connection: Connection, registration: WorkerRegistration, now: float
+) -> RegisteredWorker:
     """Insert a registration; earlier sessions of the name are superseded."""
-    connection.execute(update(workers).where(workers.c.name == registration.name).values(superseded=True))
+    connection.execute(
+        update(workers).where(workers.c.name == registration.name).values(superseded=True)
+    )
     worker_id = new_id("worker")
     connection.execute(
         insert(workers).values(
             id=worker_id,
             name=registration.name,
-            builds=json.dumps({kind: builds.model_dump() for kind, builds in registration.builds.items()}),
+            builds=json.dumps(
+                {kind: builds.model_dump() for kind, builds in registration.builds.items()}
+            ),
             condition=registration.condition.model_dump_json(),
             versions=json.dumps(registration.versions),
             registered_at=now,
@@ -74,8 +82,13 @@ _PRESENT_WORKERS = Prepared(
 )
 
 
-def present_workers(connection: Connection, *, seen_since: float | None = None) -> list[RegisteredWorker]:
-    """Return the newest session of every name, newest first; with `seen_since`, those alive since then."""
+def present_workers(
+    connection: Connection, *, seen_since: float | None = None
+) -> list[RegisteredWorker]:
+    """Return the newest session of every name, newest first.
+
+    With `seen_since`, those alive since then.
+    """
     since = float("-inf") if seen_since is None else seen_since
     return [_worker(row) for row in _PRESENT_WORKERS.rows(connection, {"b_since": since})]
 
@@ -83,7 +96,8 @@ def present_workers(connection: Connection, *, seen_since: float | None = None) 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
     """Return the builds for new jobs of `kind`: those of the newest worker that makes it.
 
-    None if no worker has ever told its builds; raise KindNotAvailableError where none of those makes it.
+    None if no worker has ever told its builds; raise KindNotAvailableError where none of those
+    makes it.
     """
     workers = [worker for worker in present_workers(connection) if worker.builds]
     if not workers:
@@ -92,7 +106,9 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
         if kind in worker.builds:
             return worker.builds[kind]
     kinds = ", ".join(sorted({kind for worker in workers for kind in worker.builds}))
-    raise KindNotAvailableError(f"no worker makes {kind!r}; those that have registered make {kinds}")
+    raise KindNotAvailableError(
+        f"no worker makes {kind!r}; those that have registered make {kinds}"
+    )
 
 
 _HEARD = Prepared(
@@ -109,19 +125,29 @@ _HEARD = Prepared(
 )
 
 
-def touch_workers(connection: Connection, ids: Collection[str], now: float) -> dict[str, WorkerCondition]:
-    """Store when workers were heard; return how they were, without those that a writer has locked or nobody knows."""
+def touch_workers(
+    connection: Connection, ids: Collection[str], now: float
+) -> dict[str, WorkerCondition]:
+    """Store when workers were heard.
+
+    Return how they were, without those that a writer has locked or nobody knows.
+    """
     rows = _HEARD.tuples(connection, {"b_ids": ids, "b_now": now})
     return {worker: WorkerCondition.model_validate_json(condition) for worker, condition in rows}
 
 
-def record_condition(connection: Connection, worker_id: str, now: float, condition: WorkerCondition) -> None:
+def record_condition(
+    connection: Connection, worker_id: str, now: float, condition: WorkerCondition
+) -> None:
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:
-    """Return the number of tasks of a job that can run at once; `builds` is JSON, None for an unplanned job."""
+    """Return the number of tasks of a job that can run at once.
+
+    `builds` is JSON, None for an unplanned job.
+    """
     if builds is None:
         return 0
     needed = Builds.model_validate_json(builds)
@@ -136,7 +162,9 @@ def running_tasks(
     `frames` is the progress of simulations.
     """
     rows = connection.execute(
-        select(tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id)
+        select(
+            tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id
+        )
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
         .where(IS_LEASED, own(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
@@ -146,7 +174,11 @@ def running_tasks(
         since = as_datetime(started_at) if state == "running" else None
         name = task_id(stage, key)
         running = responses.RunningTask(
-            task_id=name, stage=Stage(stage), job=job, since=since, frames=frames.get(name) if since else None
+            task_id=name,
+            stage=Stage(stage),
+            job=job,
+            since=since,
+            frames=frames.get(name) if since else None,
         )
         found.setdefault(owner, []).append(running)
     return found
@@ -174,25 +206,31 @@ def show_workers(context: Context, connection: Connection) -> list[responses.Wor
 
 @lru_cache(maxsize=64)
 def _builds(document: str) -> Mapping[str, Builds]:
-    return MappingProxyType({kind: Builds.model_validate(builds) for kind, builds in json.loads(document).items()})
+    return MappingProxyType(
+        {kind: Builds.model_validate(builds) for kind, builds in json.loads(document).items()}
+    )
 
 
 def _worker(row: Any) -> RegisteredWorker:
     condition = WorkerCondition.model_validate_json(row.condition)
     versions, superseded = json.loads(row.versions), bool(row.superseded)
     times = row.registered_at, row.last_seen_at
-    return RegisteredWorker(row.id, row.name, _builds(row.builds), condition, versions, *times, superseded)
+    return RegisteredWorker(
+        row.id, row.name, _builds(row.builds), condition, versions, *times, superseded
+    )
 
 
 _PLANNED_JOBS = Prepared(
-    select(jobs.c.seq, jobs.c.state, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message).where(
-        jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None)
-    )
+    select(
+        jobs.c.seq, jobs.c.state, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message
+    ).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None))
 )
 
 
 def update_unschedulable_jobs(context: Context) -> None:
-    """Set reason and message of the jobs that no connected worker can run, and clear those of the others."""
+    """Set reason and message of the jobs that no connected worker can run, and clear those of the
+    others.
+    """
     with context.database.read() as connection:
         if not _find_stranded(context, connection):
             return
@@ -203,7 +241,10 @@ def update_unschedulable_jobs(context: Context) -> None:
 
 
 def _find_stranded(context: Context, connection: Connection) -> dict[tuple[int, str], str]:
-    """Return the new messages of planned jobs by seq and state, where they change; empty for jobs that are served."""
+    """Return the new messages of planned jobs by seq and state, where they change.
+
+    Empty for jobs that are served.
+    """
     alive = alive_workers(context, connection)
     found = {}
     for row in _PLANNED_JOBS.rows(connection):
@@ -222,7 +263,11 @@ def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) 
     made = [worker.builds[kind].by_stage for worker in alive if kind in worker.builds]
     if not made:
         return f"no connected worker makes {kind!r}; the job goes on when one does"
-    missing = [stage for stage, build in builds.by_stage.items() if all(own[stage] != build for own in made)]
+    missing = [
+        stage
+        for stage, build in builds.by_stage.items()
+        if all(own[stage] != build for own in made)
+    ]
     if missing:
         return (
             f"no connected worker has the builds that this job was planned for (stages: {', '.join(missing)}); it goes "

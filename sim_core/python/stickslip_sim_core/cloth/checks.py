@@ -1,7 +1,8 @@
 """Checks of a run of cloth: whether it is valid follows from this table alone.
 
-The solver measures after every step that it takes. The worst value of each check is stored with the sample, and a value
-beyond its limit is the reason why a run is not valid. A value that is not a number is beyond every limit.
+The solver measures after every step that it takes. The worst value of each check is stored with the
+sample, and a value beyond its limit is the reason why a run is not valid. A value that is not a
+number is beyond every limit.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,7 +28,8 @@ class Seen:
     """(frames, V, 3) [m]"""
 
     crossings: int
-    """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact."""
+    """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact.
+    """
 
     @property
     def total(self) -> StepReport:
@@ -71,7 +73,9 @@ CHECKS = (
     Check(
         "unconverged",
         "steps that ended above the tolerance, over those that the preset allows",
-        lambda seen: _ratio(seen.total.unconverged, seen.cloth.preset.unconverged_share_max * seen.total.steps),
+        lambda seen: _ratio(
+            seen.total.unconverged, seen.cloth.preset.unconverged_share_max * seen.total.steps
+        ),
         1.0,
         "the preset allows a share of 0.002",
     ),
@@ -140,7 +144,8 @@ CHECKS = (
         "missed",
         "shortest steps that are further off than twice the preset's step error, over those that fit the scene",
         lambda seen: _ratio(
-            seen.total.missed * seen.cloth.preset.longest_step, seen.cloth.preset.finest * seen.cloth.time
+            seen.total.missed * seen.cloth.preset.longest_step,
+            seen.cloth.preset.finest * seen.cloth.time,
         ),
         0.5,
         "drags reach 0, falls 0.13 and tumbles 0.352 with `certified`; a preset too coarse for its scene reaches 1",
@@ -159,10 +164,15 @@ def values(seen: Seen) -> Mapping[str, float]:
 
 
 def failed(worst: Mapping[str, float]) -> tuple[str, str]:
-    """Return the code and the text of the reason why a run with these values is not valid, or empty texts."""
+    """Return the code and the text of the reason why a run with these values is not valid, or empty
+    texts.
+    """
     for check in CHECKS:
         value = worst[check.name]
         if check.limit is not None and not value <= check.limit:
             unit = "" if check.unit == "1" else f" {check.unit}"
-            return check.name, f"{check.name}: must be at most {check.limit:g}{unit}, got {value:.4g} ({check.formula})"
+            return (
+                check.name,
+                f"{check.name}: must be at most {check.limit:g}{unit}, got {value:.4g} ({check.formula})",
+            )
     return "", ""

@@ -16,8 +16,8 @@ MU_MAX = 10.0
 """Largest coefficient of friction."""
 
 ROUNDING = 5e-3
-"""Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest edge. Cells of up to
-twice the radius slide over such an edge."""
+"""Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest
+edge. Cells of up to twice the radius slide over such an edge."""
 
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -29,7 +29,8 @@ BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
 class Body:
     """A rigid body: a half-space, or all points within a radius of a core.
 
-    The core is a box about the origin: a point of a sphere, a segment of a capsule, an endless line of a cylinder.
+    The core is a box about the origin: a point of a sphere, a segment of a capsule, an endless line
+    of a cylinder.
 
     Raises:
         ValueError: `mu` is out of range, `origin` is not finite, or `rotation` is no rotation.
@@ -42,7 +43,9 @@ class Body:
     """0 plane, which fills z < 0 in its own axes; 1 rounded: `Body::Shape` of the core."""
 
     core: tuple[float, float, float] = ORIGIN
-    """Half edges of the core along the body's own axes [m], 0 or more; inf along the axis of an endless cylinder."""
+    """Half edges of the core along the body's own axes [m], 0 or more; inf along the axis of an
+    endless cylinder.
+    """
 
     radius: float = 0.0
     """Distance of the body's face from its core [m]."""
@@ -63,7 +66,9 @@ class Body:
             or not np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL
             or np.linalg.det(turn) < 0
         ):
-            raise ValueError(f"rotation: must be orthonormal (3, 3) with determinant +1, got {turn.tolist()}")
+            raise ValueError(
+                f"rotation: must be orthonormal (3, 3) with determinant +1, got {turn.tolist()}"
+            )
 
     @property
     def pose(self) -> Floats:
@@ -83,14 +88,22 @@ class Body:
 
 
 def check_friction(mu: ArrayLike) -> None:
-    """Raise ValueError unless a coefficient of friction, or those with several sheets, are in range."""
+    """Raise ValueError unless a coefficient of friction, or those with several sheets, are in
+    range.
+    """
     values = np.asarray(mu, float)
     if values.ndim > 1 or not values.size or not ((values >= 0.0) & (values <= MU_MAX)).all():
-        raise ValueError(f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {values.tolist()}")
+        raise ValueError(
+            f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {values.tolist()}"
+        )
 
 
-def plane(mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = ORIGIN) -> Body:
-    """Return the half-space below a plane, with the axes of the world in the shortest turn from z to the normal."""
+def plane(
+    mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = ORIGIN
+) -> Body:
+    """Return the half-space below a plane, with the axes of the world in the shortest turn from z
+    to the normal.
+    """
     n = np.asarray(normal, float)
     if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
         raise ValueError(f"normal: must be three finite numbers, not all 0, got {n.tolist()}")
@@ -99,24 +112,38 @@ def plane(mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLi
     b = 1.0 + n[2] if n[2] > 0.0 else (n[0] ** 2 + n[1] ** 2) / (1.0 - n[2])
     if b > 0.0:
         a = -n[0] * n[1] / b
-        turn = np.array([[1.0 - n[0] ** 2 / b, a, n[0]], [a, 1.0 - n[1] ** 2 / b, n[1]], [-n[0], -n[1], n[2]]])
+        turn = np.array(
+            [[1.0 - n[0] ** 2 / b, a, n[0]], [a, 1.0 - n[1] ** 2 / b, n[1]], [-n[0], -n[1], n[2]]]
+        )
     return Body(mu, 0, origin=origin, rotation=turn)
 
 
-def sphere(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
-    """Return a ball. Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step."""
+def sphere(
+    mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT
+) -> Body:
+    """Return a ball.
+
+    Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step.
+    """
     check_positive(radius=radius)
     return Body(mu, 1, ORIGIN, radius, origin, rotation)
 
 
-def cylinder(mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT) -> Body:
+def cylinder(
+    mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT
+) -> Body:
     """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
     check_positive(radius=radius)
     return Body(mu, 1, (0.0, 0.0, np.inf), radius, origin, rotation)
 
 
 def capsule(
-    mu: ArrayLike, radius: float, length: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT
+    mu: ArrayLike,
+    radius: float,
+    length: float,
+    *,
+    origin: ArrayLike = ORIGIN,
+    rotation: ArrayLike = UPRIGHT,
 ) -> Body:
     """Return a cylinder with half balls as ends, along the last column of its rotation (3, 3).
 
@@ -134,7 +161,10 @@ def box(
     origin: ArrayLike = ORIGIN,
     rotation: ArrayLike = UPRIGHT,
 ) -> Body:
-    """Return a box with edges of `size` (3,) [m], rounded with a radius [m]; None: 5 mm, or less for a thin box."""
+    """Return a box with edges of `size` (3,) [m], rounded with a radius [m].
+
+    None: 5 mm, or less for a thin box.
+    """
     whole = np.asarray(size, float)
     if whole.shape != (3,) or not (np.isfinite(whole).all() and (whole > 0.0).all()):
         raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
@@ -142,7 +172,9 @@ def box(
     radius = min(ROUNDING, half) if rounding is None else rounding
     check_positive(rounding=radius)
     if radius > half:
-        raise ValueError(f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}")
+        raise ValueError(
+            f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}"
+        )
     a, b, c = (0.5 * whole - radius).tolist()
     return Body(mu, 1, (a, b, c), radius, origin, rotation)
 
@@ -154,38 +186,40 @@ CREASE = float(np.radians(40.0))
 """Default angle from which edges of a surface stay sharp [rad]."""
 
 SELF_FRICTION = 0.5
-"""Default coefficient of friction of a cloth with itself in a scene: the mean of the two of the thesis's shawls, 0.3
-and 0.7 [thesis, Fig. 4.16]."""
+"""Default coefficient of friction of a cloth with itself in a scene: the mean of the two of the
+thesis's shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
 BEARING: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"all": (1.0, 1.0), "vertices": (0.9, 1.0), "first": (0.9, 0.9)}
 )
-"""Shares of the thickness that two sheets keep between edges, and between vertices of the later and faces of the
-earlier: see `SelfContact.bearing`."""
+"""Shares of the thickness that two sheets keep between edges, and between vertices of the later and
+faces of the earlier: see `SelfContact.bearing`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SelfContact:
-    """Contact of cloth with itself and other cloth, without crossings and with exact Coulomb friction.
+    """Contact of cloth with itself and other cloth, without crossings and with exact Coulomb
+    friction.
 
     Raises:
         ValueError: A number breaks its rule.
     """
 
     mu: float | ArrayLike
-    """Coefficient of friction, 0 ... 10, or one for each pair of sheets: (S, S), symmetric. Sheets are the connected
-    pieces of the mesh, in the order of their first vertices."""
+    """Coefficient of friction, 0 ... 10, or one for each pair of sheets: (S, S), symmetric. Sheets
+    are the connected pieces of the mesh, in the order of their first vertices."""
 
     thickness: float | ArrayLike = THICKNESS
-    """Of all sheets [m], or of each: (S,). The middles of two sheets stay the mean of their thicknesses apart. A sheet
-    must be thinner than the distance at rest between any of its vertices and edges that do not meet."""
+    """Of all sheets [m], or of each: (S,). The middles of two sheets stay the mean of their
+    thicknesses apart. A sheet must be thinner than the distance at rest between any of its vertices
+    and edges that do not meet."""
 
     bearing: str = "all"
-    """Contacts that keep two sheets the full thickness apart; the others keep 0.9 of it. "all": vertices, and edges
-    that cross. "vertices": vertices of both sheets. "first": vertices of the earlier sheet. Where sheets lie on
-    each other over large, smooth faces, "vertices" and "first" converge in fewer iterations. Choose "first" only
-    where these are flat: over curved cloth its forces are rough. Within a sheet all contacts keep the full
-    thickness."""
+    """Contacts that keep two sheets the full thickness apart; the others keep 0.9 of it. "all":
+    vertices, and edges that cross. "vertices": vertices of both sheets. "first": vertices of the
+    earlier sheet. Where sheets lie on each other over large, smooth faces, "vertices" and "first"
+    converge in fewer iterations. Choose "first" only where these are flat: over curved cloth its
+    forces are rough. Within a sheet all contacts keep the full thickness."""
 
     def __post_init__(self) -> None:
         if self.bearing not in BEARING:
@@ -197,7 +231,9 @@ class SelfContact:
             raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
         thickness = np.asarray(self.thickness, float)
         if thickness.ndim > 1 or not (np.isfinite(thickness) & (thickness > 0.0)).all():
-            raise ValueError(f"thickness: must be finite and > 0, one or one a sheet, got {thickness.tolist()}")
+            raise ValueError(
+                f"thickness: must be finite and > 0, one or one a sheet, got {thickness.tolist()}"
+            )
 
     def of_sheets(self, sheets: int) -> tuple[Floats, Floats]:
         """Return friction (S, S) and thicknesses (S,) [m] of S sheets.
@@ -210,19 +246,21 @@ class SelfContact:
             raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
         if thickness.ndim and thickness.shape != (sheets,):
             raise ValueError(f"thickness: must be of {sheets} sheets, got {thickness.tolist()}")
-        return np.broadcast_to(mu, (sheets, sheets)).copy(), np.broadcast_to(thickness, sheets).copy()
+        return np.broadcast_to(mu, (sheets, sheets)).copy(), np.broadcast_to(
+            thickness, sheets
+        ).copy()
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A body of any shape: triangles with prescribed motion, which cloth touches from either side.
 
-    It may be open or closed, cross itself, and bend as it moves. It has no inside: cloth stays on the side where it
-    starts.
+    It may be open or closed, cross itself, and bend as it moves. It has no inside: cloth stays on
+    the side where it starts.
 
-    Vertices of the cloth touch a smooth surface through the vertices of the triangles, as they touch a body. Between
-    its vertices the cloth keeps a quarter of that distance from the triangles, by pairs of closest points (see
-    `SelfContact`). Nothing crosses the triangles.
+    Vertices of the cloth touch a smooth surface through the vertices of the triangles, as they
+    touch a body. Between its vertices the cloth keeps a quarter of that distance from the
+    triangles, by pairs of closest points (see `SelfContact`). Nothing crosses the triangles.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -232,18 +270,20 @@ class Surface:
     """(T, 3): vertices of each triangle."""
 
     positions: ArrayLike | Callable[[float], ArrayLike]
-    """(N, 3) [m], or a function of the time [s] that returns them. Within a step vertices move on straight lines."""
+    """(N, 3) [m], or a function of the time [s] that returns them. Within a step vertices move on
+    straight lines.
+    """
 
     mu: float | ArrayLike
     """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
 
     thickness: float = THICKNESS
-    """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and half of its own
-    thickness away from them. May be 0."""
+    """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and
+    half of its own thickness away from them. May be 0."""
 
     crease: float = CREASE
-    """Edges stay sharp where the normals of their triangles are further apart at time 0, 0 ... pi [rad]. Borders are
-    sharp."""
+    """Edges stay sharp where the normals of their triangles are further apart at time 0, 0 ... pi
+    [rad]. Borders are sharp."""
 
     def __post_init__(self) -> None:
         check_friction(self.mu)
@@ -253,7 +293,9 @@ class Surface:
             raise ValueError(f"crease: must be in [0, pi] rad, got {self.crease}")
         triangles = np.array(self.triangles, dtype=np.int32)
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
-            raise ValueError(f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}")
+            raise ValueError(
+                f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}"
+            )
         object.__setattr__(self, "triangles", triangles)
         corners = self.at(0.0)
         if triangles.min() < 0 or triangles.max() >= len(corners):
@@ -271,7 +313,9 @@ class Surface:
         Raises:
             ValueError: They are not (N, 3) or not finite.
         """
-        found = np.ascontiguousarray(self.positions(time) if callable(self.positions) else self.positions, dtype=float)
+        found = np.ascontiguousarray(
+            self.positions(time) if callable(self.positions) else self.positions, dtype=float
+        )
         if found.ndim != 2 or found.shape[1] != 3:
             raise ValueError(f"positions: must be (N, 3), got shape {found.shape} at {time:g} s")
         if not np.isfinite(found).all():

@@ -37,12 +37,14 @@ class Fabric:
     """Mass per area [kg/m^2]."""
 
     stretching: Floats
-    """(6, 4) [N/m]: k0 ... k3 of the energy per area k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2, G being Green's
-    strain. Row 0 holds at no strain, rows 1 ... 5 where the larger principal stretch is 1 + 1/6, at 0, 22.5, ..., 90
-    degrees from the warp; bilinear in between."""
+    """(6, 4) [N/m]: k0 ... k3 of the energy per area k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3
+    G01^2, G being Green's strain. Row 0 holds at no strain, rows 1 ... 5 where the larger principal
+    stretch is 1 + 1/6, at 0, 22.5, ..., 90 degrees from the warp; bilinear in between."""
 
     rigidity: Floats
-    """(3, 3) [N m]: D of the energy per area H:D:H/2, H = (H11, H22, 2 H12) being the second derivatives."""
+    """(3, 3) [N m]: D of the energy per area H:D:H/2, H = (H11, H22, 2 H12) being the second
+    derivatives.
+    """
 
     damping: float = 0.0
     """Proportional to mass [1/s]: a free motion slows down by exp(-damping t)."""
@@ -52,18 +54,30 @@ class Fabric:
         check_range("damping", self.damping, 0.0, DAMPING_MAX)
         k, d = np.asarray(self.stretching, float), np.asarray(self.rigidity, float)
         if k.shape != (6, 4) or not ((k >= 0.0) & (k <= STRETCHING_MAX)).all():
-            raise ValueError(f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, got {k.tolist()}")
+            raise ValueError(
+                f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, got {k.tolist()}"
+            )
         if not (k[:, 1] ** 2 < k[:, 0] * k[:, 2]).all():
             row = int(np.argmin(k[:, 0] * k[:, 2] - k[:, 1] ** 2))
-            raise ValueError(f"stretching: must have k1^2 < k0 k2 in every row, and row {row} is {k[row].tolist()}")
-        if d.shape != (3, 3) or not np.isfinite(d).all() or np.abs(d - d.T).max() > 1e-12 * np.abs(d).max():
-            raise ValueError(f"rigidity: must be a symmetric (3, 3) matrix of finite numbers, got {d.tolist()}")
+            raise ValueError(
+                f"stretching: must have k1^2 < k0 k2 in every row, and row {row} is {k[row].tolist()}"
+            )
+        if (
+            d.shape != (3, 3)
+            or not np.isfinite(d).all()
+            or np.abs(d - d.T).max() > 1e-12 * np.abs(d).max()
+        ):
+            raise ValueError(
+                f"rigidity: must be a symmetric (3, 3) matrix of finite numbers, got {d.tolist()}"
+            )
         for value in np.linalg.eigvalsh(d):
             check_range("rigidity, an eigenvalue", float(value), *RIGIDITY_BOUNDS)
         object.__setattr__(self, "stretching", k)
         object.__setattr__(self, "rigidity", d)
 
-    def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> "Fabric":
+    def scaled(
+        self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0
+    ) -> "Fabric":
         """Return a fabric whose numbers are those of this one times factors.
 
         Raises:
@@ -73,7 +87,9 @@ class Fabric:
         for name, factor in factors.items():
             if not (np.isfinite(factor) and factor > 0.0):
                 raise ValueError(f"{name}: must be a finite factor > 0, got {factor}")
-        changed = "".join(f", {name} x {factor:g}" for name, factor in factors.items() if factor != 1.0)
+        changed = "".join(
+            f", {name} x {factor:g}" for name, factor in factors.items() if factor != 1.0
+        )
         return Fabric(
             self.name + changed,
             self.density * density,
@@ -94,24 +110,23 @@ def custom_fabric(
     bending: ArrayLike | None = None,
     damping: float = 0.0,
 ) -> Fabric:
-    """Return a fabric from measured numbers: a stretching table with bending, or Young's modulus with thickness.
+    """Return a fabric from measured numbers: a stretching table with bending, or Young's modulus
+    with thickness.
 
-    Args:
-        name: For messages.
-        density: Mass per area [kg/m^2].
-        stretching: (6, 4) [N/m], as `Fabric.stretching`; or `young`.
-        young: Young's modulus [Pa], of an isotropic fabric with `poisson` and `thickness`.
-        poisson: Poisson's ratio, in [0, 0.5]; None is 0.
-        thickness: [m]
-        bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). Without it, the plate's of `young`,
-            E h^3 / (12 (1 - poisson^2)).
-        damping: Proportional to mass [1/s].
+    Args: name: For messages. density: Mass per area [kg/m^2]. stretching: (6, 4) [N/m], as
+        `Fabric.stretching`; or `young`. young: Young's modulus [Pa], of an isotropic fabric with
+        `poisson` and `thickness`. poisson: Poisson's ratio, in [0, 0.5]; None is 0. thickness: [m]
+        bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). Without it, the
+        plate's of `young`, E h^3 / (12 (1 - poisson^2)). damping: Proportional to mass [1/s].
 
     Raises:
         ValueError: A number breaks its rule, or there are too many or too few.
     """
     if (stretching is None) == (young is None):
-        raise ValueError("stretching, young: must be one of both, got " + ("both" if young is not None else "neither"))
+        raise ValueError(
+            "stretching, young: must be one of both, got "
+            + ("both" if young is not None else "neither")
+        )
     if young is not None:
         if thickness is None:
             raise ValueError("thickness: must be given with young")
@@ -120,7 +135,11 @@ def custom_fabric(
         check_range("thickness", thickness, 1e-6, 0.1)
         check_range("poisson", poisson, 0.0, 0.5)
         plate = isotropic(
-            density, young * thickness, young * thickness**3 / (12.0 * (1.0 - poisson**2)), poisson, name=name
+            density,
+            young * thickness,
+            young * thickness**3 / (12.0 * (1.0 - poisson**2)),
+            poisson,
+            name=name,
         )
         table, rigidity = plate.stretching, plate.rigidity
     else:
@@ -134,7 +153,11 @@ def custom_fabric(
 
 
 def isotropic(
-    density: float, stretching: float, rigidity: float, poisson: float = 0.0, name: str = "isotropic"
+    density: float,
+    stretching: float,
+    rigidity: float,
+    poisson: float = 0.0,
+    name: str = "isotropic",
 ) -> Fabric:
     """Return an isotropic fabric.
 
@@ -151,7 +174,9 @@ def isotropic(
     check_range("poisson", poisson, 0.0, 0.5)
     tension = stretching / (1.0 - poisson**2)
     row = [tension, poisson * tension, tension, stretching / (1.0 + poisson)]
-    plate = rigidity * np.array([[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - poisson)]])
+    plate = rigidity * np.array(
+        [[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - poisson)]]
+    )
     return Fabric(name, float(density), np.tile(row, (6, 1)), plate)
 
 
@@ -159,10 +184,11 @@ def isotropic(
 def fabric(name: str) -> Fabric:
     """Return one of the fabrics of [Wang et al. 2011].
 
-    Its stretching numbers are doubled, as the authors' simulator does, negative ones are raised to 0, and the coupling
-    is kept positive definite. Its bending numbers k are coefficients of hinges: a plate as stiff has D = k/4 on
-    equilateral triangles. D against curvature along warp, weft and in between comes from hinges across it; with no
-    coupling D12, D66 = D(45 degrees) - (D11 + D22)/4. D is the mean over the tabulated curvatures.
+    Its stretching numbers are doubled, as the authors' simulator does, negative ones are raised to
+    0, and the coupling is kept positive definite. Its bending numbers k are coefficients of hinges:
+    a plate as stiff has D = k/4 on equilateral triangles. D against curvature along warp, weft and
+    in between comes from hinges across it; with no coupling D12, D66 = D(45 degrees) - (D11 +
+    D22)/4. D is the mean over the tabulated curvatures.
 
     Raises:
         ValueError: There is no such fabric.

@@ -31,25 +31,37 @@ class Mesh:
     @property
     def rim(self) -> NDArray[np.int32]:
         """(R,): vertices of the boundary, ascending."""
-        edges = np.sort(np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
+        edges = np.sort(
+            np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1
+        )
         unique, counts = np.unique(edges, axis=0, return_counts=True)
         return np.unique(unique[counts == 1])
 
 
 def grid(
-    width: float, length: float, columns: int, rows: int, diagonals: Diagonals = "alternating", seed: int = 0
+    width: float,
+    length: float,
+    columns: int,
+    rows: int,
+    diagonals: Diagonals = "alternating",
+    seed: int = 0,
 ) -> Mesh:
-    """Triangulate [-width/2, width/2] x [-length/2, length/2] by columns x rows cells, each cut along a diagonal.
+    """Triangulate [-width/2, width/2] x [-length/2, length/2] by columns x rows cells, each cut
+    along a diagonal.
 
     Raises:
         ValueError: A size is not positive, or there is no such pattern.
     """
     check_positive(width=width, length=length, columns=columns, rows=rows)
     x, y = np.meshgrid(
-        np.linspace(-0.5, 0.5, columns + 1) * width, np.linspace(-0.5, 0.5, rows + 1) * length, indexing="xy"
+        np.linspace(-0.5, 0.5, columns + 1) * width,
+        np.linspace(-0.5, 0.5, rows + 1) * length,
+        indexing="xy",
     )
     rest = np.stack([x.ravel(), y.ravel()], axis=1)
-    column, row = (cells.ravel() for cells in np.meshgrid(np.arange(columns), np.arange(rows), indexing="xy"))
+    column, row = (
+        cells.ravel() for cells in np.meshgrid(np.arange(columns), np.arange(rows), indexing="xy")
+    )
     a = row * (columns + 1) + column
     b, c, d = a + 1, a + columns + 2, a + columns + 1
     match diagonals:
@@ -62,7 +74,9 @@ def grid(
         case "random":
             rising = np.random.default_rng(seed).random(a.size) < 0.5
         case _:
-            raise ValueError(f"diagonals: must be alternating, left, right or random, got {diagonals!r}")
+            raise ValueError(
+                f"diagonals: must be alternating, left, right or random, got {diagonals!r}"
+            )
     up = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1)
     down = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], 1)
     triangles = np.where(rising[:, None, None], up, down).reshape(-1, 3)
@@ -70,7 +84,9 @@ def grid(
 
 
 def together(*parts: Mesh) -> Mesh:
-    """Return a mesh of several sheets, which lie side by side at rest; vertices keep their order, part by part.
+    """Return a mesh of several sheets, which lie side by side at rest.
+
+    Vertices keep their order, part by part.
 
     A single part stays as it is.
     """
@@ -86,12 +102,15 @@ def together(*parts: Mesh) -> Mesh:
     return Mesh(np.concatenate(rest), np.concatenate(triangles).astype(np.int32))
 
 
-def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, aligned: int = 0) -> Mesh:
-    """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered vertices.
+def unstructured(
+    width: float, length: float, spacing: float, seed: int = 0, *, aligned: int = 0
+) -> Mesh:
+    """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered
+    vertices.
 
-    Rows of a triangular lattice with edges of about `spacing` are displaced at random by up to 0.3 spacings, and edges
-    are flipped until every circumcircle is empty [Lawson 1977]. The first `aligned` rows of cells along the length are
-    squares of side `spacing` instead.
+    Rows of a triangular lattice with edges of about `spacing` are displaced at random by up to 0.3
+    spacings, and edges are flipped until every circumcircle is empty [Lawson 1977]. The first
+    `aligned` rows of cells along the length are squares of side `spacing` instead.
 
     Raises:
         ValueError: A size is not positive, or the length is less than that of the aligned rows.
@@ -99,7 +118,9 @@ def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, 
     check_positive(width=width, length=length, spacing=spacing)
     start = aligned * spacing
     if not start < length:
-        raise ValueError(f"aligned: rows of {spacing} m must be shorter than the length of {length} m, got {aligned}")
+        raise ValueError(
+            f"aligned: rows of {spacing} m must be shorter than the length of {length} m, got {aligned}"
+        )
     rng = np.random.default_rng(seed)
     columns = max(1, round(width / spacing))
     rows = max(1, round((length - start) / (spacing * np.sqrt(0.75))))
@@ -120,11 +141,15 @@ def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, 
     starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
     triangles: list[tuple[int, int, int]] = []
     for row in range(rows):
-        low, high = list(range(starts[row], starts[row + 1])), list(range(starts[row + 1], starts[row + 2]))
+        low, high = (
+            list(range(starts[row], starts[row + 1])),
+            list(range(starts[row + 1], starts[row + 2])),
+        )
         i = j = 0
         while i < len(low) - 1 or j < len(high) - 1:
             along_low = j == len(high) - 1 or (
-                i < len(low) - 1 and rest[low[i + 1], 0] + rest[low[i], 0] <= rest[high[j + 1], 0] + rest[high[j], 0]
+                i < len(low) - 1
+                and rest[low[i + 1], 0] + rest[low[i], 0] <= rest[high[j + 1], 0] + rest[high[j], 0]
             )
             if along_low:
                 triangles.append((low[i], low[i + 1], high[j]))
@@ -136,7 +161,9 @@ def unstructured(width: float, length: float, spacing: float, seed: int = 0, *, 
     return Mesh(rest - np.array([width, length]) / 2.0, np.array(flipped, dtype=np.int32))
 
 
-def _delaunay(rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+def _delaunay(
+    rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]
+) -> list[tuple[int, int, int]]:
     """Flip edges whose opposite angles add up to more than pi, until there are none."""
     cells = [list(t) for t in triangles]
     sides: dict[tuple[int, int], int] = {}  # directed edge -> triangle on its left
@@ -160,7 +187,10 @@ def _delaunay(rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]) 
         left, right = sides[a, b], sides[b, a]
         c = next(v for v in cells[left] if v not in (a, b))
         d = next(v for v in cells[right] if v not in (a, b))
-        if cotangent(c, a, b) + cotangent(d, a, b) > -1e-9 or min(area(a, d, c), area(d, b, c)) <= 0.0:
+        if (
+            cotangent(c, a, b) + cotangent(d, a, b) > -1e-9
+            or min(area(a, d, c), area(d, b, c)) <= 0.0
+        ):
             continue
         cells[left], cells[right] = [a, d, c], [d, b, c]
         del sides[a, b], sides[b, a]

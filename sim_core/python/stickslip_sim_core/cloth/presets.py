@@ -26,7 +26,9 @@ class SolverSettings:
     """Step where steps are not chosen by `step_error` [s], at most 1."""
 
     tolerance: float = 1e-4
-    """Largest residual force of a node in a converged step, in weights of 25 mm^2 of the cloth; at most 1."""
+    """Largest residual force of a node in a converged step, in weights of 25 mm^2 of the cloth; at
+    most 1.
+    """
 
     newton_max: int = 40
     """Iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
@@ -35,37 +37,48 @@ class SolverSettings:
     """Residual over right-hand side at which GMRES stops, below 1."""
 
     refactor_after: int = 10
-    """GMRES iterations that a stale factor may cost beyond those with a fresh one before all of it is made anew."""
+    """GMRES iterations that a stale factor may cost beyond those with a fresh one before all of it
+    is made anew.
+    """
 
     patience: int = 10
-    """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000."""
+    """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000.
+    """
 
     halvings_max: int = 6
     """Times that a step which does not converge is halved, 0 ... 20."""
 
     step_error: float | None = STEP_ERROR
-    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None: `time_step`."""
+    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None:
+    `time_step`.
+    """
 
     longest_step: float = 0.125
     """Longest step where steps are chosen by `step_error` [s], at most 1."""
 
     finest: int = 64
-    """Parts, a power of two, that the longest step is cut into at most for the sake of `step_error`; steps that do not
-    converge are halved further."""
+    """Parts, a power of two, that the longest step is cut into at most for the sake of
+    `step_error`; steps that do not converge are halved further."""
 
     newton_per_second: int = 50_000
-    """Iterations of Newton's method in a second of scene time, 1 ... 1,000,000, beyond which a run ends as not valid:
-    four times 512 steps of 25 iterations each."""
+    """Iterations of Newton's method in a second of scene time, 1 ... 1,000,000, beyond which a run
+    ends as not valid: four times 512 steps of 25 iterations each."""
 
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
 
     constants: Mapping[str, float] = field(default_factory=dict, hash=False)
-    """Constants of the C++ solver to replace, by their names in `numbers`: for tests of how results depend on them."""
+    """Constants of the C++ solver to replace, by their names in `numbers`: for tests of how results
+    depend on them.
+    """
 
     def numbers(self) -> dict[str, Any]:
-        """Return all numbers that the preset stands for, by name, those of the C++ solver as "group.name"."""
-        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"}
+        """Return all numbers that the preset stands for, by name, those of the C++ solver as
+        "group.name".
+        """
+        own = {
+            item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"
+        }
         return {**own, **_sim_core.cloth_constants(), **self.constants}
 
     def __post_init__(self) -> None:
@@ -90,7 +103,9 @@ class SolverSettings:
         if isinstance(self.finest, bool) or self.finest not in [2**power for power in range(13)]:
             raise ValueError(f"finest: must be a power of two, 1 ... 4096, got {self.finest}")
         if not 0.0 <= self.unconverged_share_max <= 1.0:
-            raise ValueError(f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}")
+            raise ValueError(
+                f"unconverged_share_max: must be 0 ... 1, got {self.unconverged_share_max}"
+            )
 
 
 _CUT_OFF: dict[str, Any] = {"halvings_max": 0, "step_error": None, "unconverged_share_max": 1.0}
@@ -103,7 +118,8 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
             SolverSettings("fast", 0.04, tolerance=2e-4, step_error=4e-4, finest=16),
             # Where frames are compared.
             SolverSettings("fine", 0.01, tolerance=5e-5, step_error=2e-5, longest_step=0.0625),
-            # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves its residual.
+            # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves
+            # its residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
             SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),
             SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, **_CUT_OFF),

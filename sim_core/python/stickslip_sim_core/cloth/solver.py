@@ -1,4 +1,6 @@
-"""Time stepping of cloth in contact with bodies, itself and surfaces: a thin layer over the C++ solver."""
+"""Time stepping of cloth in contact with bodies, itself and surfaces: a thin layer over the C++
+solver.
+"""
 
 import os
 from collections.abc import Callable, Sequence
@@ -9,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, sheet_count
 from stickslip_sim_core.arrays import Floats
-from stickslip_sim_core.cloth.contact import BEARING, THICKNESS, Body, BodyTuple, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import (
+    BEARING,
+    THICKNESS,
+    Body,
+    BodyTuple,
+    SelfContact,
+    Surface,
+)
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
@@ -17,7 +26,14 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that sets the level of the kernels."""
 
-PASSED_ON = ("newton_max", "krylov_tolerance", "refactor_after", "patience", "halvings_max", "finest")
+PASSED_ON = (
+    "newton_max",
+    "krylov_tolerance",
+    "refactor_after",
+    "patience",
+    "halvings_max",
+    "finest",
+)
 """Settings that the C++ solver takes as they are."""
 
 RESIDUAL_PATCH = 0.005**2
@@ -30,26 +46,27 @@ GRAVITY = 9.81
 """[m/s^2]"""
 
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
-"""From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies."""
+"""From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies.
+"""
 
 Path = Callable[[Floats], tuple[ArrayLike, ArrayLike]]
-"""From times (T,) [s] to positions of the held vertices (T, K, 3) [m], and poses of the bodies (T, B, 3, 4) [m]."""
+"""From times (T,) [s] to positions of the held vertices (T, K, 3) [m], and poses of the bodies (T,
+B, 3, 4) [m].
+"""
 
 
 class Cloth:
     """Cloth with its state and solver settings: a sheet, or several in one mesh.
 
-    Args:
-        mesh: The cloth at rest; `meshes.together` puts several sheets into one.
-        fabric: Material of the cloth, or of each sheet. Sheets are the connected pieces of the mesh, in the order of
-            their first vertices.
-        preset: Solver settings.
-        held: (K,) vertices whose positions are prescribed.
-        self_contact: Contact within and between sheets. None: off, the cloth passes through itself.
-        surfaces: Triangles that it touches.
-        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the lightest fabric.
-        kernel: Level of the kernels, one of `_sim_core.kernels()`: levels differ in the last digits. None takes
-            that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor runs.
+    Args: mesh: The cloth at rest; `meshes.together` puts several sheets into one. fabric: Material
+        of the cloth, or of each sheet. Sheets are the connected pieces of the mesh, in the order of
+        their first vertices. preset: Solver settings. held: (K,) vertices whose positions are
+        prescribed. self_contact: Contact within and between sheets. None: off, the cloth passes
+        through itself. surfaces: Triangles that it touches. force_scale: Force that residuals are
+        measured in [N]; None is the weight of 25 mm^2 of the lightest fabric. kernel: Level of the
+        kernels, one of `_sim_core.kernels()`: levels differ in the last digits. None takes that of
+        the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor
+        runs.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -74,7 +91,9 @@ class Cloth:
         sheets = sheet_count(mesh.rest, mesh.triangles)
         extent = float(np.ptp(mesh.rest, axis=0).max())
         if extent > EXTENT_MAX:
-            raise ValueError(f"mesh: must be at most {EXTENT_MAX:g} m long and wide, got {extent:g} m")
+            raise ValueError(
+                f"mesh: must be at most {EXTENT_MAX:g} m long and wide, got {extent:g} m"
+            )
         self.surfaces = tuple(surfaces)
         self.self_contact = self_contact
         self.time = 0.0
@@ -83,14 +102,22 @@ class Cloth:
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
         mu, thickness = self._touch(sheets)
         edge_share, second_share = BEARING[self_contact.bearing if self_contact else "all"]
-        patch_weight = min((fabric.density for fabric in self.fabrics), default=np.nan) * RESIDUAL_PATCH * GRAVITY
+        patch_weight = (
+            min((fabric.density for fabric in self.fabrics), default=np.nan)
+            * RESIDUAL_PATCH
+            * GRAVITY
+        )
         self.force_scale = patch_weight if force_scale is None else force_scale
-        """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given."""
+        """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given.
+        """
         self._make = partial(
             ClothSolver,
             mesh.rest,
             mesh.triangles,
-            [(fabric.density, fabric.stretching, fabric.rigidity, fabric.damping) for fabric in self.fabrics],
+            [
+                (fabric.density, fabric.stretching, fabric.rigidity, fabric.damping)
+                for fabric in self.fabrics
+            ],
             tolerance=preset.tolerance * self.force_scale,
             **{name: getattr(preset, name) for name in PASSED_ON},
             step_error=preset.step_error or np.inf,
@@ -101,7 +128,8 @@ class Cloth:
             edge_share=edge_share,
             second_share=second_share,
             surface_triangles=np.concatenate(
-                [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))], dtype=np.int32
+                [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))],
+                dtype=np.int32,
             ),
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
@@ -111,9 +139,12 @@ class Cloth:
         self._solver = self._make(held=self.held.tolist())
         self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
         self.total = StepReport()
-        """Of all steps: counts, least distances and worst values, and `seen`, what `checks` judge."""
+        """Of all steps: counts, least distances and worst values, and `seen`, what `checks` judge.
+        """
         self.spent = 0.0
-        """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1 it stops."""
+        """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1
+        it stops.
+        """
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
@@ -126,14 +157,18 @@ class Cloth:
         for column, surface in enumerate(self.surfaces, start=sheets):
             own = np.asarray(surface.mu, float)
             if own.ndim and own.shape != (sheets,):
-                raise ValueError(f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}")
+                raise ValueError(
+                    f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}"
+                )
             mu[:sheets, column] = mu[column, :sheets] = own
         return mu, np.append(thickness, [surface.thickness for surface in self.surfaces])
 
     def _surfaces_at(self, time: float) -> Floats:
         found = [surface.at(time) for surface in self.surfaces]
         if [len(one) for one in found] != self._surface_sizes:
-            raise ValueError(f"positions: of surfaces must keep their vertices, and do not at {time:g} s")
+            raise ValueError(
+                f"positions: of surfaces must keep their vertices, and do not at {time:g} s"
+            )
         return np.concatenate([np.empty((0, 3)), *found])
 
     @property
@@ -162,13 +197,15 @@ class Cloth:
 
     @property
     def reactions(self) -> Floats:
-        """(V, 3) [N]: force of a body or a smooth surface on a free vertex, of its holder on a held one, by M a =
-        forces."""
+        """(V, 3) [N]: force of a body or a smooth surface on a free vertex, of its holder on a held
+        one, by M a = forces."""
         return np.asarray(self._solver.reactions())
 
     @property
     def contacts(self) -> NDArray[np.int32]:
-        """(V,): body that a vertex touches, or surface, which are counted after the bodies; -1 where none."""
+        """(V,): body that a vertex touches, or surface, which are counted after the bodies; -1
+        where none.
+        """
         return np.asarray(self._solver.contacts(), dtype=np.int32)
 
     @property
@@ -178,34 +215,45 @@ class Cloth:
 
     @property
     def pair_forces(self) -> PairForces:
-        """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of surfaces, at the end of
-        the last step."""
+        """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of
+        surfaces, at the end of the last step."""
         return self._solver.pair_forces()
 
     @property
     def surface_forces(self) -> list[Floats]:
-        """Forces of the cloth on the vertices of each surface at the end of the last step: (N, 3) [N]."""
-        return np.split(np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1])
+        """Forces of the cloth on the vertices of each surface at the end of the last step: (N, 3)
+        [N].
+        """
+        return np.split(
+            np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1]
+        )
 
-    def set_state(self, positions: ArrayLike, velocities: ArrayLike | None = None, bodies: Sequence[Body] = ()) -> None:
+    def set_state(
+        self, positions: ArrayLike, velocities: ArrayLike | None = None, bodies: Sequence[Body] = ()
+    ) -> None:
         """Set positions (V, 3) [m], and velocities (V, 3) [m/s].
 
         Without `bodies`, those of this time, they do not move in the next step.
 
-        Raises:
-            ValueError: The cloth crosses a surface, or, with self-contact, itself; a free vertex is more than 1 um
-                inside a body; or an array has another shape.
+        Raises: ValueError: The cloth crosses a surface, or, with self-contact, itself; a free
+            vertex is more than 1 um inside a body; or an array has another shape.
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
         self._solver.set_state(
-            at, speed, self._surfaces_at(self.time), [body.as_tuple() for body in bodies], begins=True
+            at,
+            speed,
+            self._surfaces_at(self.time),
+            [body.as_tuple() for body in bodies],
+            begins=True,
         )
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
-        """Prescribe the positions of these vertices (K,) from now on, in place of those held so far.
+        """Prescribe the positions of these vertices (K,) from now on, in place of those held so
+        far.
 
-        Positions and velocities stay: what is let go flies on as it was moved. `bodies` are those of this time.
+        Positions and velocities stay: what is let go flies on as it was moved. `bodies` are those
+        of this time.
 
         Raises:
             ValueError: A vertex is not there, or comes twice; or none is left free.
@@ -214,17 +262,28 @@ class Cloth:
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
         around = [body.as_tuple() for body in bodies]
-        self._solver.set_state(positions, velocities, self._surfaces_at(self.time), around, begins=False)
+        self._solver.set_state(
+            positions, velocities, self._surfaces_at(self.time), around, begins=False
+        )
 
-    def step(self, dt: float, *, held: ArrayLike = (), bodies: Sequence[Body] = (), damping: float = 0.0) -> StepReport:
-        """Advance by dt [s]. Positions of held vertices (K, 3), bodies and surfaces are those at its end.
+    def step(
+        self, dt: float, *, held: ArrayLike = (), bodies: Sequence[Body] = (), damping: float = 0.0
+    ) -> StepReport:
+        """Advance by dt [s].
+
+        Positions of held vertices (K, 3), bodies and surfaces are those at its end.
 
         `damping` is proportional to mass [1/s]; that of the fabric is added.
         A step that does not converge is counted, and its best iterate is kept.
         """
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
-            dt, self.gravity, ends, self._surfaces_at(self.time + dt), [body.as_tuple() for body in bodies], damping
+            dt,
+            self.gravity,
+            ends,
+            self._surfaces_at(self.time + dt),
+            [body.as_tuple() for body in bodies],
+            damping,
         )
         self.time += dt
         self.total.add(report)
@@ -239,11 +298,13 @@ class Cloth:
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
     ) -> None:
-        """Take steps until one ends at `end` [s] or later: those of the controller, or of the preset's length.
+        """Take steps until one ends at `end` [s] or later: those of the controller, or of the
+        preset's length.
 
-        Steps depend on where the cloth is, not on how often this is called: `positions_at` has it at any time of the
-        last step. Gravity and damping are those at the ends of steps. Where held vertices, bodies or surfaces do not
-        move evenly in a step, it is halved: they are looked at 512 times a second, with `certified`.
+        Steps depend on where the cloth is, not on how often this is called: `positions_at` has it
+        at any time of the last step. Gravity and damping are those at the ends of steps. Where held
+        vertices, bodies or surfaces do not move evenly in a step, it is halved: they are looked at
+        512 times a second, with `certified`.
 
         Args:
             end: [s]
@@ -260,7 +321,10 @@ class Cloth:
 
         def drive(time: float) -> tuple[Floats, Floats, Floats, list[BodyTuple], float]:
             self.gravity, held, bodies = motion(time)
-            ends, tuples = np.asarray(held, float).reshape(-1, 3), [body.as_tuple() for body in bodies]
+            ends, tuples = (
+                np.asarray(held, float).reshape(-1, 3),
+                [body.as_tuple() for body in bodies],
+            )
             return self.gravity, ends, self._surfaces_at(time), tuples, damping(time)
 
         def track(times: Sequence[float]) -> tuple[Floats, Floats]:
@@ -283,14 +347,17 @@ class Cloth:
             self.total.add(report)
             if self.preset.step_error is not None:  # iterations of the last second of scene time
                 allowed = self.preset.newton_per_second
-                self._spent = max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
+                self._spent = (
+                    max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
+                )
                 self.spent = max(self.spent, self._spent / allowed)
 
     def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
 
-        They are cubic in time between both ends of the step, with the velocities there, or straight: a cubic goes on
-        with the velocity before an impact, and may reach through what it hits.
+        They are cubic in time between both ends of the step, with the velocities there, or
+        straight: a cubic goes on with the velocity before an impact, and may reach through what it
+        hits.
 
         Raises:
             ValueError: The time is not in the last step.
@@ -299,7 +366,9 @@ class Cloth:
             return self.positions
         begin, x, v = self._before
         if not begin <= time < self.time:
-            raise ValueError(f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}")
+            raise ValueError(
+                f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}"
+            )
         h, s = self.time - begin, (time - begin) / (self.time - begin)
         way = self.positions - x
         if straight:
@@ -310,7 +379,8 @@ class Cloth:
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the rate of momentum less weight and the force of the holders; zero before the first step.
+        It is the rate of momentum less weight and the force of the holders; zero before the first
+        step.
         """
         if not self.total.steps:
             return np.zeros(3)
@@ -319,5 +389,7 @@ class Cloth:
         return np.asarray(self._solver.momentum_rate() - weight - holders)
 
     def softest(self) -> float:
-        """Return the smallest eigenvalue of stiffness over mass in this state, without contact [1/s^2]; > 0: stable."""
+        """Return the smallest eigenvalue of stiffness over mass in this state, without contact
+        [1/s^2]; > 0: stable.
+        """
         return float(self._solver.softest(self.positions))

@@ -1,4 +1,7 @@
-"""Physical protocols: measurements of a build of the core, against master curves. See docs/protocols.md."""
+"""Physical protocols: measurements of a build of the core, against master curves.
+
+See docs/protocols.md.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +17,12 @@ from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
 from stickslip_sim_core.protocols.protocol import Protocol
 from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
-from stickslip_sim_core.protocols.rods import BendTwist, RodCantilever, RodLateralBuckling, RodProtocol
+from stickslip_sim_core.protocols.rods import (
+    BendTwist,
+    RodCantilever,
+    RodLateralBuckling,
+    RodProtocol,
+)
 from stickslip_sim_core.protocols.stick_slip import StickSlip
 
 PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
@@ -36,7 +44,9 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
     }
 )
 
-ROD_PROTOCOLS = frozenset(name for name, protocol in PROTOCOLS.items() if issubclass(protocol, RodProtocol))
+ROD_PROTOCOLS = frozenset(
+    name for name, protocol in PROTOCOLS.items() if issubclass(protocol, RodProtocol)
+)
 """Protocols of the rod solver, which has no presets."""
 
 
@@ -84,7 +94,9 @@ class Certification:
     """The module whose build the certificate is of."""
 
     numbers: Callable[[], Mapping[str, Any]] = dict
-    """Returns the settings that the preset stands for, constants of the solver included, in JSON's types."""
+    """Returns the settings that the preset stands for, constants of the solver included, in JSON's
+    types.
+    """
 
     quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
     """Settings by protocol for a first look; a certificate made with them certifies nothing."""
@@ -98,12 +110,16 @@ SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-ou
 def _of_cloth(preset: SolverSettings) -> Certification:
     # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
     touches = not preset.name.startswith("thesis-")
-    return Certification(SCENE_PROTOCOLS if touches else _CLOTH, "stickslip_sim_core.cloth", preset.numbers)
+    return Certification(
+        SCENE_PROTOCOLS if touches else _CLOTH, "stickslip_sim_core.cloth", preset.numbers
+    )
 
 
 CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
     {
-        "rods": Certification(("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods"),
+        "rods": Certification(
+            ("rod-lateral-buckling", "rod-cantilever", "bend-twist"), "stickslip_sim_core.rods"
+        ),
         **{name: _of_cloth(preset) for name, preset in PRESETS.items()},
     }
 )

@@ -21,8 +21,9 @@ CELLS_ACROSS = 2  # without Poisson's effect the width does not matter
 
 DENSITY = 0.2  # kg/m^2
 
-# Stiffness against stretching, over rho_A g L: the strip stretches by half of its inverse at most. Ten times as much
-# and an unstructured mesh of flat triangles begins to lock at the sharp bend of heavy strips.
+# Stiffness against stretching, over rho_A g L: the strip stretches by half of its inverse at most.
+# Ten times as much and an unstructured mesh of flat triangles begins to lock at the sharp bend of
+# heavy strips.
 STRETCHING = 3e3
 
 DAMPING = 3.0  # 1/s
@@ -57,7 +58,9 @@ class Cantilever(RefinedProtocol):
         return max((times for weight, times in FINER.items() if x > weight), default=1)
 
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
-        ratio, cloth = hang(strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[at["mesh"]]), x, self.solver)
+        ratio, cloth = hang(
+            strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[at["mesh"]]), x, self.solver
+        )
         self.tally.count(cloth)
         return ratio
 
@@ -65,8 +68,13 @@ class Cantilever(RefinedProtocol):
         return float(master_curves.cantilever(x))
 
 
-def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING) -> tuple[float, Cloth]:
-    """Let a strip that was straight and horizontal settle; return H/W, NaN if it did not, and the cloth."""
+def hang(
+    clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING
+) -> tuple[float, Cloth]:
+    """Let a strip that was straight and horizontal settle.
+
+    Return H/W, NaN if it did not, and the cloth.
+    """
     weight = DENSITY * GRAVITY * LENGTH  # N/m
     cloth = Cloth(
         clamped.mesh,
@@ -82,7 +90,9 @@ def hang(clamped: Strip, gamma: float, preset: SolverSettings, stretching: float
     while cloth.total.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
         cloth.step(dt, held=straight[held], damping=DAMPING)
-        at_rest = 2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
+        at_rest = (
+            2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
+        )
         if cloth.total.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
     reach, _, drop = cloth.positions[clamped.tip].mean(axis=0)

@@ -1,4 +1,7 @@
-"""Capstan: a strip is drawn over a cylinder against a light pull; friction makes the heavy pull grow with the wrap."""
+"""Capstan: a strip is drawn over a cylinder against a light pull.
+
+Friction makes the heavy pull grow with the wrap.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +23,9 @@ FRICTION = (0.1, 0.3, 0.8, 1.5)
 BENDING = (1e-4, 0.05)  # B / T1, B = D / (2 R^2)
 RADIUS, WRAP, WIDTH = 0.05, 2.0, 2  # m, rad, cells
 CELLS_PER_TURN = 72  # 5 degrees each
-FREE = 2.0 * np.pi / 3.0  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
+FREE = (
+    2.0 * np.pi / 3.0
+)  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
 LIGHT = 2.0  # T1, N/m
 DENSITY, STRETCHING = 0.1, 2e4  # kg/m^2, N/m
 SPEED, DAMPING = 0.01, 2.0  # m/s, 1/s
@@ -63,12 +68,21 @@ class Capstan(ClothProtocol):
 
 
 class Strip:
-    """A strip without weight over a cylinder along y, two cells wide. A pull of `LIGHT` hangs on its free end."""
+    """A strip without weight over a cylinder along y, two cells wide.
+
+    A pull of `LIGHT` hangs on its free end.
+    """
 
     apart: ClassVar[float] = 0.0
     """Distance from the cylinder at the start, in thicknesses."""
 
-    def __init__(self, mu: float, bending: float, preset: SolverSettings, cells_per_turn: int = CELLS_PER_TURN) -> None:
+    def __init__(
+        self,
+        mu: float,
+        bending: float,
+        preset: SolverSettings,
+        cells_per_turn: int = CELLS_PER_TURN,
+    ) -> None:
         self.preset = preset
         self.cell = 2.0 * np.pi * RADIUS / cells_per_turn
         free = round(FREE * RADIUS / self.cell)
@@ -106,13 +120,17 @@ class Strip:
         return Cloth(mesh, material, self.preset, held=self.held, force_scale=force_scale)
 
     def draw(self) -> tuple[Floats, float]:
-        """Return the heavy pull at each measured step [N/m], and the angle between the far directions [rad]."""
+        """Return the heavy pull at each measured step [N/m], and the angle between the far
+        directions [rad].
+        """
         dt, pulls = self.preset.time_step, []
         first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
             before = self.cloth.total.newton
-            self.cloth.step(dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING)
+            self.cloth.step(
+                dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING
+            )
             if step > first:
                 self.iterations += (self.cloth.total.newton - before) / (last - first)
                 pulls.append(self.cloth.reactions[self.held].sum(axis=0) / self.breadth)

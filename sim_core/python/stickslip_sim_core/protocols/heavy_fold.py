@@ -1,4 +1,6 @@
-"""Heavy fold: a strip folded onto itself lies on a floor; the shape of its loop does not depend on friction.
+"""Heavy fold: a strip folded onto itself lies on a floor.
+
+The shape of its loop does not depend on friction.
 
 The upper layer is then pulled away from the loop, until it slips.
 """
@@ -25,12 +27,13 @@ STRETCHING = 1.5e4  # over rho g L_gb
 LOWER, UPPER = 4.0, 3.0  # length of the layers that lie, over L_gb
 FRICTION = (0.3, 1.0)
 
-# Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing moves further [m].
+# Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing
+# moves further [m].
 FIRST_SHARE, GROWTH, LONGEST, DAMPING, REST = 0.1, 1.1, 0.05, 8.0, 1e-9
 STEPS_MAX = 1500
 
-# The pull on the upper layer, over that of the master curve. It grows while the strip is damped, and is held [s] while
-# drift is measured; from the next share on it grows slowly [1/s].
+# The pull on the upper layer, over that of the master curve. It grows while the strip is damped,
+# and is held [s] while drift is measured; from the next share on it grows slowly [1/s].
 HOLD_SHARE, HOLD_TIME = 0.9, 10.0
 FROM, UP_TO, RATE = 0.98, 1.02, 0.004
 GROWING = 1.0  # s
@@ -42,10 +45,11 @@ FORCE_SHARE = 0.1
 
 @dataclass(kw_only=True, eq=False)
 class HeavyFold(ClothProtocol):
-    """The height of the loop, how far its nose lies before the landing, and the pull at which the upper layer slips.
+    """The height of the loop, how far its nose lies before the landing, and the pull at which the
+    upper layer slips.
 
-    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest gives the length of the tail. Its weight and
-    the force at the landing are the load on friction.
+    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest gives the length of the
+    tail. Its weight and the force at the landing are the load on friction.
     """
 
     name, x_name, y_name = "heavy-fold", "mu", "length/L_gb, pull/(rho g L_gb)"
@@ -68,7 +72,9 @@ class HeavyFold(ClothProtocol):
     """Of the strip along its length, which is 11.7 L_gb."""
     tolerance: float = 0.005
 
-    folds: dict[float, tuple[tuple[float, float], ...]] = field(default_factory=dict, init=False, repr=False)
+    folds: dict[float, tuple[tuple[float, float], ...]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
         if mu not in self.folds:
@@ -76,21 +82,30 @@ class HeavyFold(ClothProtocol):
         return self.folds[mu][at["what"]]
 
     def fold(self, mu: float) -> tuple[tuple[float, float], ...]:
-        """Return height, distance of nose and landing, and pull at slip: as measured, and of the master curve."""
+        """Return height, distance of nose and landing, and pull at slip: as measured, and of the
+        master curve.
+        """
         exact = master_curves.heavy_fold(GAP)
         fold = Fold(mu, self.solver, self.cells)
         height, nose_to_landing = fold.settle()
         self.tally.note(fold.drift())
         pull = fold.slip_pull()
         self.tally.count(fold.cloth)
-        return (height, exact.height), (nose_to_landing, exact.nose_to_landing), (pull, fold.expected)
+        return (
+            (height, exact.height),
+            (nose_to_landing, exact.nose_to_landing),
+            (pull, fold.expected),
+        )
 
     def reported(self) -> dict[str, Setting]:
         return {**super().reported(), "cells": self.cells, "drift_mm": 1e3 * self.tally.largest}
 
 
 class Fold:
-    """A strip on a floor, with its upper part folded back over the lower one; `mu`: with itself and with the floor."""
+    """A strip on a floor, with its upper part folded back over the lower one.
+
+    `mu`: with itself and with the floor.
+    """
 
     def __init__(self, mu: float, preset: SolverSettings, cells: int) -> None:
         self.mu, self.preset = mu, preset
@@ -110,9 +125,13 @@ class Fold:
         self.middle = np.flatnonzero(np.abs(mesh.rest[:, 0]) < 1e-3 * cell)
         self.end = np.flatnonzero(self.along > length - 0.1 * cell)
         self.unit = weight * 2.0 * np.sqrt(0.75) * cell  # N: rho g L_gb times the width
-        self.straight_end = length - 0.25 * cell  # of a strip as heavy: the ends of this one are notched
+        self.straight_end = (
+            length - 0.25 * cell
+        )  # of a strip as heavy: the ends of this one are notched
         self.expected = self.tail = np.nan
-        """Pull at which the upper layer slips by the master curve, and its length, once it has come to rest."""
+        """Pull at which the upper layer slips by the master curve, and its length, once it has come
+        to rest.
+        """
         self.landing_from = (LOWER + 0.7 * loop) * BENDING_LENGTH
         self.floor = [plane(mu)]
         self.step = FIRST_SHARE * preset.time_step
@@ -125,7 +144,10 @@ class Fold:
         self.cloth.set_state(np.column_stack([x, mesh.rest[:, 0], radius * (1.0 - np.cos(angle))]))
 
     def settle(self) -> tuple[float, float]:
-        """Return height and distance of nose and landing over L_gb; NaN if it does not come to rest."""
+        """Return height and distance of nose and landing over L_gb.
+
+        NaN if it does not come to rest.
+        """
         if not self.rests():
             return np.nan, np.nan
         height, nose_to_landing, self.tail = self.measure()
@@ -145,10 +167,14 @@ class Fold:
 
     def pulled(self, share: float) -> None:
         """Pull at the end of the upper layer by a share of the master's pull."""
-        self.cloth.gravity[self.end, 0] = -share * self.expected * self.unit / self.cloth.masses[self.end].sum()
+        self.cloth.gravity[self.end, 0] = (
+            -share * self.expected * self.unit / self.cloth.masses[self.end].sum()
+        )
 
     def drift(self) -> float:
-        """Return the largest displacement in `HOLD_TIME` without damping [m], pulled by `HOLD_SHARE`."""
+        """Return the largest displacement in `HOLD_TIME` without damping [m], pulled by
+        `HOLD_SHARE`.
+        """
         if np.isnan(self.expected):
             return np.inf
         growing = round(GROWING / self.preset.time_step)
@@ -163,7 +189,10 @@ class Fold:
         return float(np.abs(self.cloth.positions - before).max())
 
     def slip_pull(self) -> float:
-        """Return the pull over rho g L_gb at which all of the upper layer slips, or NaN; `drift` comes before."""
+        """Return the pull over rho g L_gb at which all of the upper layer slips, or NaN.
+
+        `drift` comes before.
+        """
         if np.isnan(self.expected):
             return np.nan
         dt = self.preset.time_step
@@ -182,10 +211,12 @@ class Fold:
         return np.nan
 
     def measure(self) -> tuple[float, float, float]:
-        """Return height, distance of nose and landing, and length of the strip beyond the landing, over L_gb.
+        """Return height, distance of nose and landing, and length of the strip beyond the landing,
+        over L_gb.
 
-        Beyond the landing the layer below bears the weight of each vertex, and there a force besides. It is where the
-        surplus over the weights has its centre, since the layer bears no moment.
+        Beyond the landing the layer below bears the weight of each vertex, and there a force
+        besides. It is where the surplus over the weights has its centre, since the layer bears no
+        moment.
         """
         at = self.cloth.positions
         line = at[self.middle][np.argsort(self.along[self.middle])]
@@ -203,9 +234,18 @@ class Fold:
 
 
 def strip_of(cell: float, cells: int) -> meshes.Mesh:
-    """Return a strip of equilateral triangles from y = 0 on, two rows wide: they leave most room for a thickness."""
-    rise, side, inner = np.sqrt(0.75) * cell, cell * np.arange(cells + 1), cell * (np.arange(cells) + 0.5)
-    rest = [np.column_stack([np.full(len(y), x), y]) for x, y in ((-rise, side), (0.0, inner), (rise, side))]
+    """Return a strip of equilateral triangles from y = 0 on, two rows wide: they leave most room
+    for a thickness.
+    """
+    rise, side, inner = (
+        np.sqrt(0.75) * cell,
+        cell * np.arange(cells + 1),
+        cell * (np.arange(cells) + 0.5),
+    )
+    rest = [
+        np.column_stack([np.full(len(y), x), y])
+        for x, y in ((-rise, side), (0.0, inner), (rise, side))
+    ]
     left, middle = np.arange(cells + 1), cells + 1 + np.arange(cells)
     right = left + 2 * cells + 1
     triangles = [

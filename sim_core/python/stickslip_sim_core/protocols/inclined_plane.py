@@ -1,5 +1,5 @@
-"""Inclined plane: the slope at which a patch of cloth begins to slide, or the upper sheets of a stack, and its creep
-below that slope."""
+"""Inclined plane: the slope at which a patch of cloth begins to slide, or the upper sheets of a
+stack, and its creep below that slope."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,9 @@ DRIFT_MAX = 1e-5  # m
 
 
 class OnSlope:
-    """Cloth at rest on a slope. What lies above an interface of friction mu is to slip as the slope grows, alone.
+    """Cloth at rest on a slope.
+
+    What lies above an interface of friction mu is to slip as the slope grows, alone.
 
     Args:
         cloth: Without a state.
@@ -49,7 +51,9 @@ class OnSlope:
     slid: ClassVar[float] = 1e-9
     """What slides has come so far with all of its vertices [m]."""
 
-    def __init__(self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]) -> None:
+    def __init__(
+        self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]
+    ) -> None:
         self.cloth, self.start, self.mu, self.upper = cloth, start, mu, upper
         self.floor = [plane(floor)]
         cloth.set_state(start)
@@ -91,7 +95,8 @@ def tilted(angle: float) -> Floats:
 class SlopeProtocol(MeshedProtocol):
     """Tan(alpha) of the slope at which cloth slips, against mu.
 
-    What comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its measurement is NaN.
+    What comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its
+    measurement is NaN.
     """
 
     x_name, y_name, points = "mu", "tan(alpha) at slip", "friction"
@@ -116,7 +121,10 @@ class SlopeProtocol(MeshedProtocol):
         return slope if moved <= DRIFT_MAX else np.nan, mu
 
     def reported(self) -> dict[str, Setting]:
-        own = {"force_scale_over_node_weight": self.force_share, "drift_mm": 1e3 * self.tally.largest}
+        own = {
+            "force_scale_over_node_weight": self.force_share,
+            "drift_mm": 1e3 * self.tally.largest,
+        }
         return super().reported() | own
 
 
@@ -124,8 +132,8 @@ class SlopeProtocol(MeshedProtocol):
 class InclinedPlane(SlopeProtocol):
     """A patch on a plane.
 
-    A resting node may bear a force beyond friction by the preset's tolerance times the force that residuals are
-    measured in, and slides late by as much over mu.
+    A resting node may bear a force beyond friction by the preset's tolerance times the force that
+    residuals are measured in, and slides late by as much over mu.
     """
 
     name, grids_max, force_share = "inclined-plane", 1, 1.0
@@ -135,7 +143,9 @@ class InclinedPlane(SlopeProtocol):
     tolerance: float = 0.005
 
     def lay(self, mu: float, at: Mapping[str, Any]) -> OnSlope:
-        mesh = rectangle(SIDE, SIDE, (self.cells, self.cells), SIDE / self.cells, self.kinds[at["mesh"]], 0)
+        mesh = rectangle(
+            SIDE, SIDE, (self.cells, self.cells), SIDE / self.cells, self.kinds[at["mesh"]], 0
+        )
         return patch(mesh, mu, self.solver)
 
 
@@ -150,14 +160,19 @@ def patch(mesh: meshes.Mesh, mu: float, preset: SolverSettings) -> OnSlope:
 
 STACK_FRICTION = (0.1, 0.3, 0.8, 1.5)
 SHEETS = (2, 4)
-TOP, WIDER = 0.1, 0.01  # m: side of the sheet on top, and by how much each one below is wider on each side
+TOP, WIDER = (
+    0.1,
+    0.01,
+)  # m: side of the sheet on top, and by how much each one below is wider on each side
 THICKNESS = 5e-4  # m
 ROUGHER = 1.5  # friction of all other interfaces, over the least
 
 
 @dataclass(kw_only=True, eq=False)
 class StackedIncline(SlopeProtocol):
-    """The upper sheets of a stack, over the middle interface. The other interfaces are rougher than mu.
+    """The upper sheets of a stack, over the middle interface.
+
+    The other interfaces are rougher than mu.
 
     A stack in which another interface slides has no slip angle either.
     """
@@ -177,7 +192,8 @@ class StackedIncline(SlopeProtocol):
 
 
 class Stack(OnSlope):
-    """Sheets on each other on a slope, the widest below, with the least friction, mu, below sheet `sheets // 2`.
+    """Sheets on each other on a slope, the widest below, with the least friction, mu, below sheet
+    `sheets // 2`.
 
     `cells` are those of the sheet on top along a side.
     """
@@ -185,7 +201,12 @@ class Stack(OnSlope):
     share_from, share_to, rate, slid = 0.99, 1.01, 0.002, 1e-6
 
     def __init__(
-        self, sheets: int, mu: float, preset: SolverSettings, cells: int, kind: MeshKind = "alternating"
+        self,
+        sheets: int,
+        mu: float,
+        preset: SolverSettings,
+        cells: int,
+        kind: MeshKind = "alternating",
     ) -> None:
         if sheets < 2:
             raise ValueError(f"sheets: must be at least 2, got {sheets}")
@@ -207,7 +228,10 @@ class Stack(OnSlope):
             force_scale=StackedIncline.force_share * weight,
         )
         start = np.concatenate(
-            [np.column_stack([p.rest, np.full(len(p.rest), level * THICKNESS)]) for level, p in enumerate(parts)]
+            [
+                np.column_stack([p.rest, np.full(len(p.rest), level * THICKNESS)])
+                for level, p in enumerate(parts)
+            ]
         )
         self.level = np.repeat(np.arange(sheets), [len(p.rest) for p in parts])
         super().__init__(cloth, start, mu, ROUGHER * mu, self.level >= loose)

@@ -1,9 +1,11 @@
-"""Lateral buckling: the weight at which a strip clamped with its width vertical turns sideways [Romero et al. 2021].
+"""Lateral buckling: the weight at which a strip clamped with its width vertical turns sideways
+[Romero et al. 2021].
 
-The strip takes up its weight in its plane, by steps of the solver. What its stress then adds to the stiffness against
-moving out of the plane goes with the weight, what bending adds with the rigidity: the flat state loses stability where
-the smallest eigenvalue of their sum is zero, which is an eigenvalue problem for the weight. Both matrices are central
-differences of the solver's own gradient.
+The strip takes up its weight in its plane, by steps of the solver. What its stress then adds to the
+stiffness against moving out of the plane goes with the weight, what bending adds with the rigidity:
+the flat state loses stability where the smallest eigenvalue of their sum is zero, which is an
+eigenvalue problem for the weight. Both matrices are central differences of the solver's own
+gradient.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +38,8 @@ REACH = 6.0  # cells: no force of bending acts between vertices that are further
 
 @dataclass(kw_only=True, eq=False)
 class LateralBuckling(RefinedProtocol):
-    """The weight Gamma* at which flat strips lose stability, against `master_curves.lateral_buckling`.
+    """The weight Gamma* at which flat strips lose stability, against
+    `master_curves.lateral_buckling`.
 
     The preset's time step is the first one; the others grow.
     """
@@ -44,14 +47,19 @@ class LateralBuckling(RefinedProtocol):
     name, x_name, y_name = "lateral-buckling", "w/L", "Gamma* = rho_A g L^3 / D"
     points, parameters = "aspect", {"mesh": "meshes", "poisson": "poisson"}
     time_step_name = "first_time_step"
-    constants: ClassVar = {"stretching_over_weight": STRETCHING, "force_scale_over_node_weight": FORCE_SHARE}
+    constants: ClassVar = {
+        "stretching_over_weight": STRETCHING,
+        "force_scale_over_node_weight": FORCE_SHARE,
+    }
 
     aspect: Sequence[float] = ASPECT
     """Widths over length."""
     poisson: Sequence[float] = POISSON
 
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
-        return threshold(strip(x * LENGTH, cells, self.kinds[at["mesh"]]), at["poisson"], self.solver)
+        return threshold(
+            strip(x * LENGTH, cells, self.kinds[at["mesh"]]), at["poisson"], self.solver
+        )
 
     def master(self, x: float, at: Mapping[str, Any]) -> float:
         return float(master_curves.lateral_buckling(x, at["poisson"]))
@@ -68,14 +76,21 @@ def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
     stress = out_of_plane(cloth, cloth.positions, free) - bending
     if not np.isfinite(stress.data).all():
         return np.nan
-    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of -stress over bending.
+    # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of -stress over
+    # bending.
     inverse = LinearOperator(bending.shape, splu(bending).solve)
     start = np.ones(len(free))  # a start at random would not give the same bits twice
-    largest = float(eigsh(-stress, 1, M=bending, Minv=inverse, which="LA", v0=start, return_eigenvectors=False)[0])
+    largest = float(
+        eigsh(-stress, 1, M=bending, Minv=inverse, which="LA", v0=start, return_eigenvectors=False)[
+            0
+        ]
+    )
     return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
 
 
-def loaded(clamped: Strip, poisson: float, rigidity: float, preset: SolverSettings) -> tuple[Cloth, Floats]:
+def loaded(
+    clamped: Strip, poisson: float, rigidity: float, preset: SolverSettings
+) -> tuple[Cloth, Floats]:
     """Return a flat strip at rest under its weight along its width, and its vertices (V, 3) [m]."""
     cloth = Cloth(
         clamped.mesh,
@@ -91,9 +106,11 @@ def loaded(clamped: Strip, poisson: float, rigidity: float, preset: SolverSettin
 
 
 def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matrix:
-    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its plane.
+    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its
+    plane.
 
-    Vertices that are more than twice `REACH` cells apart have no neighbour in common, so they are moved together.
+    Vertices that are more than twice `REACH` cells apart have no neighbour in common, so they are
+    moved together.
     """
     rest, cell = cloth.mesh.rest[free], cloth.mesh.spacing
     period = int(np.ceil(2.0 * REACH)) + 1
@@ -118,6 +135,7 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
         columns.append(members[np.asarray(nearest)[near]])
         values.append((ends[0] - ends[1])[near] / (2.0 * DIFFERENCE * LENGTH))
     whole = csc_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (len(free), len(free))
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        (len(free), len(free)),
     )
     return csc_matrix(0.5 * (whole + whole.T))

@@ -27,19 +27,28 @@ LENGTH = 0.1
 DIAGONALS: tuple[Diagonals, ...] = ("alternating", "random", "left", "right")
 
 ALIGNED = 3
-"""Rows of square cells at the clamp of an unstructured strip. With one, the tip of a cantilever is off by 2.4 %."""
+"""Rows of square cells at the clamp of an unstructured strip. With one, the tip of a cantilever is
+off by 2.4 %.
+"""
 
 MeshKind = Diagonals | int
 """Diagonals of a grid, or the seed of an unstructured mesh."""
 
 
 def rectangle(
-    width: float, length: float, cells: tuple[int, int], spacing: float, kind: MeshKind, seed: int, aligned: int = 0
+    width: float,
+    length: float,
+    cells: tuple[int, int],
+    spacing: float,
+    kind: MeshKind,
+    seed: int,
+    aligned: int = 0,
 ) -> Mesh:
-    """Return a mesh of a rectangle [m]: a grid of `cells`, or triangles with sides of about `spacing` [m].
+    """Return a mesh of a rectangle [m]: a grid of `cells`, or triangles with sides of about
+    `spacing` [m].
 
-    `seed` draws the diagonals of a grid, and is added to the seed of an unstructured mesh, of which `aligned` rows of
-    cells at the lower end are those of a grid.
+    `seed` draws the diagonals of a grid, and is added to the seed of an unstructured mesh, of which
+    `aligned` rows of cells at the lower end are those of a grid.
     """
     if isinstance(kind, int):
         return meshes.unstructured(width, length, spacing, kind + seed, aligned=aligned)
@@ -48,10 +57,11 @@ def rectangle(
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """A strip along the second axis of its rest plane, clamped at its lower end by two rows of vertices.
+    """A strip along the second axis of its rest plane, clamped at its lower end by two rows of
+    vertices.
 
-    The rows lie half a cell before and behind the clamp, so that a strip that is straight between them is level at the
-    clamp itself. The mesh is longer than the strip by half a cell.
+    The rows lie half a cell before and behind the clamp, so that a strip that is straight between
+    them is level at the clamp itself. The mesh is longer than the strip by half a cell.
     """
 
     mesh: Mesh
@@ -80,7 +90,9 @@ class Strip:
 
 
 def cell_of(cells: int) -> float:
-    """Return the length of a cell [m] of a strip with `cells` cells along it, half of one of them before the clamp."""
+    """Return the length of a cell [m] of a strip with `cells` cells along it, half of one of them
+    before the clamp.
+    """
     return LENGTH / (cells - 0.5)
 
 
@@ -122,7 +134,9 @@ class Protocol(ABC):
     """The field that holds the abscissae, which all curves share."""
 
     parameters: ClassVar[Mapping[str, str]] = {}
-    """Parameters of a curve, and the fields that hold their values. There is a curve for each combination."""
+    """Parameters of a curve, and the fields that hold their values. There is a curve for each
+    combination.
+    """
 
     tolerance: float
     """Largest |relative error| that passes."""
@@ -134,7 +148,9 @@ class Protocol(ABC):
 
     @abstractmethod
     def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        """Return the measured value at a point of the curve with the parameters `at`, and that of its master curve."""
+        """Return the measured value at a point of the curve with the parameters `at`, and that of
+        its master curve.
+        """
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         """Measure the points x of the curve with the parameters `at`."""
@@ -190,7 +206,10 @@ class ClothProtocol(Protocol):
     """Of cloth that touches cloth [m]."""
 
     def reported(self) -> dict[str, Setting]:
-        found: dict[str, Setting] = {"preset": self.solver.name, self.time_step_name: self.solver.time_step}
+        found: dict[str, Setting] = {
+            "preset": self.solver.name,
+            self.time_step_name: self.solver.time_step,
+        }
         total = self.tally.total
         if total.steps:
             found |= {"steps": total.steps, "unconverged_steps": total.unconverged}
@@ -201,7 +220,10 @@ class ClothProtocol(Protocol):
 
 @dataclass(kw_only=True, eq=False)
 class MeshedProtocol(ClothProtocol):
-    """A protocol of the cloth solver that is run on several meshes; `mesh` is a parameter of its curves."""
+    """A protocol of the cloth solver that is run on several meshes.
+
+    `mesh` is a parameter of its curves.
+    """
 
     parameters: ClassVar = {"mesh": "meshes"}
     grids_max: ClassVar[int] = 4
@@ -224,22 +246,25 @@ class MeshedProtocol(ClothProtocol):
         return range(len(self.kinds))
 
     def reported(self) -> dict[str, Setting]:
-        kinds = [f"{'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for kind in self.kinds]
+        kinds = [
+            f"{'unstructured' if isinstance(kind, int) else 'grid'} {kind}" for kind in self.kinds
+        ]
         meshes = ", ".join(f"{number} {kind}" for number, kind in enumerate(kinds))
         return {**super().reported(), "cells": self.cells, "meshes": meshes}
 
 
 @dataclass(kw_only=True, eq=False)
 class RefinedProtocol(MeshedProtocol):
-    """A protocol of strips that is run with three sizes of cells, from which the limit of small cells follows.
+    """A protocol of strips that is run with three sizes of cells, from which the limit of small
+    cells follows.
 
     Raises:
         ValueError: `cells` breaks its rule.
     """
 
     cells: tuple[int, int, int] = (20, 40, 80)
-    """Cells along the strip of three meshes, each at least 1.5 times the one before: those of sheets of 21, 41 and 81
-    vertices a side. `measured` is the value of the last."""
+    """Cells along the strip of three meshes, each at least 1.5 times the one before: those of
+    sheets of 21, 41 and 81 vertices a side. `measured` is the value of the last."""
 
     tolerance: float = 4e-3
     limit_tolerance: float = 1e-3
@@ -247,8 +272,12 @@ class RefinedProtocol(MeshedProtocol):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.cells) != 3 or not all(2 * fine >= 3 * coarse > 18 for coarse, fine in pairwise(self.cells)):
-            raise ValueError(f"cells: must be three numbers from 7 on, each 1.5 times the one before, got {self.cells}")
+        if len(self.cells) != 3 or not all(
+            2 * fine >= 3 * coarse > 18 for coarse, fine in pairwise(self.cells)
+        ):
+            raise ValueError(
+                f"cells: must be three numbers from 7 on, each 1.5 times the one before, got {self.cells}"
+            )
 
     def finer(self, x: float) -> int:
         """Return by how much finer all three meshes are at a point that needs it."""
@@ -268,7 +297,9 @@ class RefinedProtocol(MeshedProtocol):
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         cells = tuple(tuple(self.finer(point) * count for point in x) for count in self.cells)
         measured = tuple(
-            tuple(self.measure_with(count, point, at) for count, point in zip(counts, x, strict=True))
+            tuple(
+                self.measure_with(count, point, at) for count, point in zip(counts, x, strict=True)
+            )
             for counts in cells
         )
         sizes = tuple(tuple(cell_of(count) / LENGTH for count in counts) for counts in cells)

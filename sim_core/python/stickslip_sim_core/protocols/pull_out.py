@@ -1,4 +1,7 @@
-"""Pull-out: a sheet is drawn out from between two others that lie under a load; both of its sides rub."""
+"""Pull-out: a sheet is drawn out from between two others that lie under a load.
+
+Both of its sides rub.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +25,9 @@ SPEED = 0.01  # m/s
 SLIDING = 1.0  # s: after which the force is measured
 MEASURED = 0.4  # s: over which its mean is taken
 ROUGH = 10.0  # friction of the floor
-LIFTED = 0.2  # thicknesses: by which held edges are lifted; held where they touch, they could be pressed by any force
+# thicknesses: by which held edges are lifted; held where they touch, they could be pressed by any
+# force
+LIFTED = 0.2
 LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
 
 # Of a node's weight: the force that residuals are measured in.
@@ -62,14 +67,23 @@ class PullOut(MeshedProtocol):
 
 
 class Pulled:
-    """Three sheets on a rough floor. The upper one is held by its rear edge, the middle one drawn by its front edge.
+    """Three sheets on a rough floor.
 
-    `mu` is the friction of the upper two, `load` a factor of the gravity on the upper one, which has `cells` a side.
+    The upper one is held by its rear edge, the middle one drawn by its front edge.
+
+    `mu` is the friction of the upper two, `load` a factor of the gravity on the upper one, which
+    has `cells` a side.
     """
 
-    def __init__(self, mu: float, load: float, preset: SolverSettings, cells: int, kind: MeshKind) -> None:
+    def __init__(
+        self, mu: float, load: float, preset: SolverSettings, cells: int, kind: MeshKind
+    ) -> None:
         self.mu, self.preset = mu, preset
-        sizes = ((1.5 * SIDE, 1.2 * SIDE), (1.25 * SIDE, SIDE), (SIDE, 0.9 * SIDE))  # from the lowest upwards
+        sizes = (
+            (1.5 * SIDE, 1.2 * SIDE),
+            (1.25 * SIDE, SIDE),
+            (SIDE, 0.9 * SIDE),
+        )  # from the lowest upwards
         centres = (0.0, 0.1 * SIDE, 0.0)
         cell = SIDE / cells
         parts = [
@@ -80,7 +94,12 @@ class Pulled:
         self.level = np.repeat([0, 1, 2], [len(part.rest) for part in parts])
         self.start = np.concatenate(
             [
-                np.column_stack([part.rest + np.array([centre, 0.0]), np.full(len(part.rest), level * THICKNESS)])
+                np.column_stack(
+                    [
+                        part.rest + np.array([centre, 0.0]),
+                        np.full(len(part.rest), level * THICKNESS),
+                    ]
+                )
                 for level, (part, centre) in enumerate(zip(parts, centres, strict=True))
             ]
         )
@@ -94,16 +113,20 @@ class Pulled:
             laid,
             preset,
             held=np.concatenate([self.drawn, self.rear]),
-            self_contact=SelfContact([[mu, below, mu], [below, mu, above], [mu, above, mu]], THICKNESS),
+            self_contact=SelfContact(
+                [[mu, below, mu], [below, mu, above], [mu, above, mu]], THICKNESS
+            ),
             force_scale=FORCE_SHARE * laid.density * parts[-1].spacing ** 2 * GRAVITY,
         )
         self.cloth.gravity[self.level == 2] *= load
         self.cloth.set_state(self.start)
 
     def force(self) -> tuple[float, float]:
-        """Return the force that draws the middle sheet over the load (NaN if the lowest one moves), and the master's.
+        """Return the force that draws the middle sheet over the load (NaN if the lowest one moves),
+        and the master's.
 
-        The load is what the holders of the upper sheet leave of its weight, and likewise for the middle one.
+        The load is what the holders of the upper sheet leave of its weight, and likewise for the
+        middle one.
         """
         cloth, dt = self.cloth, self.preset.time_step
         weight = -cloth.masses * cloth.gravity[:, 2]

@@ -1,4 +1,6 @@
-"""Results of protocols: measured curves beside their master curves, whether they agree, and curves for pictures."""
+"""Results of protocols: measured curves beside their master curves, whether they agree, and curves
+for pictures.
+"""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,7 +23,9 @@ class Refinement:
     """What three meshes say about the points of a curve."""
 
     cells: tuple[Numbers, ...]
-    """By mesh, the coarsest first, and point: cells along the sheet. The last mesh is that of `Curve.measured`."""
+    """By mesh, the coarsest first, and point: cells along the sheet. The last mesh is that of
+    `Curve.measured`.
+    """
 
     measured: tuple[Numbers, ...]
     """By mesh and point."""
@@ -30,10 +34,14 @@ class Refinement:
     """Values extrapolated to cells of no size [Richardson 1911]."""
 
     order: Numbers
-    """Power of the cell's size with which errors fall; NaN where the meshes show none, and 2 was taken."""
+    """Power of the cell's size with which errors fall; NaN where the meshes show none, and 2 was
+    taken.
+    """
 
     @classmethod
-    def of(cls, cells: tuple[Numbers, ...], sizes: tuple[Numbers, ...], measured: tuple[Numbers, ...]) -> "Refinement":
+    def of(
+        cls, cells: tuple[Numbers, ...], sizes: tuple[Numbers, ...], measured: tuple[Numbers, ...]
+    ) -> "Refinement":
         """Extrapolate what was measured with cells of three `sizes`, by mesh and point."""
         points = zip(zip(*sizes, strict=True), zip(*measured, strict=True), strict=True)
         limits = [_extrapolated(at, values) for at, values in points]
@@ -42,11 +50,15 @@ class Refinement:
 
 
 ORDERS = (1.0, 4.0)
-"""Orders that three meshes are believed to show. Others are those of values that differ by rounding or chance."""
+"""Orders that three meshes are believed to show. Others are those of values that differ by rounding
+or chance.
+"""
 
 
 def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
-    """Return the limit and the order p of y(h) = limit + c h^p through three values, the coarsest first."""
+    """Return the limit and the order p of y(h) = limit + c h^p through three values, the coarsest
+    first.
+    """
 
     def missed(p: float) -> float:
         a, b, c = (size**p for size in sizes)
@@ -56,7 +68,9 @@ def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
     order, power = math.nan, 2.0
     if missed(low) * missed(high) < 0.0:
         order = power = float(brentq(missed, low, high))
-    return float(values[2] + (values[2] - values[1]) / ((sizes[1] / sizes[2]) ** power - 1.0)), order
+    return float(
+        values[2] + (values[2] - values[1]) / ((sizes[1] / sizes[2]) ** power - 1.0)
+    ), order
 
 
 @dataclass(frozen=True)
@@ -85,11 +99,20 @@ class Curve:
     @property
     def errors_by_mesh(self) -> tuple[Numbers, ...]:
         """The same by mesh, the coarsest first, if there are several."""
-        return tuple(self._errors_of(measured) for measured in self.refinement.measured) if self.refinement else ()
+        return (
+            tuple(self._errors_of(measured) for measured in self.refinement.measured)
+            if self.refinement
+            else ()
+        )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return parameters, points and errors, and of three meshes limits, orders and the errors of each."""
-        found = {name: getattr(self, name) for name in ("parameters", "x", "measured", "master", "errors")}
+        """Return parameters, points and errors, and of three meshes limits, orders and the errors
+        of each.
+        """
+        found = {
+            name: getattr(self, name)
+            for name in ("parameters", "x", "measured", "master", "errors")
+        }
         if self.refinement:
             found |= {name: getattr(self.refinement, name) for name in ("limit", "order", "cells")}
             found |= {"limit_errors": self.limit_errors, "errors_by_mesh": self.errors_by_mesh}
@@ -115,7 +138,8 @@ class ProtocolResult:
     """`build_info().build_hash` of the core that was measured."""
 
     limit_tolerance: float | None = None
-    """Largest |relative error| of a limit that passes, of a protocol that is run on three meshes."""
+    """Largest |relative error| of a limit that passes, of a protocol that is run on three meshes.
+    """
 
     @property
     def error(self) -> float:
@@ -132,16 +156,32 @@ class ProtocolResult:
     @property
     def passed(self) -> bool:
         limit = self.limit_error
-        return self.error <= self.tolerance and (limit is None or limit <= (self.limit_tolerance or 0.0))
+        return self.error <= self.tolerance and (
+            limit is None or limit <= (self.limit_tolerance or 0.0)
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result in JSON's types; NaN and infinity become None."""
-        numbers = ("protocol", "tolerance", "error", "limit_tolerance", "limit_error", "passed", "build_hash")
+        numbers = (
+            "protocol",
+            "tolerance",
+            "error",
+            "limit_tolerance",
+            "limit_error",
+            "passed",
+            "build_hash",
+        )
         found: dict[str, Any] = _plain(
             {"x": self.x_name, "y": self.y_name, **{name: getattr(self, name) for name in numbers}}
         )
-        settings = {name: list(value) if isinstance(value, tuple) else value for name, value in self.settings.items()}
-        return found | {"settings": settings, "curves": [_plain(curve.as_dict()) for curve in self.curves]}
+        settings = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in self.settings.items()
+        }
+        return found | {
+            "settings": settings,
+            "curves": [_plain(curve.as_dict()) for curve in self.curves],
+        }
 
 
 def _relative_error(measured: float, master: float) -> float:
@@ -168,15 +208,18 @@ _EXACT: Mapping[str, Callable[[Floats], Floats]] = {
     "inclined-plane": lambda mu: mu,
     "stacked-incline": lambda mu: mu,
     "stick-slip": lambda mu: mu,
-    "rod-lateral-buckling": lambda poisson: np.full_like(poisson, master_curves.lateral_buckling_rod()),
+    "rod-lateral-buckling": lambda poisson: np.full_like(
+        poisson, master_curves.lateral_buckling_rod()
+    ),
 }
 
 
 def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
     """Return 200 abscissae between the measured ones, and the master curve there.
 
-    It is exact where the master curve has a formula or a quick solver. Elsewhere it is the monotone cubic [Fritsch,
-    Carlson 1980] through the exact values: for pictures only. A single point without a formula has no curve.
+    It is exact where the master curve has a formula or a quick solver. Elsewhere it is the monotone
+    cubic [Fritsch, Carlson 1980] through the exact values: for pictures only. A single point
+    without a formula has no curve.
     """
     x, y = np.array(curve.x), np.array(curve.master)
     known = np.isfinite(x) & np.isfinite(y)
@@ -186,7 +229,9 @@ def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
         return x, y
     first, last = (x[0], x[-1]) if len(x) > 1 else (x[0] / 1.5, x[0] * 1.5)
     if protocol in _EXACT:
-        dense = np.geomspace(first, last, POINTS) if first > 0.0 else np.linspace(first, last, POINTS)
+        dense = (
+            np.geomspace(first, last, POINTS) if first > 0.0 else np.linspace(first, last, POINTS)
+        )
         return dense, np.asarray(_EXACT[protocol](dense), dtype=np.float64)
     if first > 0.0 and np.all(y > 0.0):
         dense = np.geomspace(first, last, POINTS)

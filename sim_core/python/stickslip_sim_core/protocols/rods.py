@@ -1,4 +1,6 @@
-"""Protocols of the rod solver, and what they share: chains of frames, equilibria, extrapolation, searches."""
+"""Protocols of the rod solver, and what they share: chains of frames, equilibria, extrapolation,
+searches.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,35 +43,48 @@ def round_rod(phi: float, poisson: float) -> Relax:
     """Relax chains of a round rod with natural bend phi / L by the rod solver's Newton method."""
 
     def relax(gamma: float, frames: Floats) -> Equilibrium:
-        return Equilibrium(gamma, *_sim_core.relax_rod(gamma, 0.0, phi, 1.0 / (1.0 + poisson), frames))
+        return Equilibrium(
+            gamma, *_sim_core.relax_rod(gamma, 0.0, phi, 1.0 / (1.0 + poisson), frames)
+        )
 
     return relax
 
 
 def planar_frames(angles: Floats) -> Floats:
-    """Frames in the plane y = 0, d3 = -y, whose tangents make these angles [rad] with gravity, shape (N + 1, 4)."""
+    """Frames in the plane y = 0, d3 = -y, whose tangents make these angles [rad] with gravity,
+    shape (N + 1, 4).
+    """
     c, s = np.cos(0.5 * angles), np.sin(0.5 * angles)
     # (1, 1, 1, -1) / 2, the clamp of solve_rods, times (c, 0, 0, s).
     return 0.5 * np.stack([c + s, c + s, c - s, s - c], axis=1)
 
 
 def tip(frames: Floats) -> Floats:
-    """Position of the free end [L], shape (3,): r' = d1 by the trapezoidal rule, whose error is even in h."""
+    """Position of the free end [L], shape (3,): r' = d1 by the trapezoidal rule, whose error is
+    even in h.
+    """
     w, x, y, z = frames.T
-    tangents = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], axis=1)
+    tangents = np.stack(
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], axis=1
+    )
     weights = np.full(len(w), 1.0 / (len(w) - 1))
     weights[[0, -1]] *= 0.5
     return np.asarray(weights @ tangents)
 
 
 def extrapolated(measure: Callable[[int], float], elements: int) -> float:
-    """Measure with 1/4, 1/2 and all of `elements` and go to the limit, as the solver does: error O(h^6)."""
+    """Measure with 1/4, 1/2 and all of `elements` and go to the limit, as the solver does: error
+    O(h^6).
+    """
     coarse, middle, fine = (measure(elements // k) for k in (4, 2, 1))
     return float(64.0 * fine - 20.0 * middle + coarse) / 45.0
 
 
 def loss_of_stability(relax: Relax, start: Equilibrium, gammas: Iterable[float]) -> float:
-    """Follow a stable equilibrium through `gammas` and bisect where it ceases to be stable; NaN where it does not."""
+    """Follow a stable equilibrium through `gammas` and bisect where it ceases to be stable.
+
+    NaN where it does not.
+    """
     stable = start
     for gamma in gammas:
         after = relax(float(gamma), stable.frames)
@@ -113,19 +128,21 @@ class RodProtocol(Protocol):
 # Natural curvature times L [rad]: 6 ... 25 pi.
 PHI = (6.0, 6.5, 7.0, 8.0, 10.0, 12.5, 16.0, 20.0, 27.0, 36.0, 48.0, 62.0, 25.0 * np.pi)
 
-# Branches are followed in these steps of gamma; close to the onset the three-dimensional window may be narrower than
-# one of them. From above they start at gamma = phi^3, where every such rod hangs almost straight and stable, and end at
-# gamma = 1e-4 phi^3, where all of it has curled up again.
+# Branches are followed in these steps of gamma; close to the onset the three-dimensional window may
+# be narrower than one of them. From above they start at gamma = phi^3, where every such rod hangs
+# almost straight and stable, and end at gamma = 1e-4 phi^3, where all of it has curled up again.
 DOWN = 0.9
 DOWN_TO = 1e-4
 
 
 @dataclass(kw_only=True, eq=False)
 class BendTwist(RodProtocol):
-    """The weight at which a hanging curly rod leaves its plane [Miller et al. 2014; Romero et al. 2021].
+    """The weight at which a hanging curly rod leaves its plane [Miller et al. 2014; Romero et al.
+    2021].
 
-    Measured is the weight at which the Hessian along a branch of planar equilibria ceases to be positive definite. An
-    exactly planar rod stays planar. The master curve is `master_curves.bend_twist`.
+    Measured is the weight at which the Hessian along a branch of planar equilibria ceases to be
+    positive definite. An exactly planar rod stays planar. The master curve is
+    `master_curves.bend_twist`.
     """
 
     name, x_name, y_name = "bend-twist", "phi", "Gamma"
@@ -138,16 +155,22 @@ class BendTwist(RodProtocol):
     tolerance: float = 1e-4
 
     def measure(self, phi: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        boundary = extrapolated(lambda elements: upper_boundary(phi, at["poisson"], elements), self.elements)
+        boundary = extrapolated(
+            lambda elements: upper_boundary(phi, at["poisson"], elements), self.elements
+        )
         return boundary, float(master_curves.bend_twist(phi, at["poisson"]))
 
 
 def upper_boundary(phi: float, poisson: float, elements: int) -> float:
-    """Return the weight at which the planar chain, followed from large weights downwards, loses stability, or NaN."""
+    """Return the weight at which the planar chain, followed from large weights downwards, loses
+    stability, or NaN.
+    """
     relax = round_rod(phi, poisson)
     start = relax(phi**3, planar_frames(np.zeros(elements + 1)))
     if not start.stable:
-        raise RuntimeError(f"bend-twist: the heavy rod of phi = {phi} is not stable on {elements} elements")
+        raise RuntimeError(
+            f"bend-twist: the heavy rod of phi = {phi} is not stable on {elements} elements"
+        )
     steps = np.arange(1, np.ceil(np.log(DOWN_TO) / np.log(DOWN)))
     return loss_of_stability(relax, start, phi**3 * DOWN**steps)
 
@@ -182,7 +205,8 @@ def drop_over_reach(gamma: float, elements: int) -> float:
     return float(-z / np.hypot(x, y))
 
 
-# Bending stiffness in the strip's plane over that across it; the buckling weight is a power series in its inverse.
+# Bending stiffness in the strip's plane over that across it; the buckling weight is a power series
+# in its inverse.
 STIFFNESS_RATIOS = (1000.0, 2000.0, 4000.0)
 
 # The weight over sqrt(EI GJ) grows from half of what buckles a strip, in these steps.
@@ -193,10 +217,12 @@ UP_TO = 60.0
 
 @dataclass(kw_only=True, eq=False)
 class RodLateralBuckling(RodProtocol):
-    """The weight at which a strip clamped edge-on buckles sideways, against `master_curves.lateral_buckling_rod`.
+    """The weight at which a strip clamped edge-on buckles sideways, against
+    `master_curves.lateral_buckling_rod`.
 
-    Measured is the loss of a positive definite Hessian as the weight of a strip grows that stays in its vertical plane.
-    The limit of a strip that does not bend in its own plane is reached by extrapolation.
+    Measured is the loss of a positive definite Hessian as the weight of a strip grows that stays in
+    its vertical plane. The limit of a strip that does not bend in its own plane is reached by
+    extrapolation.
     """
 
     name, x_name, y_name = "rod-lateral-buckling", "poisson", "rho A g L^3 / sqrt(EI GJ)"
@@ -208,13 +234,16 @@ class RodLateralBuckling(RodProtocol):
 
     def measure(self, poisson: float, at: Mapping[str, Any]) -> tuple[float, float]:
         single, double, fourfold = (
-            extrapolated(partial(buckling_weight, poisson, ratio), self.elements) for ratio in STIFFNESS_RATIOS
+            extrapolated(partial(buckling_weight, poisson, ratio), self.elements)
+            for ratio in STIFFNESS_RATIOS
         )
         return (8.0 * fourfold - 6.0 * double + single) / 3.0, master_curves.lateral_buckling_rod()
 
 
 def buckling_weight(poisson: float, stiffness_ratio: float, elements: int) -> float:
-    """Return rho A g L^3 / sqrt(EI GJ) at which the chain of a strip loses stability, NaN if it never does."""
+    """Return rho A g L^3 / sqrt(EI GJ) at which the chain of a strip loses stability, NaN if it
+    never does.
+    """
     # A thin strip: EI = Y w t^3 / 12 across its plane, GJ = Y w t^3 / (6 (1 + poisson)).
     twist = 2.0 / (1.0 + poisson)
     stiffness = np.array([twist, 1.0, stiffness_ratio])  # d3 = -y is the axis it hardly bends about

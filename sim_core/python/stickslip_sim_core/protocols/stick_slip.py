@@ -1,8 +1,10 @@
-"""Stick-Slip: the friction at which the tip of a buckled strip slips on a wall [Sano et al. 2017; Romero et al. 2021].
+"""Stick-Slip: the friction at which the tip of a buckled strip slips on a wall [Sano et al. 2017;
+Romero et al. 2021].
 
-A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (rate t)^2 times its length, so
-that Q/P, which goes with the square root of that strain, grows at an even pace, and the strain at which the tip leaves
-its place is the friction that the solver has, by `master_curves.stick_slip`.
+A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (rate t)^2
+times its length, so that Q/P, which goes with the square root of that strain, grows at an even
+pace, and the strain at which the tip leaves its place is the friction that the solver has, by
+`master_curves.stick_slip`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,11 +25,14 @@ FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
 CELLS_ACROSS = 2
 
 DENSITY, RIGIDITY, STRETCHING = 0.05, 1e-4, 3e4  # kg/m^2, N m, N/m
-RATE = 5e-3  # 1/s: root of the strain; less where the tip slips below this root, so that steps resolve it as well
+# 1/s: root of the strain; less where the tip slips below this root, so that steps resolve it as
+# well
+RATE = 5e-3
 ROOT = 0.25
 DAMPING = 20.0  # 1/s: the bounce of a buckling strip must not tear its tip off
 
-# Of the load, sideways, until the strip has decided for a side: without it a straight strip stays straight.
+# Of the load, sideways, until the strip has decided for a side: without it a straight strip stays
+# straight.
 BIAS = 2e-4
 BIAS_UNTIL = 2e-3  # strain
 
@@ -35,7 +40,9 @@ BIAS_UNTIL = 2e-3  # strain
 FORCE_SHARE = 0.03
 
 MOVED = 2e-4  # of the length: a tip that has come so far has slipped,
-LET_GO = 1e-6  # and it began with the step, the last of its kind, before it moved by more than this.
+LET_GO = (
+    1e-6  # and it began with the step, the last of its kind, before it moved by more than this.
+)
 
 # Strains of the phase diagram, and frictions beyond the triple point.
 PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))
@@ -54,7 +61,8 @@ class Press:
     """Strain at which more than the tip's vertices first touched the wall, or NaN."""
 
     static_error: float
-    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range; NaN if there is none."""
+    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range; NaN if there is none.
+    """
 
     cloth: Cloth
 
@@ -112,7 +120,9 @@ class StickSlip(RefinedProtocol):
         }
 
 
-def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, rate: float) -> Press:
+def press(
+    clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, rate: float
+) -> Press:
     """Press a strip against a wall of friction `mu` until its tip slips, or to `strain_end`.
 
     The root of the strain grows by `rate` [1/s].
@@ -128,7 +138,9 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, 
         force_scale=FORCE_SHARE * buckling / len(tip),
     )
     # The wall is the floor, the clamp above it.
-    upright = np.stack([np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1)
+    upright = np.stack(
+        [np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1
+    )
     cloth.set_state(upright)
     wall, clamp = [plane(mu)], upright[held]
     mass = float(cloth.masses.sum())
@@ -142,7 +154,9 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, 
         cloth.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
         force = cloth.reactions[tip].sum(axis=0)
         moved = abs(cloth.positions[tip, 0].mean()) / LENGTH
-        history.append((strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved)))
+        history.append(
+            (strain, float(np.hypot(force[0], force[1]) / max(force[2], 1e-15)), float(moved))
+        )
         touching = np.flatnonzero(cloth.contacts >= 0)
         if np.isnan(extended) and not np.isin(touching, tip).all():
             extended = strain
@@ -152,7 +166,9 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, 
     if not moved_at[-1] <= MOVED:
         stuck = np.flatnonzero(np.abs(np.diff(moved_at, prepend=0.0)) <= LET_GO)
         last = int(stuck[-1]) if len(stuck) else 0
-        slip = (rate * (last + 1.5) * dt) ** 2  # in the middle of the step in which it began to move
+        slip = (
+            rate * (last + 1.5) * dt
+        ) ** 2  # in the middle of the step in which it began to move
         strain_at, ratio = strain_at[:last], ratio[:last]
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
@@ -163,7 +179,10 @@ def press(clamped: Strip, mu: float, preset: SolverSettings, strain_end: float, 
 
 
 def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:
-    """Return (mu, strain, what the strip does there); a tip that has slipped once is called slipping from then on."""
+    """Return (mu, strain, what the strip does there).
+
+    A tip that has slipped once is called slipping from then on.
+    """
     points = []
     for strain in PHASE_STRAIN:
         if strain <= end or np.isfinite(one.slip):

@@ -1,23 +1,28 @@
-"""Lateral buckling of a plate strip under its own weight: plane stress, then Kirchhoff's plate, by Ritz's method.
+"""Lateral buckling of a plate strip under its own weight: plane stress, then Kirchhoff's plate, by
+Ritz's method.
 
 The strip fills 0 <= x <= 1, |y| <= w / 2 (lengths in units of L), is clamped along x = 0 and pulled along -y, in its
 own plane, by its weight. Thickness h and Young's modulus Y enter the stiffnesses only, of which the answer is free:
 
-1. Plane stress. Displacements (u, v) with u = v = 0 at the clamp minimise 1/2 int N : eps - int (rho_A g) (-v), where
-   N = Y h / (1 - nu^2) [(1 - nu) eps + nu tr(eps) I]. Every other edge is free. The membrane forces N are statically
-   determined up to the clamp: in units of rho_A g L they depend on w and nu alone.
-2. Kirchhoff's plate. The strip leaves its plane at the least Gamma = rho_A g L^3 / D, D = Y h^3 / (12 (1 - nu^2)), at
-   which with W = dW/dx = 0 at the clamp the second variation
+1. Plane stress. Displacements (u, v) with u = v = 0 at the clamp minimise 1/2 int N : eps - int
+   (rho_A g) (-v), where N = Y h / (1 - nu^2) [(1 - nu) eps + nu tr(eps) I]. Every other edge is
+   free. The membrane forces N are statically determined up to the clamp: in units of rho_A g L they
+   depend on w and nu alone.
+2. Kirchhoff's plate. The strip leaves its plane at the least Gamma = rho_A g L^3 / D, D = Y h^3 /
+   (12 (1 - nu^2)), at which with W = dW/dx = 0 at the clamp the second variation
 
-       int (lap W)^2 - 2 (1 - nu) (W_xx W_yy - W_xy^2) + Gamma int N_xx W_x^2 + 2 N_xy W_x W_y + N_yy W_y^2
+       int (lap W)^2 - 2 (1 - nu) (W_xx W_yy - W_xy^2) + Gamma int N_xx W_x^2 + 2 N_xy W_x W_y +
+       N_yy W_y^2
 
-   has a zero [Timoshenko and Gere 1961, Sec. 8.2]. The plate is thin, so that nothing turns before it buckles.
+   has a zero [Timoshenko and Gere 1961, Sec. 8.2]. The plate is thin, so that nothing turns before
+   it buckles.
 
-Both fields are products of piecewise polynomials on meshes graded towards the two corners at the clamp, where the
-stresses are singular. A basis whose highest derivative is orthonormal, integrated from zero, keeps the matrices well
-conditioned however small the elements. Turned over, the strip is pulled the other way: u is odd in y and v even, N_xx
-and N_yy are odd and N_xy even, so that N couples even W with odd W only. With stiffnesses A, B of the two and coupling
-C, Gamma is one over the largest singular value of A^{-1/2} C B^{-1/2}. Half the strip, y > 0, is enough.
+Both fields are products of piecewise polynomials on meshes graded towards the two corners at the
+clamp, where the stresses are singular. A basis whose highest derivative is orthonormal, integrated
+from zero, keeps the matrices well conditioned however small the elements. Turned over, the strip is
+pulled the other way: u is odd in y and v even, N_xx and N_yy are odd and N_xy even, so that N
+couples even W with odd W only. With stiffnesses A, B of the two and coupling C, Gamma is one over
+the largest singular value of A^{-1/2} C B^{-1/2}. Half the strip, y > 0, is enough.
 """
 
 from dataclasses import dataclass
@@ -27,7 +32,8 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 
-# Degree of the highest derivatives, W_xx and u_x; elements between the clamp and x = w, and between an edge and y = 0.
+# Degree of the highest derivatives, W_xx and u_x; elements between the clamp and x = w, and between
+# an edge and y = 0.
 DEGREE = 4
 LAYERS = 4
 
@@ -51,11 +57,15 @@ class _Axis:
         return int(self.values[0].shape[1])
 
 
-def buckling_weight(aspect: float, poisson: float, *, degree: int = DEGREE, layers: int = LAYERS) -> float:
+def buckling_weight(
+    aspect: float, poisson: float, *, degree: int = DEGREE, layers: int = LAYERS
+) -> float:
     """Return Gamma = rho_A g L^3 / D at which a strip of width aspect * L buckles."""
     x, y = _breaks_along(aspect, layers), _breaks_across(aspect, layers)
     N_xx, N_yy, N_xy = _membrane_forces(x, y, poisson, degree)
-    along, even, odd = (_functions(breaks, degree, 2, start) for breaks, start in ((x, None), (y, 0), (y, 1)))
+    along, even, odd = (
+        _functions(breaks, degree, 2, start) for breaks, start in ((x, None), (y, 0), (y, 1))
+    )
     stiff_even, stiff_odd = (_bending_stiffness(along, across, poisson) for across in (even, odd))
     weights = np.outer(along.weights, even.weights)
     coupling = sum(
@@ -86,15 +96,17 @@ def _breaks_across(aspect: float, layers: int) -> Floats:
 
 
 def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _Axis:
-    """Return the functions whose derivative of this order is one of Legendre's polynomials on one element, orthonormal.
+    """Return the functions whose derivative of this order is one of Legendre's polynomials on one
+    element, orthonormal.
 
-    They and their lower derivatives are zero at the first breakpoint. `start` adds the power of the coordinate that
-    makes them complete among even (0) or odd (1) functions.
+    They and their lower derivatives are zero at the first breakpoint. `start` adds the power of the
+    coordinate that makes them complete among even (0) or odd (1) functions.
     """
     count = (3 * (degree + 2) + 1) // 2  # points of a rule that is exact for three factors
     nodes, weights = np.polynomial.legendre.leggauss(count)
     half = np.diff(breaks) / 2.0
-    # From the left end of an element of length 2: Legendre's polynomials and their repeated integrals.
+    # From the left end of an element of length 2: Legendre's polynomials and their repeated
+    # integrals.
     local = [np.eye(degree + 1)]
     for _ in range(order):
         local.append(np.stack([np.polynomial.legendre.legint(c, lbnd=-1.0) for c in local[-1]]))
@@ -107,10 +119,17 @@ def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _A
         for k in range(order + 1):  # k integrals: derivative order - k
             scale = norm * half[e] ** k
             rows = slice(e * count, (e + 1) * count)
-            values[order - k][rows, columns] = np.polynomial.legendre.legval(nodes, local[k].T).T * scale
+            values[order - k][rows, columns] = (
+                np.polynomial.legendre.legval(nodes, local[k].T).T * scale
+            )
             at_end[k] = np.polynomial.legendre.legval(1.0, local[k].T) * scale
-        at_end[0] = 0.0  # beyond its element the highest derivative is zero, and Taylor's polynomial goes on
-        beyond = (breaks[e + 1 : -1, None] + half[e + 1 :, None] * (nodes + 1.0)).ravel() - breaks[e + 1]
+        at_end[0] = (
+            # beyond its element the highest derivative is zero, and Taylor's polynomial goes on
+            0.0
+        )
+        beyond = (breaks[e + 1 : -1, None] + half[e + 1 :, None] * (nodes + 1.0)).ravel() - breaks[
+            e + 1
+        ]
         for k in range(1, order + 1):
             taylor = sum(np.outer(beyond**j / factorial(j), at_end[k - j]) for j in range(k))
             values[order - k][(e + 1) * count :, columns] = taylor
@@ -122,9 +141,16 @@ def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _A
 
 
 def _integral(
-    along: _Axis, orders_along: tuple[int, int], one: _Axis, orders_across: tuple[int, int], two: _Axis, weight: Floats
+    along: _Axis,
+    orders_along: tuple[int, int],
+    one: _Axis,
+    orders_across: tuple[int, int],
+    two: _Axis,
+    weight: Floats,
 ) -> Floats:
-    """Integrate weight(x, y) times derivatives of the products along * one times derivatives of those along * two."""
+    """Integrate weight(x, y) times derivatives of the products along * one times derivatives of
+    those along * two.
+    """
     (a, b), (c, d) = orders_along, orders_across
     pairs = np.einsum("yk,yl->ykl", one.values[c], two.values[d])
     right = np.tensordot(weight, pairs, axes=1)
@@ -133,7 +159,11 @@ def _integral(
 
 
 def _product(
-    along: _Axis, orders_along: tuple[int, int], one: _Axis, orders_across: tuple[int, int], two: _Axis
+    along: _Axis,
+    orders_along: tuple[int, int],
+    one: _Axis,
+    orders_across: tuple[int, int],
+    two: _Axis,
 ) -> Floats:
     """The same with a weight of one."""
     (a, b), (c, d) = orders_along, orders_across
@@ -142,16 +172,26 @@ def _product(
     return np.asarray(np.kron(first, second))
 
 
-def _membrane_forces(x: Floats, y: Floats, poisson: float, degree: int) -> tuple[Floats, Floats, Floats]:
+def _membrane_forces(
+    x: Floats, y: Floats, poisson: float, degree: int
+) -> tuple[Floats, Floats, Floats]:
     """Return N_xx, N_yy, N_xy over rho_A g L at the Gauss points, shape (points in x, points in y).
 
     In units of Y h / (1 - nu^2) = 1.
     """
     shear = (1.0 - poisson) / 2.0
-    along, even, odd = (_functions(breaks, degree, 1, start) for breaks, start in ((x, None), (y, 0), (y, None)))
-    uu = _product(along, (1, 1), odd, (0, 0), odd) + shear * _product(along, (0, 0), odd, (1, 1), odd)
-    vv = _product(along, (0, 0), even, (1, 1), even) + shear * _product(along, (1, 1), even, (0, 0), even)
-    uv = poisson * _product(along, (1, 0), odd, (0, 1), even) + shear * _product(along, (0, 1), odd, (1, 0), even)
+    along, even, odd = (
+        _functions(breaks, degree, 1, start) for breaks, start in ((x, None), (y, 0), (y, None))
+    )
+    uu = _product(along, (1, 1), odd, (0, 0), odd) + shear * _product(
+        along, (0, 0), odd, (1, 1), odd
+    )
+    vv = _product(along, (0, 0), even, (1, 1), even) + shear * _product(
+        along, (1, 1), even, (0, 0), even
+    )
+    uv = poisson * _product(along, (1, 0), odd, (0, 1), even) + shear * _product(
+        along, (0, 1), odd, (1, 0), even
+    )
     weight = -np.kron(along.weights @ along.values[0], even.weights @ even.values[0])
     stiffness = np.block([[uu, uv], [uv.T, vv]])
     found = np.linalg.solve(stiffness, np.concatenate([np.zeros(len(uu)), weight]))

@@ -1,8 +1,10 @@
-"""Fits of a hanging rod to a measured centreline: three parameters, or natural curvature along the rod.
+"""Fits of a hanging rod to a measured centreline: three parameters, or natural curvature along the
+rod.
 
-Both move the natural rod until the *hung* rod, as the forward solver finds it, meets the centreline. The model is exact
-in its derivatives: two chains whose nodes include the P points, extrapolated (4 r_h - r_2h) / 3 with an error O(h^4),
-each differentiated through its equilibrium (rods/chain.hpp).
+Both move the natural rod until the *hung* rod, as the forward solver finds it, meets the
+centreline. The model is exact in its derivatives: two chains whose nodes include the P points,
+extrapolated (4 r_h - r_2h) / 3 with an error O(h^4), each differentiated through its equilibrium
+(rods/chain.hpp).
 """
 
 from dataclasses import dataclass
@@ -45,13 +47,17 @@ STEP_TOLERANCE = 1e-7
 """A minimisation ends when a step moves the centreline by less than this [L, root mean square]."""
 
 PATH_TOLERANCE = 1e-5
-"""The same on the way through the weights of smoothness; what is chosen is then brought to STEP_TOLERANCE."""
+"""The same on the way through the weights of smoothness; what is chosen is then brought to
+STEP_TOLERANCE.
+"""
 
 PENALTY_DECADES = np.arange(4.0, -8.5, -0.5)
 """Decadic logarithms of the weights tried, relative to trace(J^T J) / trace(D^T D)."""
 
 DEGREES_FACTOR = 1.4
-"""Each degree of freedom counts 1.4 times in cross validation, which then seldom undersmooths [Kim and Gu 2004]."""
+"""Each degree of freedom counts 1.4 times in cross validation, which then seldom undersmooths [Kim
+and Gu 2004].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,9 @@ class ParameterFit:
     """Natural bend about d3 times L [rad]."""
 
     standard_error: Floats
-    """Of gamma, phi0, phi1, shape (3,), for white noise as large as the residual; 0 for a given gamma."""
+    """Of gamma, phi0, phi1, shape (3,), for white noise as large as the residual; 0 for a given
+    gamma.
+    """
 
     residual: float
     """Root mean square distance per coordinate between the hung rod and the centreline [L]."""
@@ -79,7 +87,9 @@ class ParameterFit:
 
 @dataclass(frozen=True, eq=False)
 class NaturalFit:
-    """The rod of smoothest natural curvature that hangs along a centreline as nearly as its noise warrants."""
+    """The rod of smoothest natural curvature that hangs along a centreline as nearly as its noise
+    warrants.
+    """
 
     natural_curvature: Floats
     """(twist, bend about d2, bend about d3) at the P points [1/L], shape (P, 3)."""
@@ -106,19 +116,19 @@ class NaturalFit:
 def fit_parameters(
     centerline: ArrayLike, *, gamma: float | None = None, stiffness: ArrayLike = STIFFNESS
 ) -> ParameterFit:
-    """Fit (gamma, phi0, phi1) to a centreline, by Levenberg's and Marquardt's method from several starts.
+    """Fit (gamma, phi0, phi1) to a centreline, by Levenberg's and Marquardt's method from several
+    starts.
 
-    The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may leave the ranges.
+    The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may
+    leave the ranges.
 
-    Args:
-        centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc length, z up, shape
-            (P, 3), P >= 8.
-        gamma: Weight against bending if it is known; None: fitted.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
+    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
+        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
+        fitted. stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
-        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
+        equilibrium.
     """
     data = _centerline(centerline)
     model = _Model.of(len(data), stiffness, intervals=None)
@@ -127,16 +137,27 @@ def fit_parameters(
     used = np.array([gamma is None, True, True])
     variance = (state.residual(data) ** 2).sum() / (data.size - 3 - used.sum())
     error = np.zeros(3)
-    error[used] = np.sqrt(variance * np.diag(np.linalg.pinv(jacobian[:, used].T @ jacobian[:, used])))
+    error[used] = np.sqrt(
+        variance * np.diag(np.linalg.pinv(jacobian[:, used].T @ jacobian[:, used]))
+    )
     error[0] *= state.gamma  # from its logarithm's
     phi0, _, phi1 = state.coefficients[0]
     return ParameterFit(
-        state.gamma, float(phi0), float(phi1), error, _rms(state.residual(data)), model.solution(state, len(data))
+        state.gamma,
+        float(phi0),
+        float(phi1),
+        error,
+        _rms(state.residual(data)),
+        model.solution(state, len(data)),
     )
 
 
 def fit_natural_curvature(
-    centerline: ArrayLike, *, gamma: float | None = None, noise: float | None = None, stiffness: ArrayLike = STIFFNESS
+    centerline: ArrayLike,
+    *,
+    gamma: float | None = None,
+    noise: float | None = None,
+    stiffness: ArrayLike = STIFFNESS,
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 
@@ -146,21 +167,19 @@ def fit_natural_curvature(
     cross validation is kept [Golub, Heath and Wahba 1979], or, with `noise`, the first that brings the residual down to
     it, but for one standard deviation of its chi-square [Morozov 1966].
 
-    A centreline does not tell how the frame turns about it: of all that hang along it the smoothest natural curvature
-    is returned. What two such rods share, the natural shape, does not depend on that choice for a rod that bends
-    equally about d2 and d3.
+    A centreline does not tell how the frame turns about it: of all that hang along it the smoothest
+    natural curvature is returned. What two such rods share, the natural shape, does not depend on
+    that choice for a rod that bends equally about d2 and d3.
 
-    Args:
-        centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc length, z up, shape
-            (P, 3), P >= 8.
-        gamma: Weight against bending if it is known; None: fitted.
-        noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it is known. Give it when the
-            noise is correlated along the rod: cross validation takes it for white.
-        stiffness: As for `fit_parameters`.
+    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
+        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
+        fitted. noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it
+        is known. Give it when the noise is correlated along the rod: cross validation takes it for
+        white. stiffness: As for `fit_parameters`.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
-        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
+        equilibrium.
     """
     data = _centerline(centerline)
     if noise is not None and not noise > 0:
@@ -184,14 +203,20 @@ def fit_natural_curvature(
         state = _minimise(model, state, data, free, weighted, PATH_TOLERANCE)
         jacobian = model.jacobian(state)[:, free]
         normal = jacobian.T @ jacobian
-        used = float(np.trace(np.linalg.solve(normal + weighted[np.ix_(free, free)] + _ridge(normal), normal)))
+        used = float(
+            np.trace(
+                np.linalg.solve(normal + weighted[np.ix_(free, free)] + _ridge(normal), normal)
+            )
+        )
         misfit = float((state.residual(data) ** 2).sum())
         left = data.size - 3 - DEGREES_FACTOR * used
         if left <= 0:
             break
         score = misfit / left**2
         degrees_left = data.size - 3 - used
-        quiet = noise is not None and misfit <= noise**2 * (degrees_left + np.sqrt(2.0 * degrees_left))
+        quiet = noise is not None and misfit <= noise**2 * (
+            degrees_left + np.sqrt(2.0 * degrees_left)
+        )
         if quiet or best is None or score < best[0]:
             best = (score, state, used, float(decade))
         if quiet or score > 1.5 * best[0]:
@@ -214,7 +239,9 @@ def fit_natural_curvature(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A hung rod: gamma, spline coefficients (B, 3), frames per chain, extrapolated centreline (P, 3)."""
+    """A hung rod: gamma, spline coefficients (B, 3), frames per chain, extrapolated centreline (P,
+    3).
+    """
 
     gamma: float
     coefficients: Floats
@@ -243,11 +270,15 @@ class _Model:
         for k in strides:
             n = k * (points - 1)
             middles = (np.arange(n) + 0.5) / n
-            bases.append(np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles))
+            bases.append(
+                np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles)
+            )
         K, clamp = rod_stiffness(stiffness, 1)[0], clamp_quaternions(CLAMP_FRAME, 1)[0]
         return _Model(K, clamp, intervals, strides, tuple(bases))
 
-    def relax(self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]) -> _State | None:
+    def relax(
+        self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]
+    ) -> _State | None:
         """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
         hung, curves = [], []
         for k, basis, start in zip(self.strides, self.bases, frames, strict=True):
@@ -268,9 +299,13 @@ class _Model:
         return self.relax(gamma, coefficients, tuple(frames))
 
     def jacobian(self, state: _State) -> Floats:
-        """Derivatives of the centreline by log gamma and the coefficients, component by component: (3 P, 1 + 3 B)."""
+        """Derivatives of the centreline by log gamma and the coefficients, component by component:
+        (3 P, 1 + 3 B).
+        """
         parts = [
-            _sim_core.chain_jacobian(state.gamma, self.stiffness, basis @ state.coefficients, q, basis, k)
+            _sim_core.chain_jacobian(
+                state.gamma, self.stiffness, basis @ state.coefficients, q, basis, k
+            )
             for k, basis, q in zip(self.strides, self.bases, state.frames, strict=True)
         ]
         jacobian = (4.0 * parts[1] - parts[0]) / 3.0
@@ -303,7 +338,12 @@ class _Model:
 
 
 def _minimise(
-    model: _Model, state: _State, data: Floats, free: NDArray[np.int64], penalty: Floats, tolerance: float
+    model: _Model,
+    state: _State,
+    data: Floats,
+    free: NDArray[np.int64],
+    penalty: Floats,
+    tolerance: float,
 ) -> _State:
     """Minimise |residual|^2 + c^T penalty c over the free ones of (log gamma, coefficients), by damped Gauss-Newton."""
 
@@ -339,11 +379,15 @@ def _minimise(
     return state
 
 
-def _fit_constant(model: _Model, data: Floats, known_gamma: float | None, components: tuple[int, ...]) -> _State:
+def _fit_constant(
+    model: _Model, data: Floats, known_gamma: float | None, components: tuple[int, ...]
+) -> _State:
     """Fit a uniform rod from the nearest rods of the library."""
     if known_gamma is not None and not (np.isfinite(known_gamma) and known_gamma > 0):
         raise ValueError(f"gamma: must be > 0, got {known_gamma}")
-    gammas, natural, centerlines, curvature = _library(len(data), tuple(model.stiffness), known_gamma)
+    gammas, natural, centerlines, curvature = _library(
+        len(data), tuple(model.stiffness), known_gamma
+    )
     distance = np.linalg.norm(centerlines - data, axis=(1, 2))
     free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
     best: _State | None = None
@@ -360,10 +404,13 @@ def _fit_constant(model: _Model, data: Floats, known_gamma: float | None, compon
 
 
 @lru_cache(maxsize=8)
-def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | None) -> tuple[Floats, ...]:
+def _library(
+    points: int, stiffness: tuple[float, ...], known_gamma: float | None
+) -> tuple[Floats, ...]:
     """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known.
 
-    Returns gamma (n,), natural curvature (n, 3), and centreline and curvature (n, P, 3) of the stable ones.
+    Returns gamma (n,), natural curvature (n, 3), and centreline and curvature (n, P, 3) of the
+    stable ones.
     """
     per_axis = 8 if known_gamma is None else 16
     axes = (
@@ -373,7 +420,9 @@ def _library(points: int, stiffness: tuple[float, ...], known_gamma: float | Non
     )
     gamma, phi0, phi1 = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     natural = np.stack([phi0, 0.0 * phi0, phi1], axis=1)
-    rods = solve_general_rods(natural[:, None], gamma, stiffness=stiffness, elements=96, points=points)
+    rods = solve_general_rods(
+        natural[:, None], gamma, stiffness=stiffness, elements=96, points=points
+    )
     good = rods.stable
     return gamma[good], natural[good], rods.centerline[good], rods.curvature[good]
 
@@ -386,12 +435,19 @@ def _centerline(centerline: ArrayLike) -> Floats:
 
 
 def _chain_curvature(quaternions: Floats) -> Floats:
-    """Curvature of a chain at its nodes, shape (N + 1, 3): of its elements, averaged, the end ones repeated."""
+    """Curvature of a chain at its nodes, shape (N + 1, 3): of its elements, averaged, the end ones
+    repeated.
+    """
     p, q = quaternions[:-1], quaternions[1:]
     w = (p * q).sum(axis=1)
     v = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
     sine = np.linalg.norm(v, axis=1)
-    kappa = 2.0 * len(p) * np.where(sine > 1e-8, np.arctan2(sine, w) / np.maximum(sine, 1e-8), 1.0)[:, None] * v
+    kappa = (
+        2.0
+        * len(p)
+        * np.where(sine > 1e-8, np.arctan2(sine, w) / np.maximum(sine, 1e-8), 1.0)[:, None]
+        * v
+    )
     return np.concatenate([kappa[:1], 0.5 * (kappa[1:] + kappa[:-1]), kappa[-1:]])
 
 

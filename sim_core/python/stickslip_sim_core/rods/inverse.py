@@ -27,15 +27,19 @@ class NaturalCurvature:
     """Natural curvature of n rods, or of one: the leading shape (...) is that of the arguments."""
 
     curvature: Floats
-    """Natural curvature kappa_bar(s) = (twist, bend about d2, bend about d3) [1/L], shape (..., P, 3)."""
+    """Natural curvature kappa_bar(s) = (twist, bend about d2, bend about d3) [1/L], shape (..., P,
+    3).
+    """
 
     moment: Floats
-    """Internal moment m(s) in the material frame [EI/L], shape (..., P, 3); zero at the free end."""
+    """Internal moment m(s) in the material frame [EI/L], shape (..., P, 3); zero at the free end.
+    """
 
     amplification: Floats
-    """Relative error of kappa_bar per relative error of kappa, both as root mean squares along the rod [-], shape
-    (...): expected for a smooth random error of kappa from which the frames are integrated too. Multiply the error
-    that you believe your curvature has by it. First order: it holds while the product stays below about 1/2."""
+    """Relative error of kappa_bar per relative error of kappa, both as root mean squares along the
+    rod [-], shape (...): expected for a smooth random error of kappa from which the frames are
+    integrated too. Multiply the error that you believe your curvature has by it. First order: it
+    holds while the product stays below about 1/2."""
 
     amplification_max: Floats
     """The same for the smooth error that harms most, shape (...)."""
@@ -51,22 +55,22 @@ def natural_curvature(
 ) -> NaturalCurvature:
     """Compute the unique natural curvature for which a framed curve hangs in equilibrium.
 
-    Eq. 5.1 of the thesis [Bertails-Descoubes et al. 2018, Sec. 4] integrates m' = m x kappa - gamma (1 - s) e_x x g
-    from m(1) = 0 and takes kappa_bar = kappa - K^{-1} m. In the world the moment M = R m needs a quadrature only,
-    M(s) = gamma (int_s^1 (1 - u) t(u) du) x e_g, e_g along gravity. It is done interval by interval with t, t' and t''
-    (error (kappa h)^6 / 100800 of the integrand).
+    Eq. 5.1 of the thesis [Bertails-Descoubes et al. 2018, Sec. 4] integrates m' = m x kappa - gamma
+    (1 - s) e_x x g from m(1) = 0 and takes kappa_bar = kappa - K^{-1} m. In the world the moment M
+    = R m needs a quadrature only, M(s) = gamma (int_s^1 (1 - u) t(u) du) x e_g, e_g along gravity.
+    It is done interval by interval with t, t' and t'' (error (kappa h)^6 / 100800 of the
+    integrand).
 
-    Args:
-        curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4 points of uniform arc
-            length, clamp and free end included, shape (..., P, 3).
-        frame: Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (..., P, 3, 3). None:
-            integrated from `clamp_frame` by R' = R [kappa]x, with the error of the curvature in them.
-        gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3).
-        clamp_frame: R(0), used without `frame` only, shape (3, 3) or (..., 3, 3).
+    Args: curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4
+        points of uniform arc length, clamp and free end included, shape (..., P, 3). frame:
+        Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (..., P, 3,
+        3). None: integrated from `clamp_frame` by R' = R [kappa]x, with the error of the curvature
+        in them. gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0. stiffness:
+        K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3). clamp_frame: R(0), used without
+        `frame` only, shape (3, 3) or (..., 3, 3).
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     shape = np.shape(curvature)
     if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 4:
@@ -75,7 +79,9 @@ def natural_curvature(
     n = int(np.prod(leading))
     kappa = finite_array("curvature", np.reshape(curvature, (n, points, 3)), (n, points, 3))
     if np.shape(gamma) != leading:
-        raise ValueError(f"gamma: must have the leading shape of curvature {leading}, got shape {np.shape(gamma)}")
+        raise ValueError(
+            f"gamma: must have the leading shape of curvature {leading}, got shape {np.shape(gamma)}"
+        )
     weight = finite_array("gamma", np.reshape(gamma, n), (n,))
     if (weight < 0).any():
         raise ValueError(f"gamma: must be >= 0, got {weight.min()}")
@@ -92,14 +98,19 @@ def natural_curvature(
     natural = kappa - moment / K[:, None, :]
     mean, largest = _amplification(kappa, R, world, natural, weight, K)
     return NaturalCurvature(
-        natural.reshape(shape), moment.reshape(shape), mean.reshape(leading), largest.reshape(leading)
+        natural.reshape(shape),
+        moment.reshape(shape),
+        mean.reshape(leading),
+        largest.reshape(leading),
     )
 
 
 def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) -> Floats:
-    """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on, for kappa (n, P, 3) [1/L].
+    """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on, for kappa (n, P, 3)
+    [1/L].
 
-    Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles and Norsett 1999].
+    Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles
+    and Norsett 1999].
     """
     n, points, _ = curvature.shape
     steps = 2 * (points - 1)
@@ -112,7 +123,10 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
     theta = 0.5 * h * (a + b) + np.sqrt(3.0) / 12.0 * h**2 * np.cross(a, b)
     clamps = clamp_quaternions(clamp_frame, n)
     # A chain of these turns: its curvature is that of the turn of each element.
-    frames = [_sim_core.chain_frames(rod / h, clamp)[::2] for rod, clamp in zip(theta, clamps, strict=True)]
+    frames = [
+        _sim_core.chain_frames(rod / h, clamp)[::2]
+        for rod, clamp in zip(theta, clamps, strict=True)
+    ]
     from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
 
     quaternions = np.roll(np.reshape(frames, (-1, 4)), -1, axis=1)
@@ -120,7 +134,10 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
 
 
 def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
-    """Return a field of shape (..., 3[, 3]) with its leading shape as one; a field for all rods as it is."""
+    """Return a field of shape (..., 3[, 3]) with its leading shape as one.
+
+    A field for all rods as it is.
+    """
     array = np.asarray(field)
     tail = (3,) * rank
     return array.reshape(-1, *tail) if array.shape == (*leading, *tail) else array
@@ -142,7 +159,9 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
     f, df, ddf = left * t, left * dt - t, left * ddt - 2.0 * dt
     h = 1.0 / (points - 1)
     parts = (
-        h / 2 * (f[:, :-1] + f[:, 1:]) + h**2 / 10 * (df[:, :-1] - df[:, 1:]) + h**3 / 120 * (ddf[:, :-1] + ddf[:, 1:])
+        h / 2 * (f[:, :-1] + f[:, 1:])
+        + h**2 / 10 * (df[:, :-1] - df[:, 1:])
+        + h**3 / 120 * (ddf[:, :-1] + ddf[:, 1:])
     )
     sums = np.zeros_like(f)
     sums[:, :-1] = np.cumsum(parts[:, ::-1], axis=1)[:, ::-1]
@@ -152,14 +171,17 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
 def _amplification(
     kappa: Floats, R: Floats, world: Floats, natural: Floats, gamma: Floats, K: Floats
 ) -> tuple[Floats, Floats]:
-    """Expected and largest relative error of kappa_bar per relative smooth error of kappa, shapes (n,).
+    """Expected and largest relative error of kappa_bar per relative smooth error of kappa, shapes
+    (n,).
 
-    An error dk of kappa turns frames by dw = int_0^s R dk (world axes), so that dt = dw x t, dM = gamma int_s^1
-    (1 - u) dt x e_g and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).
+    An error dk of kappa turns frames by dw = int_0^s R dk (world axes), so that dt = dw x t, dM =
+    gamma int_s^1 (1 - u) dt x e_g and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).
     """
     points = kappa.shape[1]
     s = np.linspace(0.0, 1.0, points)
-    modes = np.polynomial.legendre.legvander(2 * s - 1, ERROR_MODES - 1) * np.sqrt(2 * np.arange(ERROR_MODES) + 1)
+    modes = np.polynomial.legendre.legvander(2 * s - 1, ERROR_MODES - 1) * np.sqrt(
+        2 * np.arange(ERROR_MODES) + 1
+    )
     weights = np.full(points, 1.0 / (points - 1))
     weights[[0, -1]] *= 0.5
     squares = np.empty((len(kappa), 3 * ERROR_MODES, 3 * ERROR_MODES))
@@ -175,7 +197,11 @@ def _amplification(
     size, natural_size = (np.sqrt(np.einsum("p,npi->n", weights, f**2)) for f in (kappa, natural))
     relative = size / np.maximum(natural_size, 1e-300)
     mean = np.sqrt(np.trace(squares, axis1=1, axis2=2) / (3 * ERROR_MODES))
-    largest = np.sqrt(np.maximum(np.linalg.eigvalsh(squares)[:, -1], 0.0)) if len(squares) else np.empty(0)
+    largest = (
+        np.sqrt(np.maximum(np.linalg.eigvalsh(squares)[:, -1], 0.0))
+        if len(squares)
+        else np.empty(0)
+    )
     return relative * mean, relative * largest
 
 

@@ -17,9 +17,11 @@ from stickslip_sim_core.rods.solve import (
 
 
 def reach(centerline: ArrayLike) -> Floats:
-    """Return the largest distance of each rod from the vertical through its clamp, z being up: (n,) [L].
+    """Return the largest distance of each rod from the vertical through its clamp, z being up: (n,)
+    [L].
 
-    `centerline` has positions (n, points, 3) [L] from the clamp on; where it is NaN, so is the distance.
+    `centerline` has positions (n, points, 3) [L] from the clamp on; where it is NaN, so is the
+    distance.
     """
     r = _centerlines(centerline)
     return np.asarray(np.linalg.norm(r[..., :2] - r[:, :1, :2], axis=2).max(axis=1))
@@ -28,12 +30,14 @@ def reach(centerline: ArrayLike) -> Floats:
 def self_contact_distance(centerline: ArrayLike) -> Floats:
     """Return the least distance of each centreline from another part of itself.
 
-    Neighbouring parts are always close; what counts is a local minimum of the distance between two points of the
-    centreline, each free to slide along it: the doubly critical distance of the theory of ideal knots [Gonzalez and
-    Maddocks 1999], ends included. A rod of radius r touches itself where it is below 2 r.
+    Neighbouring parts are always close; what counts is a local minimum of the distance between two
+    points of the centreline, each free to slide along it: the doubly critical distance of the
+    theory of ideal knots [Gonzalez and Maddocks 1999], ends included. A rod of radius r touches
+    itself where it is below 2 r.
 
-    `centerline` has positions (n, points, 3) [L], joined by straight segments. The distance (n,) [L] is infinite where
-    it has no such minimum, as on a straight rod, and NaN where the centreline is.
+    `centerline` has positions (n, points, 3) [L], joined by straight segments. The distance (n,)
+    [L] is infinite where it has no such minimum, as on a straight rod, and NaN where the centreline
+    is.
     """
     r = _centerlines(centerline)
     return np.array([_self_contact_distance(rod) for rod in r]).reshape(len(r))
@@ -54,10 +58,16 @@ def _self_contact_distance(r: Floats) -> float:
     p = len(r)
     squared = (r**2).sum(axis=1)
     distance2 = squared[:, None] + squared - 2.0 * (r @ r.T)
-    # No point is farther from another than from those around it: local minima over the eight neighbours.
+    # No point is farther from another than from those around it: local minima over the eight
+    # neighbours.
     padded = np.full((p + 2, p + 2), np.inf)
     padded[1:-1, 1:-1] = distance2
-    around = [padded[1 + i : p + 1 + i, 1 + j : p + 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    around = [
+        padded[1 + i : p + 1 + i, 1 + j : p + 1 + j]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        if (i, j) != (0, 0)
+    ]
     minimal = distance2 <= np.minimum.reduce(around)
     first, second = np.nonzero(np.triu(minimal, k=2))
     if first.size == 0:
@@ -66,7 +76,11 @@ def _self_contact_distance(r: Floats) -> float:
     a, b = (np.stack([np.clip(x - 1, 0, p - 2), np.clip(x, 0, p - 2)]) for x in (first, second))
     i, j = (x.ravel() for x in np.broadcast_arrays(a[:, None], b[None, :]))
     apart = j - i >= 2
-    return float(_segment_distance(r[i[apart]], r[i[apart] + 1], r[j[apart]], r[j[apart] + 1]).min(initial=np.inf))
+    return float(
+        _segment_distance(r[i[apart]], r[i[apart] + 1], r[j[apart]], r[j[apart] + 1]).min(
+            initial=np.inf
+        )
+    )
 
 
 def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
@@ -75,14 +89,20 @@ def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
     uu, uv, vv, uw, vw = ((x * y).sum(axis=1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     tiny = np.finfo(float).tiny
     determinant = uu * vv - uv**2
-    s = np.where(determinant > 1e-14 * uu * vv, np.clip((uv * vw - vv * uw) / np.maximum(determinant, tiny), 0, 1), 0.0)
+    s = np.where(
+        determinant > 1e-14 * uu * vv,
+        np.clip((uv * vw - vv * uw) / np.maximum(determinant, tiny), 0, 1),
+        0.0,
+    )
     t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
     s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
     return np.asarray(np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1))
 
 
 DISTINCT = 1e-3
-"""Largest centreline distance [L] at which two equilibria count as one: 100 times the solver's error."""
+"""Largest centreline distance [L] at which two equilibria count as one: 100 times the solver's
+error.
+"""
 
 MIRROR = np.array([-1.0, -1.0, 1.0])
 """What the mirror of world y does to (twist, bend about d2, bend about d3)."""
@@ -93,7 +113,9 @@ class OtherMinima:
     """Other stable equilibria of n rods."""
 
     multistable: Bools
-    """A stable equilibrium other than that of `solve_rods` was found, shape (n,). False is no proof that none is."""
+    """A stable equilibrium other than that of `solve_rods` was found, shape (n,). False is no proof
+    that none is.
+    """
 
     energy: Floats
     """Lowest energy of another stable equilibrium [EI/L], shape (n,); NaN where none was found."""
@@ -112,36 +134,46 @@ def other_minima(
     points: int = 150,
     solution: RodSolution | None = None,
 ) -> OtherMinima:
-    """Search for a stable equilibrium other than the one that `solve_rods` reaches from the natural shape.
+    """Search for a stable equilibrium other than the one that `solve_rods` reaches from the natural
+    shape.
 
-    What such rods have is a curl of either hand. Each rod therefore starts again from the mirror image of its
-    equilibrium. Over the thesis's ranges this start found every rod that 28 others did, straight, weakly curled,
-    twisted either way, of two hands, random, or continued in the weight. Equilibria whose centrelines differ by more
-    than 1e-3 L are distinct.
+    What such rods have is a curl of either hand. Each rod therefore starts again from the mirror
+    image of its equilibrium. Over the thesis's ranges this start found every rod that 28 others
+    did, straight, weakly curled, twisted either way, of two hands, random, or continued in the
+    weight. Equilibria whose centrelines differ by more than 1e-3 L are distinct.
 
     Args:
         gamma, phi0, phi1, poisson, elements, points: As for `solve_rods`.
         solution: What `solve_rods` returned for exactly these arguments, to save solving again.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     weight = finite_array("gamma", gamma, (None,))
     n = len(weight)
     twist, bend = finite_array("phi0", phi0, (n,)), finite_array("phi1", phi1, (n,))
     options = {"elements": elements, "points": points}
-    found = solve_rods(weight, twist, bend, poisson=poisson, **options) if solution is None else solution
+    found = (
+        solve_rods(weight, twist, bend, poisson=poisson, **options)
+        if solution is None
+        else solution
+    )
     if found.centerline.shape != (n, points, 3):
-        raise ValueError(f"solution: must be of {n} rods at {points} points, got shape {found.centerline.shape}")
+        raise ValueError(
+            f"solution: must be of {n} rods at {points} points, got shape {found.centerline.shape}"
+        )
 
     natural = np.stack([twist, np.zeros(n), bend], axis=1)[:, None, :]
     stiffness = (1.0 / (1.0 + poisson), 1.0, 1.0)
-    # The curvature of the start is cut to what the coarsest level can hold, and 0 for rods without one.
+    # The curvature of the start is cut to what the coarsest level can hold, and 0 for rods without
+    # one.
     start = np.nan_to_num(found.curvature * MIRROR)
     largest = np.linalg.norm(start, axis=2).max(axis=1, initial=0.0)
     limit = 0.9 * ELEMENT_TURN_MAX * (elements // 4)
     start = start * np.minimum(1.0, limit / np.maximum(largest, 1e-300))[:, None, None]
-    other = solve_general_rods(natural, weight, stiffness=stiffness, start_curvature=start, **options)
+    other = solve_general_rods(
+        natural, weight, stiffness=stiffness, start_curvature=start, **options
+    )
     distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
     distinct = other.stable & ~(distance <= DISTINCT)
     centerline = np.where(distinct[:, None, None], other.centerline, np.nan)

@@ -1,4 +1,6 @@
-"""Equilibria of suspended rods: the family (gamma, phi0, phi1), and rods that vary along their length."""
+"""Equilibria of suspended rods: the family (gamma, phi0, phi1), and rods that vary along their
+length.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,7 +27,9 @@ CLAMP_FRAME = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 CLAMP_FRAME.flags.writeable = False
 
 ELEMENT_TURN_MAX = 2.5
-"""Largest turn of an element of the coarsest level in the shape that the search starts from [rad]; see rods.hpp."""
+"""Largest turn of an element of the coarsest level in the shape that the search starts from [rad];
+see rods.hpp.
+"""
 
 RODS_AT_ONCE = 1024
 """Rods whose fields are on the solver's grid at once: some 15 MB."""
@@ -33,28 +37,35 @@ RODS_AT_ONCE = 1024
 
 @dataclass(frozen=True, eq=False)
 class RodSolution:
-    """Equilibria of n rods at `points` points of uniform arc length s = 0 ... 1 (clamp ... free end, both included).
+    """Equilibria of n rods at `points` points of uniform arc length s = 0 ... 1 (clamp ... free
+    end, both included).
 
-    Lengths are in units of the rod's length L, moments in EI/L. The world has z up, gravity along -z, and the clamp at
-    the origin with d1 = -z (along gravity), d2 = +x, d3 = -y. A rod that did not converge is NaN throughout.
+    Lengths are in units of the rod's length L, moments in EI/L. The world has z up, gravity along
+    -z, and the clamp at the origin with d1 = -z (along gravity), d2 = +x, d3 = -y. A rod that did
+    not converge is NaN throughout.
     """
 
     centerline: Floats
     """Positions r(s) [L], shape (n, points, 3); r' = d1."""
 
     curvature: Floats
-    """Deformed curvature kappa(s) = (twist, bend about d2, bend about d3) [1/L] in the material frame, shape
-    (n, points, 3). The natural curvature is (phi0, 0, phi1)."""
+    """Deformed curvature kappa(s) = (twist, bend about d2, bend about d3) [1/L] in the material
+    frame, shape (n, points, 3). The natural curvature is (phi0, 0, phi1)."""
 
     frame: Floats
-    """Material frames R(s), shape (n, points, 3, 3): `frame[..., :, k]`, column k, is d1 (tangent), d2 or d3 in world
-    axes, so that R takes material components to world components and R' = R [kappa]x."""
+    """Material frames R(s), shape (n, points, 3, 3): `frame[..., :, k]`, column k, is d1 (tangent),
+    d2 or d3 in world axes, so that R takes material components to world components and R' = R
+    [kappa]x."""
 
     energy: Floats
-    """Elastic plus gravitational energy [EI/L], shape (n,); the gravitational part is zero for a rod all at z = 0."""
+    """Elastic plus gravitational energy [EI/L], shape (n,); the gravitational part is zero for a
+    rod all at z = 0.
+    """
 
     stable: Bools
-    """Converged, and the Hessian on the finest level is positive definite, shape (n,): a strict local minimum."""
+    """Converged, and the Hessian on the finest level is positive definite, shape (n,): a strict
+    local minimum.
+    """
 
     converged: Bools
     """Every level reached equilibrium and the levels agree, shape (n,)."""
@@ -63,39 +74,49 @@ class RodSolution:
     """Evaluations of the Hessian over all levels, shape (n,)."""
 
     residual: Floats
-    """Largest out-of-balance nodal moment on the finest level before the last Newton step [EI/L], shape (n,)."""
+    """Largest out-of-balance nodal moment on the finest level before the last Newton step [EI/L],
+    shape (n,).
+    """
 
     refinement: Floats
-    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,). The error left in `frame` was
-    at most a quarter of it at 128 elements, and 2.3 times it at 48."""
+    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,). The error
+    left in `frame` was at most a quarter of it at 128 elements, and 2.3 times it at 48."""
 
 
 def solve_rods(
-    gamma: ArrayLike, phi0: ArrayLike, phi1: ArrayLike, *, poisson: float = 0.5, elements: int = 128, points: int = 150
+    gamma: ArrayLike,
+    phi0: ArrayLike,
+    phi1: ArrayLike,
+    *,
+    poisson: float = 0.5,
+    elements: int = 128,
+    points: int = 150,
 ) -> RodSolution:
     """Compute the equilibrium that each rod reaches from its natural shape.
 
-    A Kirchhoff rod, inextensible and unshearable with K = diag(C, 1, 1), C = GJ/EI = 1/(1 + poisson) (round section),
-    minimises its energy on a geodesic chain of frames with `elements`/4, /2 and /1 elements; the three levels are
-    extrapolated to the continuous rod [Bertails et al. 2006; Bertails-Descoubes et al. 2018, Sec. 3]. A rod's bits
-    depend on its own three numbers and the settings only, not on the batch.
+    A Kirchhoff rod, inextensible and unshearable with K = diag(C, 1, 1), C = GJ/EI = 1/(1 +
+    poisson) (round section), minimises its energy on a geodesic chain of frames with `elements`/4,
+    /2 and /1 elements; the three levels are extrapolated to the continuous rod [Bertails et al.
+    2006; Bertails-Descoubes et al. 2018, Sec. 3]. A rod's bits depend on its own three numbers and
+    the settings only, not on the batch.
 
-    Args:
-        gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a single rod.
-        phi0: Natural twist times L [rad], shape (n,).
-        phi1: Natural bend about d3 times L [rad], shape (n,).
-        poisson: Poisson's ratio [-], in (-1, 0.5].
-        elements: Elements of the finest level, a multiple of 4. Largest centreline error over gamma 100 ... 1300,
-            phi0 0.2 ... 12, phi1 6 ... 20: see the README.
-        points: Output points per rod, >= 2.
+    Args: gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a
+        single rod. phi0: Natural twist times L [rad], shape (n,). phi1: Natural bend about d3 times
+        L [rad], shape (n,). poisson: Poisson's ratio [-], in (-1, 0.5]. elements: Elements of the
+        finest level, a multiple of 4. Largest centreline error over gamma 100 ... 1300, phi0 0.2
+        ... 12, phi1 6 ... 20: see the README. points: Output points per rod, >= 2.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     fields = {"gamma": gamma, "phi0": phi0, "phi1": phi1}
-    gamma, phi0, phi1 = (finite_array(name, np.atleast_1d(values), (None,)) for name, values in fields.items())
+    gamma, phi0, phi1 = (
+        finite_array(name, np.atleast_1d(values), (None,)) for name, values in fields.items()
+    )
     if not gamma.size == phi0.size == phi1.size:
-        raise ValueError(f"gamma, phi0, phi1: lengths must be equal, got {gamma.size}, {phi0.size}, {phi1.size}")
+        raise ValueError(
+            f"gamma, phi0, phi1: lengths must be equal, got {gamma.size}, {phi0.size}, {phi1.size}"
+        )
     if (gamma < 0).any():
         raise ValueError(f"gamma: must be >= 0, got {gamma.min()}")
     if not -1.0 < poisson <= 0.5:
@@ -109,7 +130,9 @@ def solve_rods(
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
     """Return `values` as contiguous float64 of this shape, None standing for any extent."""
     array = np.asarray(values)
-    if array.ndim != len(shape) or any(b not in (None, a) for a, b in zip(array.shape, shape, strict=True)):
+    if array.ndim != len(shape) or any(
+        b not in (None, a) for a, b in zip(array.shape, shape, strict=True)
+    ):
         asked = ", ".join("any" if extent is None else str(extent) for extent in shape)
         raise ValueError(f"{name}: must have shape ({asked}), got shape {array.shape}")
     if array.dtype.kind not in "fiu":
@@ -142,24 +165,24 @@ def solve_general_rods(
 ) -> RodSolution:
     """Compute the equilibrium that each rod reaches from its natural shape, or from another start.
 
-    As `solve_rods`, for rods that differ along their length: the energy is int 1/2 (kappa - kappa_bar(s))^T K
-    (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds [Bertails-Descoubes et al. 2018, Sec. 3]. Natural curvature is
-    the cubic spline (not-a-knot ends) through its samples; sample it finely enough for that. What the fields of the
-    solution mean, and its units, is the same; the clamp's frame is `clamp_frame`.
+    As `solve_rods`, for rods that differ along their length: the energy is int 1/2 (kappa -
+    kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds [Bertails-Descoubes et al.
+    2018, Sec. 3]. Natural curvature is the cubic spline (not-a-knot ends) through its samples;
+    sample it finely enough for that. What the fields of the solution mean, and its units, is the
+    same; the clamp's frame is `clamp_frame`.
 
-    Args:
-        natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of uniform arc length
-            (clamp ... free end, both included), shape (n, m, 3). m = 1: constant along the rod.
-        gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness EI [-], shape (n,), >= 0.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all rods or (n, 3).
-        clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z up), shape (3, 3) or (n, 3, 3).
-        start_curvature: Curvature of the shape from which the search starts [1/L], shape (n, m', 3); None: the natural
-            curvature. Another start may reach another minimum.
-        elements: Elements of the finest level, a multiple of 4.
-        points: Output points per rod, >= 2.
+    Args: natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of
+        uniform arc length (clamp ... free end, both included), shape (n, m, 3). m = 1: constant
+        along the rod. gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness
+        EI [-], shape (n,), >= 0. stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all
+        rods or (n, 3). clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z
+        up), shape (3, 3) or (n, 3, 3). start_curvature: Curvature of the shape from which the
+        search starts [1/L], shape (n, m', 3); None: the natural curvature. Another start may reach
+        another minimum. elements: Elements of the finest level, a multiple of 4. points: Output
+        points per rod, >= 2.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     natural = finite_array("natural_curvature", natural_curvature, (None, None, 3))
     n = len(natural)
@@ -168,7 +191,9 @@ def solve_general_rods(
         start = finite_array("start_curvature", start_curvature, (n, None, 3))
     for name, field in (("natural_curvature", natural), ("start_curvature", start)):
         if field.shape[1] < 1:
-            raise ValueError(f"{name}: must have at least one sample along the rod, got shape {field.shape}")
+            raise ValueError(
+                f"{name}: must have at least one sample along the rod, got shape {field.shape}"
+            )
     weight = finite_array("gamma", gamma, (n,))
     if (weight < 0).any():
         raise ValueError(f"gamma: must be >= 0, got {weight.min()}")
@@ -209,7 +234,9 @@ def rod_stiffness(stiffness: ArrayLike, n: int) -> Floats:
 def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
     """Return rotations (3, 3) or (n, 3, 3) as unit quaternions (w, x, y, z), shape (n, 4)."""
     R = np.asarray(clamp_frame)
-    R = finite_array("clamp_frame", np.broadcast_to(R, (n, 3, 3)) if R.shape == (3, 3) else R, (n, 3, 3))
+    R = finite_array(
+        "clamp_frame", np.broadcast_to(R, (n, 3, 3)) if R.shape == (3, 3) else R, (n, 3, 3)
+    )
     error = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(initial=0.0)
     if error > 1e-8 or (np.linalg.det(R) < 0).any():
         raise ValueError(
@@ -217,11 +244,17 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
         )
     from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
 
-    return np.ascontiguousarray(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1)) if n else np.empty((0, 4))
+    return (
+        np.ascontiguousarray(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1))
+        if n
+        else np.empty((0, 4))
+    )
 
 
 def bspline_matrix(intervals: int, s: Floats) -> Floats:
-    """Return the cubic B-splines on `intervals` equal intervals at s (p,), shape (p, intervals + 3)."""
+    """Return the cubic B-splines on `intervals` equal intervals at s (p,), shape (p, intervals +
+    3).
+    """
     from scipy.interpolate import BSpline  # here, so that importing the package stays quick
 
     knots = np.arange(-3.0, intervals + 4.0) / intervals
@@ -237,9 +270,11 @@ def _interpolants(samples: int, derivative: int) -> "BSpline":
 
 
 def interpolation_matrix(samples: int, s: Floats, derivative: int = 0) -> Floats:
-    """Return the matrix (p, samples) from values at uniform arc length to the interpolant's values at s (p,).
+    """Return the matrix (p, samples) from values at uniform arc length to the interpolant's values
+    at s (p,).
 
-    Four samples or more: the cubic spline with not-a-knot ends. Three, two, one: the parabola, line, constant.
+    Four samples or more: the cubic spline with not-a-knot ends. Three, two, one: the parabola,
+    line, constant.
     """
     if samples == 1:
         return np.full((len(s), 1), 0.0 if derivative else 1.0)

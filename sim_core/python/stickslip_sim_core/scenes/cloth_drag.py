@@ -1,4 +1,6 @@
-"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged [thesis, 4.2.3]."""
+"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged
+[thesis, 4.2.3].
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -36,11 +38,17 @@ FRAME_RATE = 2.4
 
 
 def travel(time: Floats, distance: Floats) -> Floats:
-    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at `SPEED`."""
+    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at
+    `SPEED`.
+    """
     ramp = SPEED / ACCELERATION
     duration = distance / SPEED + ramp
     t = np.minimum(np.maximum(time, 0.0), duration)
-    late = np.where(t > duration - ramp, distance - 0.5 * ACCELERATION * (duration - t) ** 2, SPEED * (t - 0.5 * ramp))
+    late = np.where(
+        t > duration - ramp,
+        distance - 0.5 * ACCELERATION * (duration - t) ** 2,
+        SPEED * (t - 0.5 * ramp),
+    )
     return np.where(t < ramp, 0.5 * ACCELERATION * t * t, late)
 
 
@@ -50,7 +58,9 @@ def duration_of(distance: float) -> float:
 
 
 def holder_path(time: ArrayLike) -> Floats:
-    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]: ([T,] 2)."""
+    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]:
+    ([T,] 2).
+    """
     legs = np.arange(LEGS)
     since = np.asarray(time, float)[..., None] - np.append(0.0, LEGS * [duration_of(DROP)])
     ways = travel(since - np.append(0.0, legs * duration_of(DRAG)), np.append(DROP, LEGS * [DRAG]))
@@ -72,7 +82,9 @@ def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = N
     flat = np.zeros((len(mesh.rest), 3))
     flat[:, 1] = mesh.rest[:, 0]
     flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
-    return hung(mesh, fabric, flat, held_by_holders(mesh), normal=(1.0, 0.0, 0.0), seed=seed, kernel=kernel)
+    return hung(
+        mesh, fabric, flat, held_by_holders(mesh), normal=(1.0, 0.0, 0.0), seed=seed, kernel=kernel
+    )
 
 
 def scene(
@@ -88,19 +100,17 @@ def scene(
 ) -> Scene:
     """Return the scene of a cloth that is lowered onto a plane and dragged to and fro.
 
-    The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without imperfection would
-    buckle to neither side: gravity is tilted along x by `bias`, a little more on one side of the cloth than on the
-    other, both drawn from `seed`, until the drop ends, and set upright within the second after.
+    The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without
+    imperfection would buckle to neither side: gravity is tilted along x by `bias`, a little more on
+    one side of the cloth than on the other, both drawn from `seed`, until the drop ends, and set
+    upright within the second after.
 
-    Args:
-        material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge.
-        mu: Coefficient of friction between cloth and floor, 0 ... 10.
-        self_friction: Coefficient of friction of the cloth with itself, 0 ... 10; None turns self-contact off.
-        preset: Solver settings, or their name.
-        mesh: Vertices a side of a grid, at least 5; or a mesh of the square of side `SIDE`.
-        frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
-        seed: Of the bias.
-        kernel: Level of the kernels, see `Cloth`.
+    Args: material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge. mu:
+        Coefficient of friction between cloth and floor, 0 ... 10. self_friction: Coefficient of
+        friction of the cloth with itself, 0 ... 10; None turns self-contact off. preset: Solver
+        settings, or their name. mesh: Vertices a side of a grid, at least 5; or a mesh of the
+        square of side `SIDE`. frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
+        seed: Of the bias. kernel: Level of the kernels, see `Cloth`.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -153,16 +163,21 @@ def holder_pose(time: ArrayLike) -> Floats:
 
 
 def _forces(cloth: Cloth, hung: Hung) -> Record:
-    """Return the forces of the floor and of the holders (3,) [N]; before the first step the holders bear the weight."""
+    """Return the forces of the floor and of the holders (3,) [N].
+
+    Before the first step the holders bear the weight.
+    """
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
     holders = cloth.reactions[hung.held].sum(axis=0) if cloth.total.steps else -weight
     return {"contact_force": cloth.contact_force(), "holder_force": holders}
 
 
 def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
-    """Return the labels of a drop: those of the fabric, the bias, and the side of the holders on which the cloth lay.
+    """Return the labels of a drop: those of the fabric, the bias, and the side of the holders on
+    which the cloth lay.
 
-    `landed_side` is the sign of its mean x less that of the holders in the first frame after the drop; 0 without one.
+    `landed_side` is the sign of its mean x less that of the holders in the first frame after the
+    drop; 0 without one.
     """
     frame = int(np.ceil(duration_of(DROP) * FRAME_RATE))
     landed = 0

@@ -22,16 +22,21 @@ UPRIGHT = 1.0
 
 
 def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
-    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with arrays for files.
+    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with arrays
+    for files.
 
-    Its run records, besides what all scenes record, sheets, holders and bodies being in the order of their names:
+    Its run records, besides what all scenes record, sheets, holders and bodies being in the order
+    of their names:
 
-    - `SHEET.positions`, `SHEET.rest`, `SHEET.triangles`, and `SHEET.contact` (frame, vertex): 0 open, 1 stick, 2 slip
-    - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, of each body and then of each sheet
-    - `holder_force` (frame, holder, 3) [N], `holder_pose` (frame, holder, 3, 4), `grasped` (frame, holder), and
-      `holder_box` (holder, 3) [m], where there are holders
+    - `SHEET.positions`, `SHEET.rest`, `SHEET.triangles`, and `SHEET.contact` (frame, vertex): 0
+      open, 1 stick, 2 slip
+    - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, of each body and then of each
+      sheet
+    - `holder_force` (frame, holder, 3) [N], `holder_pose` (frame, holder, 3, 4), `grasped` (frame,
+      holder), and `holder_box` (holder, 3) [m], where there are holders
     - `body_pose` (frame, body, 3, 4), where there are bodies: x -> A x + b from its own axes
-    - `BODY.rest`, `BODY.triangles`, and `BODY.vertices` (frame, vertex, 3) [m] if it deforms, of bodies of triangles
+    - `BODY.rest`, `BODY.triangles`, and `BODY.vertices` (frame, vertex, 3) [m] if it deforms, of
+      bodies of triangles
 
     `seed` is of what breaks its symmetry; on `kernel`, see `Cloth`.
 
@@ -40,12 +45,16 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     """
     names = sorted(document["sheets"])
     mu = _friction(document)
-    sheets = [sheet(name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel) for name in names]
+    sheets = [
+        sheet(name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel)
+        for name in names
+    ]
     for one in sheets:
         if sheet_count(one.mesh.rest, one.mesh.triangles) != 1:
             raise ValueError(f"sheets.{one.name}.mesh: must hang together in one piece")
     things = [
-        thing(name, given, [mu[one, name] for one in names]) for name, given in sorted(document["bodies"].items())
+        thing(name, given, [mu[one, name] for one in names])
+        for name, given in sorted(document["bodies"].items())
     ]
     ends = np.cumsum([0, *(len(one.start) for one in sheets)])
     holders = [
@@ -62,13 +71,19 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
 
     length, end, calm = document["duration"], document["end"], document["calm"]
     last = max([0.0, gravity.last, *(one.last for one in sheets), *(one.last for one in things)])
-    tracks = {f"{one.name}.vertices": one.surface.at for one in things if one.surface is not None and one.deforms}
+    tracks = {
+        f"{one.name}.vertices": one.surface.at
+        for one in things
+        if one.surface is not None and one.deforms
+    }
     if things:
         tracks["body_pose"] = lambda time: np.stack([one.pose(time) for one in things])
     if holders:
         poses = [track for one in sheets for track in one.tracks.values()]
         tracks["holder_pose"] = lambda time: np.stack([pose(time) for pose in poses])
-        tracks["grasped"] = lambda time: np.array([holder.holds(time) for holder in holders], np.uint8)
+        tracks["grasped"] = lambda time: np.array(
+            [holder.holds(time) for holder in holders], np.uint8
+        )
     boxes = [box for one in sheets for box in one.boxes.values()]
     return Scene(
         mesh=meshes.together(*(one.mesh for one in sheets)),
@@ -76,12 +91,17 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         preset=preset_named(document["preset"]),
         start=np.concatenate([one.start for one in sheets]),
         motion=motion,
-        poses=lambda times: np.swapaxes(np.reshape([at(times) for at in placed], (-1, len(times), 3, 4)), 0, 1),
+        poses=lambda times: np.swapaxes(
+            np.reshape([at(times) for at in placed], (-1, len(times), 3, 4)), 0, 1
+        ),
         holders=holders,
         self_contact=_touch(document, sheets, mu),
         surfaces=[one.surface for one in things if one.surface is not None],
         damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
-        frames=int((length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)) + 1,
+        frames=int(
+            (length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)
+        )
+        + 1,
         frame_rate=document["frame_rate"],
         still_from=None if end is None else last,
         forces=_Forces(sheets, things, holders),
@@ -90,13 +110,17 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         arrays=lambda run: _arrays(run, sheets, things, ends),
         labels=lambda run: _labels(run, document, sheets, gravity.bias),
         kernel=kernel,
-        reason=next((one.hung.reason for one in sheets if one.hung is not None and one.hung.reason), ""),
+        reason=next(
+            (one.hung.reason for one in sheets if one.hung is not None and one.hung.reason), ""
+        ),
     )
 
 
 def _friction(document: Document) -> dict[tuple[str, str], float]:
     """Return the coefficient of friction of each sheet with each sheet and body."""
-    given: dict[frozenset[str], float] = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
+    given: dict[frozenset[str], float] = {
+        frozenset(pair["between"]): pair["mu"] for pair in document["friction"]
+    }
     others = [*document["sheets"], *document["bodies"]]
     return {
         (one, other): float(given.get(frozenset((one, other)), document["default_friction"] or 0.0))
@@ -105,11 +129,15 @@ def _friction(document: Document) -> dict[tuple[str, str], float]:
     }
 
 
-def _touch(document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]) -> SelfContact | None:
+def _touch(
+    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
+) -> SelfContact | None:
     """Return the contact of cloth with cloth."""
     through = [one.name for one in sheets if not document["sheets"][one.name]["self_contact"]]
     if through and len(sheets) > 1:
-        raise ValueError(f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, got false")
+        raise ValueError(
+            f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, got false"
+        )
     if through:
         return None
     friction = [[mu[one.name, other.name] for other in sheets] for one in sheets]
@@ -120,7 +148,9 @@ class _Gravity:
     """Gravity with what leans it, over time: the bias of the scene, and those of hung sheets."""
 
     def __init__(self, document: Document, sheets: Sequence[Sheet], seed: int) -> None:
-        self._down = np.tile(np.array(document["gravity"], float), (sum(len(one.start) for one in sheets), 1))
+        self._down = np.tile(
+            np.array(document["gravity"], float), (sum(len(one.start) for one in sheets), 1)
+        )
         self._size = float(np.linalg.norm(document["gravity"]))
         self._tilted, self._until = self._down, -np.inf
         self.bias = np.zeros(2)
@@ -129,8 +159,14 @@ class _Gravity:
             self.bias = np.random.default_rng(seed).uniform(-size, size, 2)
             self._tilted = self._down + self._size * np.append(self.bias, 0.0)
         self._hung = [
-            (slice(begin - len(one.start), begin), one.hung.tilt, document["sheets"][one.name]["start"]["bias_until"])
-            for one, begin in zip(sheets, np.cumsum([len(one.start) for one in sheets]), strict=True)
+            (
+                slice(begin - len(one.start), begin),
+                one.hung.tilt,
+                document["sheets"][one.name]["start"]["bias_until"],
+            )
+            for one, begin in zip(
+                sheets, np.cumsum([len(one.start) for one in sheets]), strict=True
+            )
             if one.hung is not None
         ]
         self.last = max([0.0, self._until, *(until + UPRIGHT for _, _, until in self._hung)])
@@ -150,19 +186,26 @@ class _Gravity:
 class _Forces:
     """Forces and contacts at a frame, by sheets, bodies and holders."""
 
-    def __init__(self, sheets: Sequence[Sheet], things: Sequence[Thing], holders: Sequence[Any]) -> None:
+    def __init__(
+        self, sheets: Sequence[Sheet], things: Sequence[Thing], holders: Sequence[Any]
+    ) -> None:
         self._names = [one.name for one in sheets]
         self._sheets, self._things, self._holders = len(sheets), len(things), holders
         rigid = [number for number, one in enumerate(things) if one.rigid is not None]
         surfaces = [number for number, one in enumerate(things) if one.surface is not None]
         self._others = np.array([*rigid, *surfaces], dtype=np.intp)  # in the solver's order
         sizes = [len(one.surface.at(0.0)) for one in things if one.surface is not None]
-        owners = [self._things + np.repeat(np.arange(self._sheets), [len(one.start) for one in sheets])]
+        owners = [
+            self._things + np.repeat(np.arange(self._sheets), [len(one.start) for one in sheets])
+        ]
         self._owner = np.concatenate([*owners, np.repeat(np.array(surfaces, dtype=np.intp), sizes)])
         self._ends = np.cumsum([len(one.start) for one in sheets])
 
     def __call__(self, cloth: Cloth) -> Record:
-        """Return `contact_force`, `SHEET.contact` and `holder_force`; nothing touches before the first step."""
+        """Return `contact_force`, `SHEET.contact` and `holder_force`.
+
+        Nothing touches before the first step.
+        """
         vertices = len(cloth.masses)
         force = np.zeros((self._things + self._sheets,) * 2 + (3,))
         state = np.zeros(vertices, np.uint8)
@@ -171,29 +214,42 @@ class _Forces:
             reactions, contacts, pairs = cloth.reactions, cloth.contacts, cloth.pair_forces
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)
-            np.add.at(force, (self._owner[touching], self._others[contacts[touching]]), reactions[touching])
+            np.add.at(
+                force,
+                (self._owner[touching], self._others[contacts[touching]]),
+                reactions[touching],
+            )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
             owner = np.append(self._owner, -1)[np.minimum(pairs.vertices, len(self._owner))]
             of_body = np.append(self._others, -1)[pairs.body]
-            owner = np.where(owner < 0, of_body[:, None], owner)  # skeletons of bodies have vertices of their own
+            owner = np.where(
+                owner < 0, of_body[:, None], owner
+            )  # skeletons of bodies have vertices of their own
             first, last = owner[:, 0], owner[:, 3]
             for corner in range(4):
                 own = owner[:, corner]
                 pull = pairs.weights[:, corner, None] * pairs.forces
                 np.add.at(force, (own, np.where(own == first, last, first)), pull)
                 here = (pairs.vertices[:, corner] < vertices) & (pairs.weights[:, corner] != 0.0)
-                np.maximum.at(state, pairs.vertices[here, corner], np.where(pairs.sliding[here], 2, 1).astype(np.uint8))
+                np.maximum.at(
+                    state,
+                    pairs.vertices[here, corner],
+                    np.where(pairs.sliding[here], 2, 1).astype(np.uint8),
+                )
             for number, holder in enumerate(self._holders):
                 if held[holder.vertices].all():
                     pulls[number] = reactions[holder.vertices].sum(axis=0)
         found = {"contact_force": force[self._things :]}
         found |= {
-            f"{name}.contact": own for name, own in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
+            f"{name}.contact": own
+            for name, own in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
         }
         return found | ({"holder_force": pulls} if len(self._holders) else {})
 
 
-def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], ends: NDArray[np.int64]) -> Record:
+def _arrays(
+    run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], ends: NDArray[np.int64]
+) -> Record:
     found: dict[str, Any] = {}
     for one, path in zip(sheets, np.split(run.positions, ends[1:-1], axis=1), strict=True):
         found[f"{one.name}.positions"] = path
@@ -206,7 +262,9 @@ def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], end
     return found
 
 
-def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Floats) -> dict[str, Any]:
+def _labels(
+    run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Floats
+) -> dict[str, Any]:
     found: dict[str, Any] = {"least_distance": float(run.least_distance)}
     for one in sheets:
         found |= fabric_labels(one.fabric, f"{one.name}.")
@@ -220,7 +278,10 @@ def _labels(run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Fl
 
 
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
-    """Return the outcome of a simulation; values that do not fit together are a reason to reject it."""
+    """Return the outcome of a simulation.
+
+    Values that do not fit together are a reason to reject it.
+    """
     try:
         return scene(scene_and_seed["scene"], seed=scene_and_seed["seed"]).outcome(on_frame)
     except ValueError as error:

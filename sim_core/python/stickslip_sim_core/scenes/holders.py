@@ -1,4 +1,6 @@
-"""Holders: vertices of the cloth that move as rigid bodies, and the shape in which cloth hangs at rest under them."""
+"""Holders: vertices of the cloth that move as rigid bodies, and the shape in which cloth hangs at
+rest under them.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +22,8 @@ ALWAYS = (0.0, np.inf)
 class Holder:
     """Vertices that move as one rigid body from a grasp to a release.
 
-    At the time t0 of the grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1 x(t0), M being its pose.
+    At the time t0 of the grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1
+    x(t0), M being its pose.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -30,7 +33,9 @@ class Holder:
     """(K,)"""
 
     pose: Callable[[ArrayLike], Floats]
-    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]; in a scene with `poses`, from times (T,), too."""
+    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]; in a scene with `poses`, from
+    times (T,), too.
+    """
 
     grasp: tuple[float, float] = ALWAYS
     """When it takes hold, and when it lets go [s]."""
@@ -47,7 +52,8 @@ class Holder:
 
 
 class Hands:
-    """The holders of a scene, of which no two may hold the same vertex at a time, with what each holds now.
+    """The holders of a scene, of which no two may hold the same vertex at a time, with what each
+    holds now.
 
     `positions` are those of all vertices at 0 s, (V, 3) [m].
     """
@@ -77,7 +83,9 @@ class Hands:
         return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return the positions of the held vertices at a time [s], or at times (T,): ([T,] K, 3) [m]."""
+        """Return the positions of the held vertices at a time [s], or at times (T,): ([T,] K, 3)
+        [m].
+        """
         shape = np.shape(time)
         found = [np.empty((*shape, 0, 3))]
         for number, points in self._taken.items():
@@ -96,20 +104,26 @@ class Hands:
 
 
 HANGING = SolverSettings("hanging", 0.05, tolerance=1e-5, step_error=None, halvings_max=1)
-"""Solver settings of the hung shape, so that all presets start from the same. The way there does not matter, so hard
-steps are not pursued far."""
+"""Solver settings of the hung shape, so that all presets start from the same. The way there does
+not matter, so hard steps are not pursued far."""
 
 HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
-"""Factors of the bias, in turn: with a large bias the cloth has one shape, which is followed as the bias falls."""
+"""Factors of the bias, in turn: with a large bias the cloth has one shape, which is followed as the
+bias falls.
+"""
 
 SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
 """Steps with each factor, and their damping [1/s]."""
 
 FIRST_STEP, GROWTH = 0.002, 1.3
-"""First step [s], and growth of the next ones up to 50 ms: the flat cloth buckles when it is released."""
+"""First step [s], and growth of the next ones up to 50 ms: the flat cloth buckles when it is
+released.
+"""
 
 LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
-"""Steps then grow to this length [s] until no vertex moves further than this in one [m]; at most so many steps."""
+"""Steps then grow to this length [s] until no vertex moves further than this in one [m]; at most so
+many steps.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +143,9 @@ class Hung:
     """Size of the tilt."""
 
     tilt: Floats
-    """(V, 3): gravity along the normal, over that along -z, which breaks the symmetry of what follows."""
+    """(V, 3): gravity along the normal, over that along -z, which breaks the symmetry of what
+    follows.
+    """
 
     reason: str
     """Reason why it is no stable equilibrium, or empty."""
@@ -145,11 +161,12 @@ def hung(
     seed: int,
     kernel: str | None = None,
 ) -> Hung:
-    """Return the shape at rest, under gravity along -z, of a cloth that is let down from where it is flat.
+    """Return the shape at rest, under gravity along -z, of a cloth that is let down from where it
+    is flat.
 
-    A cloth that is held at two corners has many shapes at rest. This one is reached as a tilt of gravity falls from 30
-    times a bias to the bias, which is drawn from the seed. It is settled until nothing moves, and its stability is
-    checked.
+    A cloth that is held at two corners has many shapes at rest. This one is reached as a tilt of
+    gravity falls from 30 times a bias to the bias, which is drawn from the seed. It is settled
+    until nothing moves, and its stability is checked.
 
     Args:
         mesh, fabric: Of one sheet.

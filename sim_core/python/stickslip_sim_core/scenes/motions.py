@@ -13,20 +13,35 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core.arrays import Floats
 
 RIGHT_ANGLE = 1e-12
-"""Entries of a matrix that are all as near to -1, 0 and 1 are meant to be right angles: radians have no exact ones."""
+"""Entries of a matrix that are all as near to -1, 0 and 1 are meant to be right angles: radians
+have no exact ones.
+"""
 
 
 def _times(times: ArrayLike) -> Floats:
     """Return instants (K,) [s] that ascend from 0 or later, or raise ValueError."""
     t = np.asarray(times, float)
-    if t.ndim != 1 or not len(t) or not np.isfinite(t).all() or t[0] < 0.0 or not (np.diff(t) > 0.0).all():
-        raise ValueError(f"times: must be one or more instants that ascend from 0 s or later, got {t.tolist()}")
+    if (
+        t.ndim != 1
+        or not len(t)
+        or not np.isfinite(t).all()
+        or t[0] < 0.0
+        or not (np.diff(t) > 0.0).all()
+    ):
+        raise ValueError(
+            f"times: must be one or more instants that ascend from 0 s or later, got {t.tolist()}"
+        )
     return t
 
 
 def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLike], Floats]:
-    """Return the cubic Hermite interpolant of values (K, ...); constant before the first and after the last."""
-    from scipy.interpolate import CubicHermiteSpline  # here, so that importing the package stays quick
+    """Return the cubic Hermite interpolant of values (K, ...).
+
+    Constant before the first and after the last.
+    """
+    from scipy.interpolate import (
+        CubicHermiteSpline,
+    )  # here, so that importing the package stays quick
 
     if len(times) == 1:
         return lambda time: np.array(np.broadcast_to(values[0], np.shape(time) + values.shape[1:]))
@@ -38,8 +53,9 @@ def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLi
 class Keyframes:
     """A rigid motion through keyframes. Nothing moves before the first and after the last one.
 
-    It is smooth by default, without overshoot: monotone cubics [Fritsch & Carlson 1980]. A linear motion has an even
-    speed between keyframes; from each on, its speed changes evenly for `ramp` seconds, which ends later by as much.
+    It is smooth by default, without overshoot: monotone cubics [Fritsch & Carlson 1980]. A linear
+    motion has an even speed between keyframes; from each on, its speed changes evenly for `ramp`
+    seconds, which ends later by as much.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -52,7 +68,9 @@ class Keyframes:
     """(K, 3): displacements since the start [m]."""
 
     turns: ArrayLike
-    """(K, 3): rotations since the start, as rotation vectors [rad], whose components are interpolated."""
+    """(K, 3): rotations since the start, as rotation vectors [rad], whose components are
+    interpolated.
+    """
 
     about: ArrayLike = (0.0, 0.0, 0.0)
     """(3,): the point at the start that rotations are about [m]."""
@@ -70,11 +88,17 @@ class Keyframes:
         for name, expected in (("moves", shape), ("turns", shape), ("about", (3,))):
             value = np.asarray(getattr(self, name), float)
             if value.shape != expected or not np.isfinite(value).all():
-                raise ValueError(f"{name}: must be finite, of shape {expected}, got {value.tolist()}")
+                raise ValueError(
+                    f"{name}: must be finite, of shape {expected}, got {value.tolist()}"
+                )
             object.__setattr__(self, name, value)
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
         times = np.asarray(self.times)
-        path = _evenly(times, values, self.ramp) if self.linear else _through(times, values, _monotone(times, values))
+        path = (
+            _evenly(times, values, self.ramp)
+            if self.linear
+            else _through(times, values, _monotone(times, values))
+        )
         object.__setattr__(self, "_path", path)
 
     @property
@@ -117,7 +141,9 @@ class Spin:
     def pose(self, time: ArrayLike) -> Floats:
         """Return the motion x -> A x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
         t = np.maximum(np.asarray(time, float) - self.begin, 0.0)
-        angle = self.speed * np.where(t < self.ramp, 0.5 * t * t / (self.ramp or 1.0), t - 0.5 * self.ramp)
+        angle = self.speed * np.where(
+            t < self.ramp, 0.5 * t * t / (self.ramp or 1.0), t - 0.5 * self.ramp
+        )
         axis, about = np.asarray(self.axis, float), np.asarray(self.about, float)
         R = rotation(angle[..., None] * axis / np.linalg.norm(axis))
         return np.concatenate([R, (about - R @ about)[..., None]], axis=-1)
@@ -144,7 +170,9 @@ def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike],
 
 
 def _monotone(times: Floats, values: Floats) -> Floats:
-    """Return the slopes of monotone cubics (K, n) at keyframes: 0 at both ends and where a value turns back."""
+    """Return the slopes of monotone cubics (K, n) at keyframes: 0 at both ends and where a value
+    turns back.
+    """
     from scipy.interpolate import PchipInterpolator
 
     slopes = np.zeros_like(values)
@@ -166,7 +194,8 @@ def rotation(turn: ArrayLike) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class MovingMesh:
-    """Triangles that move smoothly through given frames, with the slopes of parabolas through three of them.
+    """Triangles that move smoothly through given frames, with the slopes of parabolas through three
+    of them.
 
     Before the first and after the last frame nothing moves.
 
@@ -200,15 +229,30 @@ class MovingMesh:
         shape: tuple[Any, ...] = ("vertices", 3)
         if self.rest is not None:
             rest, weights = np.asarray(self.rest, float), np.asarray(self.weights, float)
-            if rest.ndim != 2 or rest.shape[1] != 3 or weights.ndim != 2 or len(weights) != len(rest):
-                raise ValueError(f"rest, weights: must be (N, 3) and (N, bones), got {rest.shape} and {weights.shape}")
+            if (
+                rest.ndim != 2
+                or rest.shape[1] != 3
+                or weights.ndim != 2
+                or len(weights) != len(rest)
+            ):
+                raise ValueError(
+                    f"rest, weights: must be (N, 3) and (N, bones), got {rest.shape} and {weights.shape}"
+                )
             if not (np.isfinite(rest).all() and np.isfinite(weights).all()):
                 raise ValueError("rest, weights: must be finite")
             shape = (weights.shape[1], 3, 4)
-        if path.ndim != len(shape) + 1 or path.shape[2:] != shape[1:] or not np.isfinite(path).all():
-            raise ValueError(f"frames: must be finite, of shape {('frames', *shape)}, got {path.shape}")
+        if (
+            path.ndim != len(shape) + 1
+            or path.shape[2:] != shape[1:]
+            or not np.isfinite(path).all()
+        ):
+            raise ValueError(
+                f"frames: must be finite, of shape {('frames', *shape)}, got {path.shape}"
+            )
         if shape[0] not in ("vertices", path.shape[1]):
-            raise ValueError(f"frames: must be of {shape[0]} bones, as weights are, got {path.shape[1]}")
+            raise ValueError(
+                f"frames: must be of {shape[0]} bones, as weights are, got {path.shape[1]}"
+            )
         if len(path) != len(times):
             raise ValueError(f"frames: must be {len(times)}, one for each instant, got {len(path)}")
         object.__setattr__(self, "triangles", np.asarray(self.triangles, dtype=np.int32))
@@ -232,12 +276,16 @@ class MovingMesh:
         return np.asarray(start + self.strength * (now - start))
 
     def _placed(self, time: float) -> Floats:
-        """Return the vertices of the frames: of a skin, sum over bones of w (A x + b) [linear blend skinning]."""
+        """Return the vertices of the frames: of a skin, sum over bones of w (A x + b) [linear blend
+        skinning].
+        """
         path = self._path(time)
         if self.rest is None:
             return path
         x, y, z = np.asarray(self.rest, float).T[..., None]
         found = np.zeros((len(x), 3))
         for weight, bone in zip(np.asarray(self.weights, float).T, path, strict=True):
-            found += weight[:, None] * (x * bone[:, 0] + y * bone[:, 1] + z * bone[:, 2] + bone[:, 3])
+            found += weight[:, None] * (
+                x * bone[:, 0] + y * bone[:, 1] + z * bone[:, 2] + bone[:, 3]
+            )
         return found

@@ -1,6 +1,7 @@
 """Parts of a scene, from its document: meshes and starts of sheets, motions, holders and bodies.
 
-The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in the place of each file.
+The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in the place of each
+file.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +39,9 @@ class Sheet:
     """By name; their vertices are those of the sheet."""
 
     tracks: Mapping[str, Callable[[ArrayLike], Floats]]
-    """By holder: its pose (3, 4), from its own axes, that are warp, weft and normal of the flat sheet, to the world."""
+    """By holder: its pose (3, 4), from its own axes, that are warp, weft and normal of the flat
+    sheet, to the world.
+    """
 
     boxes: Mapping[str, Floats]
     """By holder: sides of the box about what it holds, in its own axes (3,) [m]; NaN for a rim."""
@@ -47,7 +50,9 @@ class Sheet:
     """When the last motion of a holder ends, and the last of them lets go or takes hold [s]."""
 
 
-def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel: str | None) -> Sheet:
+def sheet(
+    name: str, given: Document, materials: Document, *, seed: int, kernel: str | None
+) -> Sheet:
     """Return a sheet of a document with custom fabrics; `seed` is of the tilt of hung cloth.
 
     Raises:
@@ -56,7 +61,9 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
     place = f"sheets.{name}"
     mesh, positions = _mesh(given["mesh"])
     custom = materials.get(given["material"])
-    made = fabric(given["material"]) if custom is None else custom_fabric(given["material"], **custom)
+    made = (
+        fabric(given["material"]) if custom is None else custom_fabric(given["material"], **custom)
+    )
     made = made.scaled(**given["factors"])
     turn, origin, begin = rotation(given["turn"]), np.array(given["origin"], float), given["start"]
     local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
@@ -66,7 +73,9 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
         if begin["file"] is not None:
             positions = begin["file"]["positions"]
         if positions is None or positions.shape != local.shape:
-            raise ValueError(f"{place}.start.file: must have {len(local)} vertices, as the mesh has")
+            raise ValueError(
+                f"{place}.start.file: must have {len(local)} vertices, as the mesh has"
+            )
         local = positions
     start = local @ turn.T + origin
     holders: dict[str, Holder] = {}
@@ -83,11 +92,15 @@ def sheet(name: str, given: Document, materials: Document, *, seed: int, kernel:
         grasp = ALWAYS if holder["grasp"] is None else (holder["grasp"][0], holder["grasp"][1])
         holders[key] = Holder(np.flatnonzero(held), motion.pose, grasp)
         tracks[key] = _carried(motion, turn, middle)
-        boxes[key] = np.full(3, np.nan) if holder["rim"] else np.ptp((start[held] - middle) @ turn, axis=0)
+        boxes[key] = (
+            np.full(3, np.nan) if holder["rim"] else np.ptp((start[held] - middle) @ turn, axis=0)
+        )
         last = max([last, motion.last, *(instant for instant in grasp if np.isfinite(instant))])
     hanging = None
     if begin["type"] == "hung":
-        hanging = hung(mesh, made, start, np.flatnonzero(taken), normal=turn[:, 2], seed=seed, kernel=kernel)
+        hanging = hung(
+            mesh, made, start, np.flatnonzero(taken), normal=turn[:, 2], seed=seed, kernel=kernel
+        )
         start = hanging.positions
     return Sheet(name, mesh, made, given["thickness"], start, hanging, holders, tracks, boxes, last)
 
@@ -97,7 +110,9 @@ def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
     if given["type"] == "grid":
         return meshes.grid(*given["size"], *given["cells"]), None
     if given["type"] == "unstructured":
-        return meshes.unstructured(given["size"][0], given["size"][1], given["spacing"], given["seed"]), None
+        return meshes.unstructured(
+            given["size"][0], given["size"][1], given["spacing"], given["seed"]
+        ), None
     file = given["file"]
     return meshes.Mesh(file["rest"], np.asarray(file["triangles"], np.int32)), file["positions"]
 
@@ -110,22 +125,33 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
     held = np.zeros(len(rest), dtype=bool)
     if holder["vertices"] is not None:
         if max(holder["vertices"]) >= len(rest):
-            raise ValueError(f"{place}.vertices: must be below {len(rest)}, got {max(holder['vertices'])}")
+            raise ValueError(
+                f"{place}.vertices: must be below {len(rest)}, got {max(holder['vertices'])}"
+            )
         held[list(holder["vertices"])] = True
     elif holder["rim"]:
         held[mesh.rim] = True
     elif holder["edge"] is not None:
-        axis, at = {"left": (0, low), "right": (0, high), "bottom": (1, low), "top": (1, high)}[holder["edge"]]
+        axis, at = {"left": (0, low), "right": (0, high), "bottom": (1, low), "top": (1, high)}[
+            holder["edge"]
+        ]
         held[:] = np.abs(rest[:, axis] - at[axis]) <= slack
     else:
-        held[:] = ((rest >= np.array(holder["low"]) - slack) & (rest <= np.array(holder["high"]) + slack)).all(axis=1)
+        held[:] = (
+            (rest >= np.array(holder["low"]) - slack) & (rest <= np.array(holder["high"]) + slack)
+        ).all(axis=1)
         if not held.any():
-            raise ValueError(f"{place}: must hold a vertex, and none is in {holder['low']} to {holder['high']} [m]")
+            raise ValueError(
+                f"{place}: must hold a vertex, and none is in {holder['low']} to {holder['high']} [m]"
+            )
     return held
 
 
 def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
-    """Return a motion of a document; turns are about `middle` (3,) [m] where it does not say about what."""
+    """Return a motion of a document.
+
+    Turns are about `middle` (3,) [m] where it does not say about what.
+    """
     if given is None:
         return Keyframes([0.0], np.zeros((1, 3)), np.zeros((1, 3)))
     about = middle if given["about"] is None else np.array(given["about"], float)
@@ -135,12 +161,18 @@ def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
     if given["path"] is not None:
         times, moves, turns = (given["path"][name] for name in ("time", "move", "turn"))
     else:
-        times, moves, turns = (np.array([key[name] for key in given["keys"]]) for name in ("time", "move", "turn"))
-    return Keyframes(times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"])
+        times, moves, turns = (
+            np.array([key[name] for key in given["keys"]]) for name in ("time", "move", "turn")
+        )
+    return Keyframes(
+        times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"]
+    )
 
 
 def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[ArrayLike], Floats]:
-    """Return the pose at times, ([T,] 3, 4) [s], of what starts with axes `turn` (3, 3) at `origin` (3,) [m]."""
+    """Return the pose at times, ([T,] 3, 4) [s], of what starts with axes `turn` (3, 3) at `origin`
+    (3,) [m].
+    """
 
     def at(time: ArrayLike) -> Floats:
         R, shift = np.split(motion.pose(time), [3], axis=-1)
@@ -178,7 +210,12 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     """
     if given["type"] == "plane":
         still = plane(mu, normal=given["normal"], origin=given["origin"])
-        return Thing(name, lambda time: np.broadcast_to(still.pose, (*np.shape(time), 3, 4)), 0.0, lambda _time: still)
+        return Thing(
+            name,
+            lambda time: np.broadcast_to(still.pose, (*np.shape(time), 3, 4)),
+            0.0,
+            lambda _time: still,
+        )
     if given["type"] == "mesh":
         return _surface(name, given, mu)
     origin = np.array(given["origin"], float)
@@ -204,7 +241,9 @@ def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
         file = given["file"]
         skin = {name: file[name] for name in ("rest", "weights") if name in file}
         frames = file["bones" if skin else "positions"]
-        mesh = MovingMesh(file["triangles"], file["times"], frames, **skin, strength=given["strength"])
+        mesh = MovingMesh(
+            file["triangles"], file["times"], frames, **skin, strength=given["strength"]
+        )
         motion = rigid_motion(given["motion"], mesh.at(0.0).mean(axis=0))
 
         def at(time: float) -> Floats:
@@ -217,4 +256,6 @@ def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
     except ValueError as error:
         raise ValueError(f"bodies.{name}: {error}") from error
     last = max(motion.last, mesh.last)
-    return Thing(name, motion.pose, last, surface=surface, rest=mesh.at(0.0), deforms=mesh.last > 0.0)
+    return Thing(
+        name, motion.pose, last, surface=surface, rest=mesh.at(0.0), deforms=mesh.last > 0.0
+    )

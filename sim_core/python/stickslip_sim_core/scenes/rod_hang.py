@@ -15,7 +15,9 @@ CURVES = ("centerline", "curvature", "frame")
 _settings = itemgetter("poisson", "elements", "points")
 
 
-def simulate(simulations: Sequence[Mapping[str, Any]], _on_frame: OnFrame | None = None) -> list[Outcome]:
+def simulate(
+    simulations: Sequence[Mapping[str, Any]], _on_frame: OnFrame | None = None
+) -> list[Outcome]:
     """Solve rods (gamma, phi0, phi1, poisson, elements, points), all of the same settings together.
 
     The numbers of a rod do not depend on the others.
@@ -37,11 +39,17 @@ def _solved(rods: Sequence[Mapping[str, Any]]) -> Iterable[Outcome]:
     good = solution.converged & solution.stable
     if good.any():
         other = other_minima(*parameters, **settings, solution=solution)
-        distance, far = (label(solution.centerline[good]) for label in (self_contact_distance, reach))
+        distance, far = (
+            label(solution.centerline[good]) for label in (self_contact_distance, reach)
+        )
     row = np.cumsum(good) - 1
     for i in range(len(rods)):
         if not good[i]:
-            found = "no stable equilibrium was found" if solution.converged[i] else "the solver did not converge"
+            found = (
+                "no stable equilibrium was found"
+                if solution.converged[i]
+                else "the solver did not converge"
+            )
             yield Outcome(reason=found)
             continue
         record = {name: getattr(solution, name)[i].astype(np.float32) for name in CURVES}

@@ -42,22 +42,29 @@ class ClothRun:
     """(frames,) [s]"""
 
     record: Record
-    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it [N]."""
+    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it [N].
+    """
 
     labels: Mapping[str, Any]
-    """Numbers by name: those of the solver, the checks, and of the scene, such as the bias that breaks its symmetry."""
+    """Numbers by name: those of the solver, the checks, and of the scene, such as the bias that
+    breaks its symmetry.
+    """
 
     self_intersections: NDArray[np.int32]
     """(frames,): pairs of triangles that cross."""
 
     least_distance: float
-    """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without contact."""
+    """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without
+    contact.
+    """
 
     rest_time: float
     """When all came to rest, if the scene ends then [s]; NaN if it did not."""
 
     code: str
-    """Code of the reason why the run is not valid: the name of the first check that failed; or empty."""
+    """Code of the reason why the run is not valid: the name of the first check that failed; or
+    empty.
+    """
 
     reason: str
     """The reason in words, or empty."""
@@ -86,7 +93,9 @@ class Scene:
     """From a time [s] to gravity (V, 3) [m/s^2] and bodies."""
 
     poses: Callable[[Floats], Floats] | None = None
-    """From times (T,) [s] to the poses of bodies (T, B, 3, 4); holders take times, too. None: `motion` is asked."""
+    """From times (T,) [s] to the poses of bodies (T, B, 3, 4); holders take times, too. None:
+    `motion` is asked.
+    """
 
     frames: int
     frame_rate: float
@@ -102,10 +111,14 @@ class Scene:
     """From a time [s] to a damping [1/s]."""
 
     forces: Callable[[Cloth], Record] = lambda cloth: {"contact_force": cloth.contact_force()}
-    """Arrays recorded at each frame, of the step in which it lies; the first frame is before the first step."""
+    """Arrays recorded at each frame, of the step in which it lies; the first frame is before the
+    first step.
+    """
 
     tracks: Mapping[str, Callable[[float], ArrayLike]] = field(default_factory=dict)
-    """Poses and other functions of the time, recorded at each frame. A pose is (3, 4): x -> A x + b."""
+    """Poses and other functions of the time, recorded at each frame. A pose is (3, 4): x -> A x +
+    b.
+    """
 
     record: Record = field(default_factory=dict)
     """Arrays recorded once."""
@@ -120,7 +133,9 @@ class Scene:
     """Arrays of the run to store besides its record."""
 
     still_from: float | None = None
-    """From this time on [s] the scene ends once all is at rest, and further frames repeat the last; None: never."""
+    """From this time on [s] the scene ends once all is at rest, and further frames repeat the last;
+    None: never.
+    """
 
     kernel: str | None = None
     """Level of the kernels, see `Cloth`."""
@@ -131,7 +146,8 @@ class Scene:
     def run(self, on_frame: OnFrame | None = None) -> ClothRun:
         """Simulate the scene, until it ends or a position is not finite.
 
-        The solver's steps do not depend on the frames, whose positions are interpolated within steps.
+        The solver's steps do not depend on the frames, whose positions are interpolated within
+        steps.
 
         Raises:
             ValueError: A sheet starts across itself, another or a surface.
@@ -147,7 +163,11 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
-        paths, forces, crossed = [cloth.positions], [self.forces(cloth)], [self._crossings(cloth.positions)]
+        paths, forces, crossed = (
+            [cloth.positions],
+            [self.forces(cloth)],
+            [self._crossings(cloth.positions)],
+        )
         calm, rest_time = 0, np.nan
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
@@ -173,8 +193,13 @@ class Scene:
             found += missing * found[-1:]  # type: ignore[operator]
         path = np.stack(paths)
         times = np.arange(len(path)) / self.frame_rate
-        record: dict[str, Array] = {name: np.stack([each[name] for each in forces]) for name in forces[0]}
-        record |= {name: np.stack([np.asarray(at(float(t))) for t in times]) for name, at in self.tracks.items()}
+        record: dict[str, Array] = {
+            name: np.stack([each[name] for each in forces]) for name in forces[0]
+        }
+        record |= {
+            name: np.stack([np.asarray(at(float(t))) for t in times])
+            for name, at in self.tracks.items()
+        }
         worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
         code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(
@@ -200,10 +225,16 @@ class Scene:
 
     def _crossings(self, positions: Floats) -> int:
         """Return how many pairs of triangles cross; none where positions (V, 3) [m] are not finite."""
-        return self_intersections(positions, self.mesh.triangles) if np.isfinite(positions).all() else 0
+        return (
+            self_intersections(positions, self.mesh.triangles)
+            if np.isfinite(positions).all()
+            else 0
+        )
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
-        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move of itself."""
+        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move of
+        itself.
+        """
         if self.still_from is None or time <= self.still_from:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
@@ -216,17 +247,27 @@ class Scene:
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
-            cloth.advance(min(end, event), hands.driving(self.motion), path=path, event=event, damping=self.damping)
+            cloth.advance(
+                min(end, event),
+                hands.driving(self.motion),
+                path=path,
+                event=event,
+                damping=self.damping,
+            )
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store."""
         run = self.run(on_frame)
         if not run.valid:
-            worst = ", ".join(f"{check.name} {run.labels[check.name]:.4g}" for check in checks.CHECKS)
+            worst = ", ".join(
+                f"{check.name} {run.labels[check.name]:.4g}" for check in checks.CHECKS
+            )
             return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
-        single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
+        single = {
+            name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()
+        }
         return Outcome({**single, "self_intersections": crossings}, run.labels)
 
 
@@ -240,14 +281,18 @@ def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
 
 
 def cloth_kernel() -> str:
-    """Return the default level of the kernels: that of the environment variable, or the widest of this processor."""
+    """Return the default level of the kernels: that of the environment variable, or the widest of
+    this processor.
+    """
     return build_info().cloth_kernel
 
 
 def cloth_kind(scene: Callable[..., Scene]) -> Kind:
     """Return the kind whose simulations are the scenes that `scene` makes of their physics."""
 
-    def simulate(simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None) -> list[Outcome]:
+    def simulate(
+        simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None
+    ) -> list[Outcome]:
         return [scene(**_of_materials(physics)).outcome(on_frame) for physics in simulations]
 
     return Kind(simulate, "stickslip_sim_core.cloth", kernel=cloth_kernel)

@@ -6,8 +6,9 @@
 namespace sim_core {
 namespace {
 
-// A fold by theta over the length h has s = h^2 |H|^2 = 4 sin^2(theta/2) where its energy should go as theta^2. The
-// ratio r(s) = theta^2 / s turns the one into the other; beyond `fold_end` theta^2 goes on as a parabola in s.
+// A fold by theta over the length h has s = h^2 |H|^2 = 4 sin^2(theta/2) where its energy should go
+// as theta^2. The ratio r(s) = theta^2 / s turns the one into the other; beyond `fold_end` theta^2
+// goes on as a parabola in s.
 struct Stiffening {
   double ratio, slope, curvature;  // r, dr/ds, d2r/ds2
 };
@@ -17,8 +18,9 @@ constexpr double fold_series = 0.4, fold_end = 3.8;
 inline Stiffening stiffening_of(double s) {
   if (s < fold_series) {
     // theta^2 = 2 sum_n s^n / (n^2 C(2n, n))
-    constexpr double c[11] = {1.0,         1.0 / 12,     1.0 / 90,      1.0 / 560,     1.0 / 3150,    1.0 / 16632,
-                              1.0 / 84084, 1.0 / 411840, 1.0 / 1969110, 1.0 / 9237800, 1.0 / 42678636};
+    constexpr double c[11] = {1.0,           1.0 / 12,      1.0 / 90,      1.0 / 560,
+                              1.0 / 3150,    1.0 / 16632,   1.0 / 84084,   1.0 / 411840,
+                              1.0 / 1969110, 1.0 / 9237800, 1.0 / 42678636};
     double ratio = c[10], slope = 0.0, half_curvature = 0.0;
     for (int n = 9; n >= 0; --n) {
       half_curvature = half_curvature * s + slope;
@@ -52,14 +54,16 @@ inline int store_fold(FoldData* folds, int entry, int node, NodeD a, NodeD b) {
   return entry + 1;
 }
 
-// W = A/2 r(s) q for each triangle, q = H:D:H and s = h^2 H:N:H with N = diag(1, 1, 1/2). By H its derivatives are,
-// with m = D H and n = N H,
+// W = A/2 r(s) q for each triangle, q = H:D:H and s = h^2 H:N:H with N = diag(1, 1, 1/2). By H its
+// derivatives are, with m = D H and n = N H,
 //
 //     W'  = A (r m + q r' h^2 n)
 //     W'' = A (r D + q r' h^2 N) + A (2 q r'' h^4 n n^T + 2 r' h^2 (n m^T + m n^T))
 //
-// The first part of W'' acts on x, y and z alike and goes into the matrix (`stiffening`), the second into `folds`.
-double bending(const BendingData& data, const double* x, double* gradient, float* stiffening, FoldData* folds) {
+// The first part of W'' acts on x, y and z alike and goes into the matrix (`stiffening`), the
+// second into `folds`.
+double bending(const BendingData& data, const double* x, double* gradient, float* stiffening,
+               FoldData* folds) {
   int entries = 0;
   if (folds) folds->count = 0;
   double energy = 0.0;
@@ -103,8 +107,8 @@ double bending(const BendingData& data, const double* x, double* gradient, float
         if (data.nodes[i] >= folds->free_nodes) continue;
         const double* w = data.weights + 4L * i;
         const NodeD a = spread(w[0]) * h0 + spread(w[1]) * h1 + spread(0.5 * w[2]) * h2;
-        entries =
-            store_fold(folds, entries, data.nodes[i], a, spread(w[0]) * m0 + spread(w[1]) * m1 + spread(w[2]) * m2);
+        entries = store_fold(folds, entries, data.nodes[i], a,
+                             spread(w[0]) * m0 + spread(w[1]) * m1 + spread(w[2]) * m2);
       }
       folds->begin[folds->count] = entries;
     }

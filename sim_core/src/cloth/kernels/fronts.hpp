@@ -1,5 +1,5 @@
-// The multifrontal Cholesky factor [Duff & Reid 1983]: K = L L^T, front after front, children before parents. Its dense
-// pieces come first.
+// The multifrontal Cholesky factor [Duff & Reid 1983]: K = L L^T, front after front, children
+// before parents. Its dense pieces come first.
 #pragma once
 
 #include "cloth/kernels/vectors.hpp"
@@ -22,7 +22,8 @@ inline void multiply_tile(const float* a, const float* b, long ld, int depth, fl
   for (int p = 0; p < depth; ++p) {
     Floats left[vectors];
 #pragma GCC unroll 4
-    for (int v = 0; v < vectors; ++v) left[v] = *reinterpret_cast<const Floats*>(a + p * ld + CLOTH_FLOATS * v);
+    for (int v = 0; v < vectors; ++v)
+      left[v] = *reinterpret_cast<const Floats*>(a + p * ld + CLOTH_FLOATS * v);
 #pragma GCC unroll 8
     for (int j = 0; j < columns; ++j) {
       const float right = b[p * ld + j];
@@ -41,7 +42,8 @@ inline void multiply_tile(const float* a, const float* b, long ld, int depth, fl
 }
 
 template <int columns, bool set>
-inline void multiply_column(const float* a, const float* b, long ld, int depth, float* c, long ldc, int rows) {
+inline void multiply_column(const float* a, const float* b, long ld, int depth, float* c, long ldc,
+                            int rows) {
   int i = 0;
   // Sixteen wide registers hold 2 x 6 sums, thirty-two 4 x 6.
   for (; CLOTH_FLOATS == 16 && i + 4 * CLOTH_FLOATS <= rows; i += 4 * CLOTH_FLOATS) {
@@ -50,12 +52,14 @@ inline void multiply_column(const float* a, const float* b, long ld, int depth, 
   for (; i + 2 * CLOTH_FLOATS <= rows; i += 2 * CLOTH_FLOATS) {
     multiply_tile<2, columns, set>(a + i, b, ld, depth, c + i, ldc);
   }
-  for (; i < rows; i += CLOTH_FLOATS) multiply_tile<1, columns, set>(a + i, b, ld, depth, c + i, ldc);
+  for (; i < rows; i += CLOTH_FLOATS)
+    multiply_tile<1, columns, set>(a + i, b, ld, depth, c + i, ldc);
 }
 
-// Lower part of C = -A A^T, a square of `columns`, a multiple of 3; A has `rows` >= columns, padded. Tiles that touch
-// the diagonal are whole.
-inline void negative_square(const float* a, long ld, int depth, float* c, long ldc, int rows, int columns) {
+// Lower part of C = -A A^T, a square of `columns`, a multiple of 3; A has `rows` >= columns,
+// padded. Tiles that touch the diagonal are whole.
+inline void negative_square(const float* a, long ld, int depth, float* c, long ldc, int rows,
+                            int columns) {
   for (int j = 0; j < columns; j += 6) {
     const int from = j / CLOTH_FLOATS * CLOTH_FLOATS;
     const float* left = a + from;
@@ -81,14 +85,16 @@ inline void subtract_columns(float* panel, long ld, int j, int width, int rows) 
   }
 }
 
-// Factor `width` columns of a panel from its diagonal down to `rows`, all earlier columns being subtracted already.
+// Factor `width` columns of a panel from its diagonal down to `rows`, all earlier columns being
+// subtracted already.
 inline void factor_columns(float* panel, long ld, int width, int rows) {
   float l[tile_columns][tile_columns], inverse[tile_columns];
   for (int j = 0; j < width; ++j) {
     float pivot = panel[j * ld + j];
     const float own = pivot;
     for (int q = 0; q < j; ++q) pivot -= l[j][q] * l[j][q];
-    if (!(pivot > 1e-6f * own)) pivot = own > 0.0f ? 1e-6f * own : 1.0f;  // rounding: the factor may be inexact
+    if (!(pivot > 1e-6f * own))
+      pivot = own > 0.0f ? 1e-6f * own : 1.0f;  // rounding: the factor may be inexact
     l[j][j] = __builtin_sqrtf(pivot);
     inverse[j] = 1.0f / l[j][j];
     for (int i = j + 1; i < width; ++i) {
@@ -133,7 +139,8 @@ inline void invert_triangle(const float* l, long ld, int width, float* inverse) 
   }
 }
 
-// Sizes of a front in floats. Pivot rows are padded apart from the others, so that both begin on a vector.
+// Sizes of a front in floats. Pivot rows are padded apart from the others, so that both begin on a
+// vector.
 struct FrontSize {
   int pivots, rows;  // nodes
   int columns, pivot_rows, other_rows;
@@ -147,7 +154,9 @@ struct FrontSize {
         other_rows(padded(3 * rows)),
         ld(pivot_rows + other_rows) {}
 
-  long place(int node) const { return node < pivots ? 3L * node : pivot_rows + 3L * (node - pivots); }
+  long place(int node) const {
+    return node < pivots ? 3L * node : pivot_rows + 3L * (node - pivots);
+  }
 };
 
 // Reads and writes whole vectors: what lies behind `count` is read, and written as it was.
@@ -158,7 +167,8 @@ inline void add_floats(const float* from, float* to, int count) {
   }
   if (i == count) return;
   const Integers inside = lane_numbers() < count - i;
-  *reinterpret_cast<Floats*>(to + i) += Floats(Integers(*reinterpret_cast<const Floats*>(from + i)) & inside);
+  *reinterpret_cast<Floats*>(to + i) +=
+      Floats(Integers(*reinterpret_cast<const Floats*>(from + i)) & inside);
 }
 
 template <class Kept>
@@ -175,7 +185,8 @@ inline void keep_tiles(const Factor& factor, const FrontSize& size, int j, int w
   invert_triangle(factor.panel + j * size.ld + j, size.ld, width, some);
   for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(some + q * tile_rows, tile);
   // Pivot rows and other rows lie apart in the panel.
-  const float *upper = factor.panel + j * size.ld + first, *lower = factor.panel + j * size.ld + size.pivot_rows - own;
+  const float *upper = factor.panel + j * size.ld + first,
+              *lower = factor.panel + j * size.ld + size.pivot_rows - own;
   for (int i = 0; i < end; i += tile_rows) {
     if (i + tile_rows <= own || (i >= own && i + tile_rows <= end)) {
       const float* from = (i < own ? upper : lower) + i;
@@ -184,16 +195,19 @@ inline void keep_tiles(const Factor& factor, const FrontSize& size, int j, int w
     }
     for (int q = 0; q < width; ++q, tile += tile_rows) {
       for (int r = 0; r < tile_rows; ++r) {
-        some[r] = i + r < own ? upper[q * size.ld + i + r] : i + r < end ? lower[q * size.ld + i + r] : 0.0f;
+        some[r] = i + r < own   ? upper[q * size.ld + i + r]
+                  : i + r < end ? lower[q * size.ld + i + r]
+                                : 0.0f;
       }
       keep_rows(some, tile);
     }
   }
 }
 
-// Adds what waits of a child to those columns of its parent that are pivots, or to the others; column j of the parent
-// begins at parent + j ld.
-inline void add_update(const Factor& factor, int child, const FrontSize& size, bool pivots, float* parent, long ld) {
+// Adds what waits of a child to those columns of its parent that are pivots, or to the others;
+// column j of the parent begins at parent + j ld.
+inline void add_update(const Factor& factor, int child, const FrontSize& size, bool pivots,
+                       float* parent, long ld) {
   const FrontSize below(factor, child);
   const float* update = factor.updates + factor.update_begin[child];
   const FrontRun* end = factor.runs + factor.run_begin[child + 1];
@@ -204,7 +218,8 @@ inline void add_update(const Factor& factor, int child, const FrontSize& size, b
       float* to = parent + (size.place(run->place) + j) * ld;
       int skip = j / 3 * 3;  // the lower triangle is all there is
       for (const FrontRun* rows = run; rows < end; ++rows, skip = 0) {
-        add_floats(from + 3L * rows->row + skip, to + size.place(rows->place) + skip, 3 * rows->count - skip);
+        add_floats(from + 3L * rows->row + skip, to + size.place(rows->place) + skip,
+                   3 * rows->count - skip);
       }
     }
   }
@@ -248,11 +263,13 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const float* added)
       const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
       subtract_columns(panel, size.ld, j, width, int(size.ld));
       factor_columns(panel + j * size.ld + j, size.ld, width, int(size.ld) - j);
-      factor.half ? keep_tiles<Half>(factor, size, j, width, tile) : keep_tiles<float>(factor, size, j, width, tile);
+      factor.half ? keep_tiles<Half>(factor, size, j, width, tile)
+                  : keep_tiles<float>(factor, size, j, width, tile);
       tile += tile_floats(width, size.columns - j - width + 3 * size.rows);
     }
     if (size.rows > 0) {
-      negative_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows, 3 * size.rows);
+      negative_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows,
+                      3 * size.rows);
       for (const int* c = child; c < last; ++c) {
         add_update(factor, *c, size, false, update - (ldu + 1) * size.pivot_rows, ldu);
       }

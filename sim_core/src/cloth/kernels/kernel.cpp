@@ -1,5 +1,6 @@
-// The arithmetic of cloth: energies, matrix, Cholesky factor, Krylov method. Compiled once per instruction set with
-// CLOTH_FLOATS floats in a vector; see math/lanes.hpp on why all names are in an unnamed namespace.
+// The arithmetic of cloth: energies, matrix, Cholesky factor, Krylov method. Compiled once per
+// instruction set with CLOTH_FLOATS floats in a vector; see math/lanes.hpp on why all names are in
+// an unnamed namespace.
 //
 // Sums are taken in an order that depends on CLOTH_FLOATS alone: equal machines give equal bits.
 #include "cloth/kernels/bending.hpp"

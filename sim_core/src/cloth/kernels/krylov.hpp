@@ -42,8 +42,8 @@ inline void add_pairs(const PairData& pairs, const Node* in, Node* out) {
     }
     for (int c = 0; c < 4; ++c) {
       if (nodes[c] < 0) continue;
-      out[nodes[c]] +=
-          spread(weights[c]) * force[0] + spread(weights[4 + c]) * force[1] + spread(weights[8 + c]) * force[2];
+      out[nodes[c]] += spread(weights[c]) * force[0] + spread(weights[4 + c]) * force[1] +
+                       spread(weights[8 + c]) * force[2];
     }
   }
 }
@@ -77,7 +77,9 @@ inline void apply_rows(const ClothMatrix& matrix, const int* mode, const float* 
   if (matrix.pairs) add_pairs(*matrix.pairs, in, out);
 }
 
-void apply(const ClothMatrix& matrix, const float* x, float* y) { apply_rows(matrix, nullptr, x, y); }
+void apply(const ClothMatrix& matrix, const float* x, float* y) {
+  apply_rows(matrix, nullptr, x, y);
+}
 
 // Sets to zero what contact forbids: the normal part where a node slips, all where it sticks.
 inline void admit(const ContactRows& contact, int nodes, float* v) {
@@ -92,8 +94,10 @@ inline void admit(const ContactRows& contact, int nodes, float* v) {
   }
 }
 
-// y = J v for an admissible v: a slipping node's friction follows its normal force and turns with its motion.
-inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact, const float* v, float* y) {
+// y = J v for an admissible v: a slipping node's friction follows its normal force and turns with
+// its motion.
+inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact, const float* v,
+                          float* y) {
   apply_rows(matrix, contact.mode, v, y);
   for (int i = 0; i < matrix.nodes; ++i) {
     Node* at = reinterpret_cast<Node*>(y) + i;
@@ -105,7 +109,8 @@ inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact,
       const Node own = *(reinterpret_cast<const Node*>(v) + i);
       const float normal = dot3(n, *at);
       *at -= spread(normal) * n;
-      *at += spread(contact.turning[i]) * (own - spread(dot3(t, own)) * t) - spread(contact.mu[i] * normal) * t;
+      *at += spread(contact.turning[i]) * (own - spread(dot3(t, own)) * t) -
+             spread(contact.mu[i] * normal) * t;
     }
   }
 }
@@ -131,10 +136,10 @@ inline void add_multiple(float* a, float factor, const float* b, long count) {
   for (long i = 0; i < count; ++i) a[i] += factor * b[i];
 }
 
-// Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `x`: the first guess, of which the
-// best multiple is taken, and the solution. `work`: 2 krylov_max + 1 vectors.
-int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact, const float* b, float* x,
-           float* work, double tolerance) {
+// Flexible GMRES [Saad 1993], preconditioned from the right by the stale factor. `x`: the first
+// guess, of which the best multiple is taken, and the solution. `work`: 2 krylov_max + 1 vectors.
+int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& contact,
+           const float* b, float* x, float* work, double tolerance) {
   const FlushTiny flush;
   const long count = 4L * matrix.nodes;
   float* basis = work;

@@ -8,18 +8,21 @@ namespace sim_core {
 namespace {
 
 // Adds a block of each lane, or its transpose, at slot `place` of the nine of its triangle.
-inline void add_blocks(float* blocks, const int* slots, int place, const Lane (&block)[3][3], bool transposed) {
+inline void add_blocks(float* blocks, const int* slots, int place, const Lane (&block)[3][3],
+                       bool transposed) {
   float entry[3][3][membrane_lanes];
   for (int r = 0; r < 3; ++r) {
     for (int c = 0; c < 3; ++c) {
-      for (int l = 0; l < membrane_lanes; ++l) entry[transposed ? r : c][transposed ? c : r][l] = float(block[r][c][l]);
+      for (int l = 0; l < membrane_lanes; ++l)
+        entry[transposed ? r : c][transposed ? c : r][l] = float(block[r][c][l]);
     }
   }
   for (int l = 0; l < membrane_lanes; ++l) {
     const int slot = slots[9 * l + place];
     if (slot < 0) continue;
     Node* columns = reinterpret_cast<Node*>(blocks + 12L * slot);
-    for (int c = 0; c < 3; ++c) columns[c] += Node{entry[c][0][l], entry[c][1][l], entry[c][2][l], 0.0f};
+    for (int c = 0; c < 3; ++c)
+      columns[c] += Node{entry[c][0][l], entry[c][1][l], entry[c][2][l], 0.0f};
   }
 }
 
@@ -42,7 +45,11 @@ inline Strained strained(const MembraneData& data, int group, const double* x) {
   }
   const Lane* shape = reinterpret_cast<const Lane*>(data.shape + 4L * W * group);
   Strained out{
-      {{-shape[0] - shape[2], -shape[1] - shape[3]}, {shape[0], shape[1]}, {shape[2], shape[3]}}, {}, {}, {}, {}};
+      {{-shape[0] - shape[2], -shape[1] - shape[3]}, {shape[0], shape[1]}, {shape[2], shape[3]}},
+      {},
+      {},
+      {},
+      {}};
   Lane(&f)[2][3] = out.f;
   for (int c = 0; c < 3; ++c) {
     const Lane u = p[1][c] - p[0][c], v = p[2][c] - p[0][c];
@@ -57,21 +64,24 @@ inline Strained strained(const MembraneData& data, int group, const double* x) {
   return out;
 }
 
-// Where the law is not convex where a step starts, a share of what makes it convex holds strain there: a viscosity that
-// falls as the step and vanishes at rest, so that a step has one end. Convex splitting [Eyre 1998].
+// Where the law is not convex where a step starts, a share of what makes it convex holds strain
+// there: a viscosity that falls as the step and vanishes at rest, so that a step has one end.
+// Convex splitting [Eyre 1998].
 inline void add_lag(StretchLaw& law, const Lane* lag, const Strained& now) {
   const Lane a = now.a - lag[0], h = now.h - lag[1], q = now.q - lag[2];
   law.a += lag[3] * a + lag[4] * h + lag[5] * q;
   law.h += lag[4] * a + lag[6] * h + lag[7] * q;
   law.q += lag[5] * a + lag[7] * h + lag[8] * q;
-  law.aa += lag[3], law.ah += lag[4], law.aq += lag[5], law.hh += lag[6], law.hq += lag[7], law.qq += lag[8];
+  law.aa += lag[3], law.ah += lag[4], law.aq += lag[5], law.hh += lag[6], law.hq += lag[7],
+      law.qq += lag[8];
 }
 
 void membrane_lag(const MembraneData& data, const double* x, double share, double* lag) {
   for (int group = 0; group < data.groups; ++group) {
     const int fabric = data.fabric[group];
     const Strained now = strained(data, group, x);
-    const StretchLaw law = stretch_law<true>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
+    const StretchLaw law =
+        stretch_law<true>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
     StretchLaw positive = law;
     make_definite(positive);
     const Lane entries[9] = {now.a,
@@ -83,14 +93,17 @@ void membrane_lag(const MembraneData& data, const double* x, double share, doubl
                              share * (positive.hh - law.hh),
                              share * (positive.hq - law.hq),
                              share * (positive.qq - law.qq)};
-    for (int i = 0; i < 9; ++i) *reinterpret_cast<Lane*>(lag + (9L * group + i) * membrane_lanes) = entries[i];
+    for (int i = 0; i < 9; ++i)
+      *reinterpret_cast<Lane*>(lag + (9L * group + i) * membrane_lanes) = entries[i];
   }
 }
 
-// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second derivative; a
-// `definite` one has only the positive part of the stress and of the law [Teran et al. 2005].
+// Green's strain G = (F^T F - 1)/2 and the law of kernels/stretching.hpp. The matrix is the second
+// derivative; a `definite` one has only the positive part of the stress and of the law [Teran et
+// al. 2005].
 template <bool matrix>
-double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks, bool definite) {
+double membrane_groups(const MembraneData& data, const double* x, double* gradient, float* blocks,
+                       bool definite) {
   constexpr int W = membrane_lanes;
   Lane energy{};
   for (int group = 0; group < data.groups; ++group) {
@@ -100,13 +113,15 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
     const Strained now = strained(data, group, x);
     const Lane(&n)[3][2] = now.n;
     const Lane(&f)[2][3] = now.f;
-    StretchLaw law = stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
+    StretchLaw law =
+        stretch_law<matrix>(data.law + 24L * fabric, data.tabulated[fabric], now.a, now.h, now.q);
     if (data.lag) add_lag(law, reinterpret_cast<const Lane*>(data.lag + 9L * W * group), now);
     const Lane s00 = 0.5 * (law.a + law.h), s11 = 0.5 * (law.a - law.h), s01 = 0.5 * law.q;
     energy += area * law.energy;
     Lane force[3][3];
     for (int a = 0; a < 3; ++a) {
-      const Lane u = area * (s00 * n[a][0] + s01 * n[a][1]), v = area * (s01 * n[a][0] + s11 * n[a][1]);
+      const Lane u = area * (s00 * n[a][0] + s01 * n[a][1]),
+                 v = area * (s01 * n[a][0] + s11 * n[a][1]);
       for (int c = 0; c < 3; ++c) force[a][c] = f[0][c] * u + f[1][c] * v;
     }
     for (int a = 0; a < 3; ++a) {
@@ -123,7 +138,8 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
         const Lane radius = root(half * half + s01 * s01) + 1e-30;
         const Lane big = mean + radius, small = mean - radius;
         const Lane big_plus = big > zero ? big : zero, small_plus = small > zero ? small : zero;
-        const Lane middle = 0.5 * (big_plus + small_plus), spread_ratio = 0.5 * (big_plus - small_plus) / radius;
+        const Lane middle = 0.5 * (big_plus + small_plus),
+                   spread_ratio = 0.5 * (big_plus - small_plus) / radius;
         t00 = area * (middle + spread_ratio * half);
         t11 = area * (middle - spread_ratio * half);
         t01 = area * spread_ratio * s01;
@@ -131,7 +147,8 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
       }
       // Of (s00, s11, s01) by (G00, G11, 2 G01).
       const Lane quarter = 0.25 * area;
-      const Lane c00 = quarter * (law.aa + 2.0 * law.ah + law.hh), c11 = quarter * (law.aa - 2.0 * law.ah + law.hh);
+      const Lane c00 = quarter * (law.aa + 2.0 * law.ah + law.hh),
+                 c11 = quarter * (law.aa - 2.0 * law.ah + law.hh);
       const Lane c01 = quarter * (law.aa - law.hh), c22 = quarter * law.qq;
       const Lane c02 = quarter * (law.aq + law.hq), c12 = quarter * (law.aq - law.hq);
       const int* slots = data.slots + 9L * W * group;
@@ -139,8 +156,10 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
       Lane own[3][3][3] = {};  // a translation costs nothing: rows add up to zero
       for (int pair = 0; pair < 3; ++pair) {
         const Lane *a = n[first[pair]], *b = n[second[pair]];
-        const Lane ab00 = a[0] * b[0], ab01 = a[0] * b[1], ab10 = a[1] * b[0], ab11 = a[1] * b[1], mixed = ab01 + ab10;
-        const Lane m00 = c00 * ab00 + c02 * mixed + c22 * ab11, m11 = c11 * ab11 + c12 * mixed + c22 * ab00;
+        const Lane ab00 = a[0] * b[0], ab01 = a[0] * b[1], ab10 = a[1] * b[0], ab11 = a[1] * b[1],
+                   mixed = ab01 + ab10;
+        const Lane m00 = c00 * ab00 + c02 * mixed + c22 * ab11,
+                   m11 = c11 * ab11 + c12 * mixed + c22 * ab00;
         const Lane both = c02 * ab00 + c12 * ab11;
         const Lane m01 = c01 * ab01 + c22 * ab10 + both, m10 = c01 * ab10 + c22 * ab01 + both;
         const Lane geometric = t00 * ab00 + t01 * mixed + t11 * ab11;
@@ -164,7 +183,8 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
   return total;
 }
 
-double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks, bool definite) {
+double membrane(const MembraneData& data, const double* x, double* gradient, float* blocks,
+                bool definite) {
   return blocks ? membrane_groups<true>(data, x, gradient, blocks, definite)
                 : membrane_groups<false>(data, x, gradient, nullptr, definite);
 }

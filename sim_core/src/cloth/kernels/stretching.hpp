@@ -1,23 +1,26 @@
-// The law of stretching: an energy whose stress under uniaxial strain is that of the table of [Wang et al. 2011].
+// The law of stretching: an energy whose stress under uniaxial strain is that of the table of [Wang
+// et al. 2011].
 //
-// With a = (G00 + G11)/2, h = (G00 - G11)/2, q = G01, z = h^2 + q^2 and r = sqrt(z), the principal strains are a + r
-// and a - r. Per area
+// With a = (G00 + G11)/2, h = (G00 - G11)/2, q = G01, z = h^2 + q^2 and r = sqrt(z), the principal
+// strains are a + r and a - r. Per area
 //
 //   W = Q(K0)/2 + m(e) g(t) Q(K(y)),   Q(K) = A a^2 + 2 B a h + C h^2 + D q^2,
 //   A = k0 + 2 k1 + k2,   B = k0 - k2,   C = k0 - 2 k1 + k2,   D = 2 k3,
 //
-// where K0 is the table's row at no strain and K(y) the quartic in y = cos(2 angle) through the other rows less K0.
+// where K0 is the table's row at no strain and K(y) the quartic in y = cos(2 angle) through the
+// other rows less K0.
 //
-//   e = a + z w,   y = h w,   w = 1/r   where r >= a,   else (15 - 10 s + 3 s^2) / (8 a) with s = z/a^2:
+//   e = a + z w,   y = h w,   w = 1/r   where r >= a,   else (15 - 10 s + 3 s^2) / (8 a) with s =
+//   z/a^2:
 //
-// e is the larger principal strain and y = h/r; where both strains are positive e tends to a and y to 0 as these become
-// equal, for then no direction is the first one. The table's share s(e) = (sqrt(1 + 2 e) - 1) / table_stretch, 1 at
-// most, grows with the strain, so (m e^2)' = s(e) e gives
+// e is the larger principal strain and y = h/r; where both strains are positive e tends to a and y
+// to 0 as these become equal, for then no direction is the first one. The table's share s(e) =
+// (sqrt(1 + 2 e) - 1) / table_stretch, 1 at most, grows with the strain, so (m e^2)' = s(e) e gives
 //
 //   m = 2 e - 3 e^2/4 + d e^3/5 up to the strain U of the table's end,   1/2 + c/e^2 beyond.
 //
-// g = t^2 (6 - 8 t + 3 t^2) with t = (a + r)/r, at most 1, takes the table away where nothing is in tension. W is twice
-// continuously differentiable except at e = U and at no strain.
+// g = t^2 (6 - 8 t + 3 t^2) with t = (a + r)/r, at most 1, takes the table away where nothing is in
+// tension. W is twice continuously differentiable except at e = U and at no strain.
 #pragma once
 
 #include "cloth/kernels/vectors.hpp"
@@ -26,10 +29,11 @@ namespace sim_core {
 namespace {
 
 constexpr double table_end = 0.5 * ((1.0 + table_stretch) * (1.0 + table_stretch) - 1.0);  // U
-constexpr double share_cubic =
-    (1.0 - 6.0 * table_end + 3.0 * table_end * table_end) / (table_end * table_end * table_end);  // d
+constexpr double share_cubic = (1.0 - 6.0 * table_end + 3.0 * table_end * table_end) /
+                               (table_end * table_end * table_end);  // d
 constexpr double share_tail =
-    (table_end * (2.0 - table_end * (0.75 - 0.2 * share_cubic * table_end)) - 0.5) * table_end * table_end;  // c
+    (table_end * (2.0 - table_end * (0.75 - 0.2 * share_cubic * table_end)) - 0.5) * table_end *
+    table_end;  // c
 
 // An energy per area with its derivatives by (a, h, q).
 struct StretchLaw {
@@ -55,7 +59,8 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
   const Lane equal = a * a - z;  // > 0: of one sign
   const auto both = (a > zero) & (equal > zero);
   // w and its derivatives by a and z.
-  const Lane inverse = one / (both ? a : root(z)), inverse2 = inverse * inverse, inverse3 = inverse * inverse2;
+  const Lane inverse = one / (both ? a : root(z)), inverse2 = inverse * inverse,
+             inverse3 = inverse * inverse2;
   const Lane s = both ? z * inverse2 : zero;
   const Lane w = both ? 0.125 * inverse * (15.0 - s * (10.0 - 3.0 * s)) : inverse;
   const Lane w_a = both ? -1.875 * inverse2 * (one - s) * (one - s) : zero;
@@ -65,8 +70,10 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
   const Lane tension = e > zero ? e : zero;
   const auto inside = tension <= table_end;
   const Lane tail = one / (inside ? one : tension * tension);
-  const Lane m = inside ? tension * (2.0 - tension * (0.75 - 0.2 * share_cubic * tension)) : 0.5 + share_tail * tail;
-  const Lane m_e = inside ? 2.0 - tension * (1.5 - 0.6 * share_cubic * tension) : -2.0 * share_tail * tail / tension;
+  const Lane m = inside ? tension * (2.0 - tension * (0.75 - 0.2 * share_cubic * tension))
+                        : 0.5 + share_tail * tail;
+  const Lane m_e = inside ? 2.0 - tension * (1.5 - 0.6 * share_cubic * tension)
+                          : -2.0 * share_tail * tail / tension;
   // g, whose derivatives are zero where t is 0 or 1, or m is zero.
   const Lane ratio = a < zero ? 1.0 + a * w : one, t = ratio > zero ? ratio : zero, rest = one - t;
   const Lane t_z = a * w_z, g = t * t * (6.0 - t * (8.0 - 3.0 * t)), g_t = 12.0 * t * rest * rest;
@@ -86,7 +93,8 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
   const Lane h2 = 2.0 * h, q2 = 2.0 * q;  // of z by h and q
   const Lane y_a = h * w_a, y_z = h * w_z, y_h = w + y_z * h2, y_q = y_z * q2;
   const Lane Q = own.value;
-  const Lane Q_a = own.a + turn.value * y_a, Q_h = own.h + turn.value * y_h, Q_q = own.q + turn.value * y_q;
+  const Lane Q_a = own.a + turn.value * y_a, Q_h = own.h + turn.value * y_h,
+             Q_q = own.q + turn.value * y_q;
   const Lane u_h = u_z * h2, u_q = u_z * q2;
   law.energy += u * Q;
   law.a += u_a * Q + u * Q_a;
@@ -101,10 +109,13 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
     const Lane m_ee = inside ? -1.5 + 1.2 * share_cubic * tension : 6.0 * share_tail * tail * tail;
     const Lane u_ee = m_ee * g, u_et = m_e * g_t, u_tt = 12.0 * m * rest * (one - 3.0 * t);
     const Lane u_aa = u_ee * e_a * e_a + u_e * e_aa + 2.0 * u_et * e_a * w + u_tt * w * w;
-    const Lane u_az = u_ee * e_a * e_z + u_e * e_az + u_et * (e_a * t_z + e_z * w) + u_tt * w * t_z + u_t * w_z;
-    const Lane u_zz = u_ee * e_z * e_z + u_e * e_zz + 2.0 * u_et * e_z * t_z + u_tt * t_z * t_z + u_t * a * w_zz;
+    const Lane u_az =
+        u_ee * e_a * e_z + u_e * e_az + u_et * (e_a * t_z + e_z * w) + u_tt * w * t_z + u_t * w_z;
+    const Lane u_zz =
+        u_ee * e_z * e_z + u_e * e_zz + 2.0 * u_et * e_z * t_z + u_tt * t_z * t_z + u_t * a * w_zz;
     const Lane u_ah = u_az * h2, u_aq = u_az * q2;
-    const Lane u_hh = u_zz * h2 * h2 + 2.0 * u_z, u_hq = u_zz * h2 * q2, u_qq = u_zz * q2 * q2 + 2.0 * u_z;
+    const Lane u_hh = u_zz * h2 * h2 + 2.0 * u_z, u_hq = u_zz * h2 * q2,
+               u_qq = u_zz * q2 * q2 + 2.0 * u_z;
     const Lane y_zz = h * w_zz, y_az = h * w_az;
     const Lane y_aa = h * w_aa, y_ah = w_a + y_az * h2, y_aq = y_az * q2;
     const Lane y_hh = 2.0 * w_z * h2 + y_zz * h2 * h2 + 2.0 * y_z, y_hq = w_z * q2 + y_zz * h2 * q2;
@@ -136,14 +147,15 @@ inline StretchLaw stretch_law(const double* k, bool tabulated, Lane a, Lane h, L
   return law;
 }
 
-// Makes the law's second derivatives positive semi-definite where they are not: negative eigenvalues become zero
-// [Teran et al. 2005]. (a, h, q) have the metric of strain, so this does not depend on the axes.
+// Makes the law's second derivatives positive semi-definite where they are not: negative
+// eigenvalues become zero [Teran et al. 2005]. (a, h, q) have the metric of strain, so this does
+// not depend on the axes.
 inline void make_definite(StretchLaw& law) {
   constexpr int sweeps = 4;  // of Jacobi's rotations, to rounding
   const Lane zero{}, one = zero + 1.0;
   const Lane minor = law.aa * law.hh - law.ah * law.ah;
-  const Lane whole =
-      law.qq * minor - law.aa * law.hq * law.hq - law.hh * law.aq * law.aq + 2.0 * law.ah * law.aq * law.hq;
+  const Lane whole = law.qq * minor - law.aa * law.hq * law.hq - law.hh * law.aq * law.aq +
+                     2.0 * law.ah * law.aq * law.hq;
   const auto definite = (law.aa > zero) & (minor > zero) & (whole >= zero);
   bool all = true;
   for (int l = 0; l < membrane_lanes; ++l) all = all && definite[l];

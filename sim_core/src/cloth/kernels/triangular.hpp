@@ -46,7 +46,8 @@ inline void add_transposed(const Kept* tile, const float* y, Floats* sum) {
   }
 }
 
-// A block of columns whose own rows begin at y: they are solved for, and leave the `below` rows after them.
+// A block of columns whose own rows begin at y: they are solved for, and leave the `below` rows
+// after them.
 template <int width, class Kept>
 inline void forward(const Kept* tile, float* y, int below) {
   float z[tile_rows];
@@ -54,7 +55,8 @@ inline void forward(const Kept* tile, float* y, int below) {
   add_tile<width, false>(tile, y, z);
   for (int q = 0; q < width; ++q) y[q] = z[q];
   tile += width * tile_rows;
-  for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows) add_tile<width, true>(tile, z, y + width + i);
+  for (int i = 0; i < below; i += tile_rows, tile += width * tile_rows)
+    add_tile<width, true>(tile, z, y + width + i);
 }
 
 template <int width, class Kept>

@@ -1,4 +1,5 @@
-// The registers of the cloth kernels: CLOTH_FLOATS floats, a node (x, y, z, 0), and eight triangles side by side.
+// The registers of the cloth kernels: CLOTH_FLOATS floats, a node (x, y, z, 0), and eight triangles
+// side by side.
 #pragma once
 
 #if CLOTH_FLOATS > 4
@@ -16,8 +17,8 @@ typedef float Node __attribute__((vector_size(16), aligned(16), may_alias));
 typedef double NodeD __attribute__((vector_size(32), aligned(32), may_alias));
 typedef double Lane __attribute__((vector_size(8 * membrane_lanes), aligned(64), may_alias));
 
-// Takes denormal numbers for zeros while it lives. A factor has many of them where many nodes stick, and processors are
-// slow with them.
+// Takes denormal numbers for zeros while it lives. A factor has many of them where many nodes
+// stick, and processors are slow with them.
 struct FlushTiny {
 #if defined(__SSE__)
   unsigned before = __builtin_ia32_stmxcsr();
@@ -29,17 +30,26 @@ struct FlushTiny {
 inline Floats wide(const float* from) { return *reinterpret_cast<const Floats*>(from); }
 inline void keep(Floats v, float* to) { *reinterpret_cast<Floats*>(to) = v; }
 
-// Numbers of half precision, where vectors are wide; cut, not rounded, so that none becomes infinite.
+// Numbers of half precision, where vectors are wide; cut, not rounded, so that none becomes
+// infinite.
 #if CLOTH_FLOATS == 4
 typedef float Half;
 #else
 typedef unsigned short Half;
 #if CLOTH_FLOATS == 16
-inline Floats wide(const Half* from) { return _mm512_cvtph_ps(_mm256_loadu_si256((const __m256i*)from)); }
-inline void keep(Floats v, Half* to) { _mm256_storeu_si256((__m256i*)to, _mm512_cvtps_ph(v, _MM_FROUND_TO_ZERO)); }
+inline Floats wide(const Half* from) {
+  return _mm512_cvtph_ps(_mm256_loadu_si256((const __m256i*)from));
+}
+inline void keep(Floats v, Half* to) {
+  _mm256_storeu_si256((__m256i*)to, _mm512_cvtps_ph(v, _MM_FROUND_TO_ZERO));
+}
 #else
-inline Floats wide(const Half* from) { return _mm256_cvtph_ps(_mm_loadu_si128((const __m128i*)from)); }
-inline void keep(Floats v, Half* to) { _mm_storeu_si128((__m128i*)to, _mm256_cvtps_ph(v, _MM_FROUND_TO_ZERO)); }
+inline Floats wide(const Half* from) {
+  return _mm256_cvtph_ps(_mm_loadu_si128((const __m128i*)from));
+}
+inline void keep(Floats v, Half* to) {
+  _mm_storeu_si128((__m128i*)to, _mm256_cvtps_ph(v, _MM_FROUND_TO_ZERO));
+}
 #endif
 #endif
 

@@ -1,13 +1,14 @@
-"""Named test sets, whether a dataset is one of them, and entries: records of scores, and their table.
+"""Named test sets, whether a dataset is one of them, and entries: records of scores, and their
+table.
 
-A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ between
-machines, and so do manifests. What identifies a set is therefore what its samples hold:
+A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ
+between machines, and so do manifests. What identifies a set is therefore what its samples hold:
 
   * the labels that follow from the spec, slot by slot, to the last bit: a digest;
   * a little of what methods see, and of truths that are computed, to within a tolerance: an array.
 
-The manifests of versions that were published stand beside it, so that a table can tell entries on the published bytes
-from those on a set that was remade.
+The manifests of versions that were published stand beside it, so that a table can tell entries on
+the published bytes from those on a set that was remade.
 """
 
 import json
@@ -76,7 +77,10 @@ class NamedSet:
                 f"{self.labels}. Samples were rejected here, or the dataset is in parts"
             )
         for name, found_here in self.task.seen(reader, slots).items():
-            off, allowed = np.abs(found_here - self.seen[name].astype(np.float64)).max(), self.task.tolerances[name]
+            off, allowed = (
+                np.abs(found_here - self.seen[name].astype(np.float64)).max(),
+                self.task.tolerances[name],
+            )
             if not off <= allowed:
                 raise ValueError(
                     f"{refused}{name} differs by up to {off:.3g}, and {allowed:g} is allowed. This build or machine "
@@ -104,7 +108,8 @@ def labels_digest(task: Task, reader: DatasetReader, slots: Integers) -> str:
     return sha256(canonical_json(task.labels(reader, slots)).encode())
 
 
-# --- entries --------------------------------------------------------------------------------------------------
+# --- entries
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +136,14 @@ class Record:
 
 
 def enter(
-    name: str, answers: Path, dataset: str, *, method: str, by: str, trained_on: str, link: str | None = None
+    name: str,
+    answers: Path,
+    dataset: str,
+    *,
+    method: str,
+    by: str,
+    trained_on: str,
+    link: str | None = None,
 ) -> Record:
     """Score a file of answers to the test set `name`.
 
@@ -140,7 +152,9 @@ def enter(
     data = answers.read_bytes()
     answered = json.loads(data)
     if not isinstance(answered, list):
-        raise ValueError(f"{answers} must hold a list of answers, and holds a {type(answered).__name__}")
+        raise ValueError(
+            f"{answers} must hold a list of answers, and holds a {type(answered).__name__}"
+        )
     chosen = load_set(name)
     with DatasetReader(dataset) as reader:
         slots, making = chosen.check(reader)
@@ -164,28 +178,44 @@ def read_record(path: Path) -> Record:
     try:
         return Record(**json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} must be a record of `stickslip-train benchmark score`: {error}") from None
+        raise ValueError(
+            f"{path} must be a record of `stickslip-train benchmark score`: {error}"
+        ) from None
 
 
 def table(name: str, records: Iterable[Record]) -> str:
     """Return the Markdown table of the records of a set, best first."""
     task = load_set(name).task
-    mine = sorted((record for record in records if record.set == name), key=lambda each: task.rank(each.scores))
+    mine = sorted(
+        (record for record in records if record.set == name),
+        key=lambda each: task.rank(each.scores),
+    )
     titles = ("method", *task.columns, "trained on", "by", "set")
     lines = [_line(titles), "|---" * len(titles) + "|"]
     for record in mine:
         method = record.method if record.link is None else f"[{record.method}]({record.link})"
-        lines.append(_line((method, *task.row(record.scores), record.trained_on, record.by, record.making)))
+        lines.append(
+            _line((method, *task.row(record.scores), record.trained_on, record.by, record.making))
+        )
     return "\n".join(lines)
 
 
 def with_tables(page: str, records: Iterable[Record]) -> str:
-    """Return a page in which what stands between `<!-- results of NAME -->` and `<!-- end -->` is that table."""
-    known, place = list(records), re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S)
-    changed, count = place.subn(lambda found: f"{found[1]}\n{table(found[2], known)}\n{found[3]}", page)
+    """Return a page in which what stands between `<!-- results of NAME -->` and `<!-- end -->` is
+    that table.
+    """
+    known, place = (
+        list(records),
+        re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S),
+    )
+    changed, count = place.subn(
+        lambda found: f"{found[1]}\n{table(found[2], known)}\n{found[3]}", page
+    )
     missing = {record.set for record in known} - set(re.findall(r"<!-- results of (\S+) -->", page))
     if missing or not count:
-        raise ValueError(f"the page must have a place `<!-- results of NAME -->` for {', '.join(sorted(missing))}")
+        raise ValueError(
+            f"the page must have a place `<!-- results of NAME -->` for {', '.join(sorted(missing))}"
+        )
     return changed
 
 

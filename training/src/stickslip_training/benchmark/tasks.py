@@ -49,12 +49,19 @@ class Task(ABC):
 
     @abstractmethod
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
-        """Return what a method is given, with noise from a secret; raise ValueError where that is the dataset
-        itself."""
+        """Return what a method is given, with noise from a secret.
+
+        Raise ValueError where that is the dataset itself.
+        """
 
     @abstractmethod
-    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
-        """Return the scores of answers as plain values; raise ValueError, which names the answer, where one is none."""
+    def score(
+        self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]
+    ) -> dict[str, Any]:
+        """Return the scores of answers as plain values.
+
+        Raise ValueError, which names the answer, where one is none.
+        """
 
     @abstractmethod
     def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
@@ -66,7 +73,9 @@ class Task(ABC):
 
 
 class ClothTask(Task):
-    """Friction and material of every clip: answers are what `stickslip-train cloth predict --json` prints."""
+    """Friction and material of every clip: answers are what `stickslip-train cloth predict --json`
+    prints.
+    """
 
     label_names = ("mu", "material", "texture", "viewpoint", "lighting")
     columns = (
@@ -80,19 +89,31 @@ class ClothTask(Task):
     tolerances = {"frames": 1.5}  # noqa: RUF012  # levels of 255, of means over 14 x 14 pixels
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
-        shown = np.linspace(0, reader.arrays["video"].shape[0] - 1, _SHOWN + 2).round().astype(int)[1:-1]
+        shown = (
+            np.linspace(0, reader.arrays["video"].shape[0] - 1, _SHOWN + 2)
+            .round()
+            .astype(int)[1:-1]
+        )
         means = [
-            torch.nn.functional.avg_pool2d(grey(torch.from_numpy(reader.read("video", [slot])[0][shown])), _BLOCK)
+            torch.nn.functional.avg_pool2d(
+                grey(torch.from_numpy(reader.read("video", [slot])[0][shown])), _BLOCK
+            )
             for slot in slots.tolist()
         ]
         return {"frames": (255 * torch.stack(means)).round().to(torch.uint8).numpy()}
 
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
-        raise ValueError("a method is given the clips themselves: read the array video of the dataset")
+        raise ValueError(
+            "a method is given the clips themselves: read the array video of the dataset"
+        )
 
-    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
+    def score(
+        self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]
+    ) -> dict[str, Any]:
         truth = truth_of_slots(reader, slots)
-        return asdict(score_predictions(answers, reader.categories("material"), slots.tolist(), truth))
+        return asdict(
+            score_predictions(answers, reader.categories("material"), slots.tolist(), truth)
+        )
 
     def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
         blind, bands = scores["blind"], scores["bands"]
@@ -106,7 +127,10 @@ class ClothTask(Task):
             f"{blind['within_01']['value']:.0%} / {blind['within_02']['value']:.0%}",
             f"{scores['top_1']['value']:.0%}",
             f"{blind['coverage']['value']:.0%}",
-            *(error(bands[name]) if name in bands else "" for name in (f"{low:g} to {high:g}" for low, high in BANDS)),
+            *(
+                error(bands[name]) if name in bands else ""
+                for name in (f"{low:g} to {high:g}" for low, high in BANDS)
+            ),
         )
 
     def rank(self, scores: Mapping[str, Any]) -> float:
@@ -114,15 +138,16 @@ class ClothTask(Task):
 
 
 class RodTask(Task):
-    """Curvature of hanging rods from noisy centrelines, and their weight over their stiffness, gamma.
+    """Curvature of hanging rods from noisy centrelines, and their weight over their stiffness,
+    gamma.
 
-    A method is given the centrelines of the split test under white noise of three strengths, drawn from a secret. Its
-    answers are a list with
+    A method is given the centrelines of the split test under white noise of three strengths, drawn
+    from a secret. Its answers are a list with
 
         {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
 
-    for every rod and noise. `bending` is null where a method has no answer, which counts as infinitely wrong. `gamma`
-    may be left out.
+    for every rod and noise. `bending` is null where a method has no answer, which counts as
+    infinitely wrong. `gamma` may be left out.
     """
 
     label_names = ("gamma", "phi0", "phi1")
@@ -134,7 +159,10 @@ class RodTask(Task):
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         exact = reader.read("centerline", slots)
-        return {"centerline": exact[:, ::_EVERY], "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32)}
+        return {
+            "centerline": exact[:, ::_EVERY],
+            "bending": _truth(reader, slots)[:, ::_EVERY].astype(np.float32),
+        }
 
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
         """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3).
@@ -142,10 +170,14 @@ class RodTask(Task):
         Who does not know the secret cannot draw the noise again and take it away.
         """
         exact, seed = reader.read("centerline", slots), int(sha256(secret), 16)
-        lines = np.stack([with_white_noise(exact, noise, (seed, place)) for place, noise in enumerate(NOISES)])
+        lines = np.stack(
+            [with_white_noise(exact, noise, (seed, place)) for place, noise in enumerate(NOISES)]
+        )
         return {"slot": slots, "noise": np.array(NOISES), "centerline": lines}
 
-    def score(self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]) -> dict[str, Any]:
+    def score(
+        self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]
+    ) -> dict[str, Any]:
         truth, gamma = _truth(reader, slots), reader.label("gamma")[slots]
         estimated, weights = _parsed(answers, slots, truth.shape[1])
         found = {}
@@ -179,7 +211,10 @@ def _truth(reader: DatasetReader, slots: Integers) -> Floats:
 def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:
     """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods); NaN where a method gives none."""
     rows = {int(slot): row for row, slot in enumerate(slots)}
-    estimated, gamma = np.full((len(NOISES), len(slots), points), np.nan), np.full((len(NOISES), len(slots)), np.nan)
+    estimated, gamma = (
+        np.full((len(NOISES), len(slots), points), np.nan),
+        np.full((len(NOISES), len(slots)), np.nan),
+    )
     answered = np.zeros(gamma.shape, dtype=bool)
     for place, answer in enumerate(answers):
         try:
@@ -197,15 +232,21 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
             )
         where = NOISES.index(noise), rows[slot]
         if answered[where]:
-            raise ValueError(f"slot {slot} is answered twice at noise {noise:g}, at {place} for the second time")
+            raise ValueError(
+                f"slot {slot} is answered twice at noise {noise:g}, at {place} for the second time"
+            )
         answered[where] = True
         if values is not None:
             if values.shape != (points,) or not (np.isfinite(values).all() and (values >= 0).all()):
-                raise ValueError(f"bending of answer {place} must be {points} finite numbers of 0 or more, or null")
+                raise ValueError(
+                    f"bending of answer {place} must be {points} finite numbers of 0 or more, or null"
+                )
             estimated[where] = values
         if weight is not None:
             if not 0 < weight < np.inf:
-                raise ValueError(f"gamma of answer {place} must be more than 0 and finite, and is {weight}")
+                raise ValueError(
+                    f"gamma of answer {place} must be more than 0 and finite, and is {weight}"
+                )
             gamma[where] = weight
     if not answered.all():
         noise, row = (int(index[0]) for index in np.nonzero(~answered))
@@ -217,13 +258,18 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
 
 
 def _quantiles(errors: Floats) -> dict[str, Any]:
-    """Return median and 95 % quantile, each with its 90 % interval over rods; None if it is infinite."""
+    """Return median and 95 % quantile, each with its 90 % interval over rods.
+
+    None if it is infinite.
+    """
     errors = np.where(np.isfinite(errors), errors, np.inf)
     drawn = errors[np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))]
     found: dict[str, Any] = {}
     for name, share in (("median", 0.5), ("p95", 0.95)):
         value = float(np.quantile(errors, share, method="higher"))
-        low, high = np.quantile(np.quantile(drawn, share, axis=1, method="higher"), (0.05, 0.95), method="nearest")
+        low, high = np.quantile(
+            np.quantile(drawn, share, axis=1, method="higher"), (0.05, 0.95), method="nearest"
+        )
         numbers = {"value": value, "low": float(low), "high": float(high)}
         told = {key: number if np.isfinite(number) else None for key, number in numbers.items()}
         found[name] = told if np.isfinite(value) else None
@@ -232,4 +278,6 @@ def _quantiles(errors: Floats) -> dict[str, Any]:
 
 def _cell(quantiles: Mapping[str, Any]) -> str:
     percents = [None if each is None else 100.0 * each["value"] for each in quantiles.values()]
-    return "; ".join("-" if p is None else f"{p:,.0f} %" if p >= 9.95 else f"{p:.2g} %" for p in percents)
+    return "; ".join(
+        "-" if p is None else f"{p:,.0f} %" if p >= 9.95 else f"{p:.2g} %" for p in percents
+    )

@@ -6,7 +6,9 @@ from stickslip_training.cli.benchmark import benchmark
 from stickslip_training.cli.cloth import cloth
 from stickslip_training.cli.commands import curvature, export, info, reconstruct
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Read stickslip datasets and train on them.")
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, help="Read stickslip datasets and train on them."
+)
 app.command()(info)
 app.command()(export)
 app.command()(curvature)

@@ -15,7 +15,9 @@ from stickslip_training.data.reader import DatasetReader
 
 benchmark = typer.Typer(no_args_is_help=True, help="Named test sets: enter yours, and compare.")
 
-SetArgument = Annotated[str, typer.Argument(metavar="SET", help="name of a test set: see `benchmark list`")]
+SetArgument = Annotated[
+    str, typer.Argument(metavar="SET", help="name of a test set: see `benchmark list`")
+]
 
 
 @benchmark.command("list")
@@ -57,7 +59,10 @@ def inputs(
     dataset: DatasetArgument,
     out: Annotated[Path, typer.Option(help="file for what a method is given (.npz)")],
     secret: Annotated[
-        Path, typer.Option(help="file that the noise is drawn from; the scorer keeps it, and the first call makes it")
+        Path,
+        typer.Option(
+            help="file that the noise is drawn from; the scorer keeps it, and the first call makes it"
+        ),
     ],
 ) -> None:
     """Write what a method is given, where that is not the dataset itself: rods are seen with noise."""
@@ -80,19 +85,25 @@ def inputs(
 @benchmark.command()
 def score(
     name: SetArgument,
-    predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS", help="your answers, a JSON list")],
+    predictions: Annotated[
+        Path, typer.Argument(metavar="PREDICTIONS", help="your answers, a JSON list")
+    ],
     dataset: DatasetArgument,
     method: Annotated[str, typer.Option(help="its name in the table")] = "yours",
     by: Annotated[str, typer.Option(help="who entered it")] = "you",
     trained_on: Annotated[str, typer.Option(help="data that the method learnt from")] = "not said",
     link: Annotated[str | None, typer.Option(help="to code, or a text about the method")] = None,
-    record: Annotated[Path | None, typer.Option(help="file for the record of this entry (.json)")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="file for the record of this entry (.json)")
+    ] = None,
 ) -> None:
     """Score a file of predictions on a test set; the dataset is compared with the set first."""
     from stickslip_training.benchmark.sets import enter, table
 
     with readable_errors():
-        entry = enter(name, predictions, dataset, method=method, by=by, trained_on=trained_on, link=link)
+        entry = enter(
+            name, predictions, dataset, method=method, by=by, trained_on=trained_on, link=link
+        )
         if record is not None:
             record.parent.mkdir(parents=True, exist_ok=True)
             write_durably(record, entry.document())
@@ -101,8 +112,13 @@ def score(
 
 @benchmark.command("table")
 def table_(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="what `benchmark score --record` wrote")],
-    page: Annotated[Path | None, typer.Option(help="put the tables into this page, between its marks")] = None,
+    records: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORD...", help="what `benchmark score --record` wrote"),
+    ],
+    page: Annotated[
+        Path | None, typer.Option(help="put the tables into this page, between its marks")
+    ] = None,
 ) -> None:
     """Print the tables of records, best first, or put them into a page."""
     from stickslip_training.benchmark.sets import read_record, table, with_tables

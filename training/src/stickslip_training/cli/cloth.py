@@ -14,19 +14,28 @@ from stickslip_training.data.reader import DatasetReader, Split
 NO_ANSWER = 3
 """Exit status of `predict` where no clip has an answer."""
 
-cloth = typer.Typer(no_args_is_help=True, help="Measure friction and material of dragged cloth from video.")
+cloth = typer.Typer(
+    no_args_is_help=True, help="Measure friction and material of dragged cloth from video."
+)
 
 RunsArgument = Annotated[
-    str, typer.Argument(metavar="RUNS", help="a dataset that stores positions, or a packed file of simulations (.npz)")
+    str,
+    typer.Argument(
+        metavar="RUNS",
+        help="a dataset that stores positions, or a packed file of simulations (.npz)",
+    ),
 ]
 
 
 @cloth.command()
 def train(
     runs: RunsArgument,
-    out: Annotated[Path, typer.Option(help="directory for the model, the checkpoint and the report")],
+    out: Annotated[
+        Path, typer.Option(help="directory for the model, the checkpoint and the report")
+    ],
     validation: Annotated[
-        str | None, typer.Option(help="a packed file of simulations to validate; a dataset has a split for it")
+        str | None,
+        typer.Option(help="a packed file of simulations to validate; a dataset has a split for it"),
     ] = None,
     steps: Annotated[int, typer.Option(help="of training")] = 1500,
     batch: Annotated[int, typer.Option(help="clips of a step; 256 keep a GPU busy")] = 16,
@@ -36,15 +45,26 @@ def train(
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
     clips: Annotated[
         list[str] | None,
-        typer.Option(help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"),
+        typer.Option(
+            help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"
+        ),
     ] = None,
     start: Annotated[
-        list[Path] | None, typer.Option(help="a friction.safetensors whose weights are the first; of several, the mean")
+        list[Path] | None,
+        typer.Option(
+            help="a friction.safetensors whose weights are the first; of several, the mean"
+        ),
     ] = None,
-    rate: Annotated[float, typer.Option(help="of learning, the highest; smaller where a model goes on")] = 2e-3,
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+    rate: Annotated[
+        float, typer.Option(help="of learning, the highest; smaller where a model goes on")
+    ] = 2e-3,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on from the checkpoint in --out")
+    ] = False,
 ) -> None:
-    """Train a network that estimates material and friction, on pictures rendered from simulations while it trains."""
+    """Train a network that estimates material and friction, on pictures rendered from simulations
+    while it trains.
+    """
     from stickslip_schemas.base import sha256
 
     from stickslip_training.cloth.clips import training_clips, training_runs
@@ -55,13 +75,21 @@ def train(
     console = Console()
     with readable_errors():
         settings = ClothTraining(
-            steps=steps, batch_size=batch, width=width, learning_rate=rate, seed=seed, threads=threads, device=device
+            steps=steps,
+            batch_size=batch,
+            width=width,
+            learning_rate=rate,
+            seed=seed,
+            threads=threads,
+            device=device,
         )
         first = mean_model([load_friction(path) for path in start]) if start else None
         settings = settings if first is None else settings.going_on()
         source, learned, judged = training_runs(runs, validation)
         source["start"] = [sha256(path.read_bytes()) for path in start or []]
-        source["clips"], rendered = training_clips(clips, learned, judged) if clips else (None, None)
+        source["clips"], rendered = (
+            training_clips(clips, learned, judged) if clips else (None, None)
+        )
         model = train_friction(
             learned,
             judged,
@@ -81,25 +109,38 @@ def train(
 
 @cloth.command()
 def predict(
-    source: Annotated[str, typer.Argument(metavar="DATASET_OR_VIDEO", help="a dataset, or a video with --camera")],
+    source: Annotated[
+        str, typer.Argument(metavar="DATASET_OR_VIDEO", help="a dataset, or a video with --camera")
+    ],
     model: Annotated[
-        Path | None, typer.Option(help="friction.safetensors of `cloth train`; that of the package if not given")
+        Path | None,
+        typer.Option(
+            help="friction.safetensors of `cloth train`; that of the package if not given"
+        ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="train, validation or test; all clips if not given")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="train, validation or test; all clips if not given")
+    ] = None,
     camera: Annotated[
-        Path | None, typer.Option(help="calibrated camera of a video, TOML: see the README of training")
+        Path | None,
+        typer.Option(help="calibrated camera of a video, TOML: see the README of training"),
     ] = None,
     start: Annotated[
         float | None, typer.Option(help="when the holders start in a video [s]; found if not given")
     ] = None,
-    frame_rate: Annotated[float | None, typer.Option(help="of a video [1/s]; its own times if not given")] = None,
+    frame_rate: Annotated[
+        float | None, typer.Option(help="of a video [1/s]; its own times if not given")
+    ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="print a list of {slot, material, mu, familiarity, no_answer}")
+        bool,
+        typer.Option("--json", help="print a list of {slot, material, mu, familiarity, no_answer}"),
     ] = False,
 ) -> None:
-    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your own video.
+    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your
+    own video.
 
-    A clip that is unlike those of training has no answer, and a reason; if all are so, the exit status is 3.
+    A clip that is unlike those of training has no answer, and a reason; if all are so, the exit
+    status is 3.
     """
     from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
@@ -111,7 +152,9 @@ def predict(
         true: list[str] = []
         if camera is not None:
             if split is not None:
-                raise ValueError(f"split must not be given with camera: a video has none, and it is {split!r}")
+                raise ValueError(
+                    f"split must not be given with camera: a video has none, and it is {split!r}"
+                )
             calibration = load_camera(camera)
             clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate)
             Console(stderr=True).print(f"the video: {found_in}", soft_wrap=True)
@@ -119,13 +162,17 @@ def predict(
         else:
             for name, value in (("start", start), ("frame_rate", frame_rate)):
                 if value is not None:
-                    raise ValueError(f"{name} must come with --camera: clips of a dataset have times; it is {value}")
+                    raise ValueError(
+                        f"{name} must come with --camera: clips of a dataset have times; it is {value}"
+                    )
             with DatasetReader(source) as reader:
                 clips, found = read_clips(reader, cast("Split | None", split), friction.materials)
                 names = reader.categories("material")
                 fabrics = [names[code] for code in reader.label("material")[found].tolist()]
             slots = found.tolist()
-            true = [f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)]
+            true = [
+                f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)
+            ]
         answers = predictions(friction.estimate(clips), slots, friction.judge(clips))
     if as_json:
         typer.echo(json.dumps(answers, indent=1))
@@ -145,7 +192,11 @@ def _answers(answers: list[dict[str, Any]], true: list[str]) -> Table:
         if mu is None:
             cells = ["", "no answer", answer["no_answer"]]
         else:
-            bounds = f"{mu['low']:.2f} to " + (f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}")
+            bounds = f"{mu['low']:.2f} to " + (
+                f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}"
+            )
             cells = [f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
-        table.add_row(str(answer["slot"]), *cells, *true[place : place + 1], f"{answer['familiarity']:.2f}")
+        table.add_row(
+            str(answer["slot"]), *cells, *true[place : place + 1], f"{answer['familiarity']:.2f}"
+        )
     return table

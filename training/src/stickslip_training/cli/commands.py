@@ -1,4 +1,6 @@
-"""The commands `stickslip-train info`, `export`, `curvature` and `reconstruct`, and what all commands share."""
+"""The commands `stickslip-train info`, `export`, `curvature` and `reconstruct`, and what all
+commands share.
+"""
 
 import math
 from collections import Counter
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_LINES = 5.0  # epochs of a small dataset take less
 
 DatasetArgument = Annotated[
-    str, typer.Argument(metavar="DATASET", help="directory or URL of a dataset version, .../versions/1")
+    str,
+    typer.Argument(metavar="DATASET", help="directory or URL of a dataset version, .../versions/1"),
 ]
 
 
@@ -37,7 +40,9 @@ def readable_errors() -> Iterator[None]:
     try:
         yield
     except (DatasetError, ValueError, OSError, ImportError) as error:
-        Console(stderr=True).print(f"stickslip-train: {error}", style="red", soft_wrap=True, markup=False)
+        Console(stderr=True).print(
+            f"stickslip-train: {error}", style="red", soft_wrap=True, markup=False
+        )
         raise typer.Exit(1) from error
 
 
@@ -50,18 +55,25 @@ def shows_epochs(console: Console, steps: int) -> "Callable[[EpochReport], None]
         if epoch.seconds < shown_at + _SECONDS_BETWEEN_LINES:
             return
         shown_at = epoch.seconds
-        validation = "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
-        console.print(f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s")
+        validation = (
+            "" if epoch.validation_loss is None else f", validation {epoch.validation_loss:.3f}"
+        )
+        console.print(
+            f"step {epoch.step} of {steps}: loss {epoch.train_loss:.3f}{validation}, {epoch.seconds:.0f} s"
+        )
 
     return show
 
 
-# --- datasets -------------------------------------------------------------------------------------------------
+# --- datasets
+# -------------------------------------------------------------------------------------------------
 
 
 def info(
     dataset: DatasetArgument,
-    verify: Annotated[bool, typer.Option("--verify", help="check the SHA-256 of every file first")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="check the SHA-256 of every file first")
+    ] = False,
 ) -> None:
     """Say what is in a dataset."""
     with readable_errors(), DatasetReader(dataset, verify=verify) as reader:
@@ -70,16 +82,26 @@ def info(
         facts = Table.grid(padding=(0, 2))
         facts.add_row("dataset", f"{manifest.dataset}, version {manifest.version}, {reader.kind}")
         facts.add_row("spec", f"{manifest.spec_digest}")
-        facts.add_row("certificate", manifest.certificate or "none: the physics of this build is not vouched for")
+        facts.add_row(
+            "certificate",
+            manifest.certificate or "none: the physics of this build is not vouched for",
+        )
         counts = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
-        facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}")
+        facts.add_row(
+            "samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {counts}"
+        )
         reasons = Counter(str(rejection.reason) for rejection in reader.rejections())
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
-        facts.add_row("acceptance", f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {counts}" if counts else ""))
+        facts.add_row(
+            "acceptance",
+            f"{manifest.acceptance_rate:.1%}" + (f"; rejected: {counts}" if counts else ""),
+        )
         files, sizes = list(reader.files()), Counter[str]()
         for file in files:
             sizes[file.path.split("/")[0]] += file.size
-        facts.add_row("files", f"{len(files)}, {decimal(sizes.total())}" + (", verified" if verify else ""))
+        facts.add_row(
+            "files", f"{len(files)}, {decimal(sizes.total())}" + (", verified" if verify else "")
+        )
         console.print(facts)
         arrays = Table(box=None, pad_edge=False, header_style="bold")
         for title in ("array", "type", "shape", "raw", "on disk", "what"):
@@ -98,22 +120,36 @@ def info(
 
 def export(
     dataset: DatasetArgument,
-    to_hdf5: Annotated[Path | None, typer.Option("--hdf5", metavar="FILE", help="one HDF5 file")] = None,
+    to_hdf5: Annotated[
+        Path | None, typer.Option("--hdf5", metavar="FILE", help="one HDF5 file")
+    ] = None,
     to_webdataset: Annotated[
         Path | None, typer.Option("--webdataset", metavar="DIR", help="tar files for WebDataset")
     ] = None,
     to_huggingface: Annotated[
-        Path | None, typer.Option("--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets")
+        Path | None,
+        typer.Option(
+            "--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets"
+        ),
     ] = None,
     to_lerobot: Annotated[
-        Path | None, typer.Option("--lerobot", metavar="DIR", help="episodes of scenes with holders for LeRobot")
+        Path | None,
+        typer.Option(
+            "--lerobot", metavar="DIR", help="episodes of scenes with holders for LeRobot"
+        ),
     ] = None,
     to_obj: Annotated[
         Path | None, typer.Option("--obj", metavar="DIR", help="meshes of cloth, an instant each")
     ] = None,
-    arrays: Annotated[str | None, typer.Option(help="arrays to take, with commas between; labels always come")] = None,
-    split: Annotated[str | None, typer.Option(help="train, validation or test; without, all")] = None,
-    where: Annotated[list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")] = None,
+    arrays: Annotated[
+        str | None, typer.Option(help="arrays to take, with commas between; labels always come")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="train, validation or test; without, all")
+    ] = None,
+    where: Annotated[
+        list[str] | None, typer.Option(help="a condition on a label, as in 'mu<0.5'; may repeat")
+    ] = None,
 ) -> None:
     """Write a dataset in a format that other libraries read. Nothing is overwritten."""
     targets = {
@@ -126,7 +162,9 @@ def export(
     with readable_errors():
         given = {option: path for option, path in targets.items() if path is not None}
         if len(given) != 1:
-            raise ValueError(f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}")
+            raise ValueError(
+                f"an export needs one of {', '.join(targets)}, and has {', '.join(given) or 'none'}"
+            )
         [(option, target)] = given.items()
         if missing := [name for name in _NEEDED.get(option, []) if find_spec(name) is None]:
             raise ImportError(
@@ -155,7 +193,11 @@ _DIRECTORIES = {
     "--lerobot": lerobot.write,
     "--obj": formats.write_obj,
 }
-_NEEDED = {"--hdf5": ["h5py"], "--huggingface": ["datasets", "pyarrow"], "--lerobot": ["av", "pandas", "pyarrow"]}
+_NEEDED = {
+    "--hdf5": ["h5py"],
+    "--huggingface": ["datasets", "pyarrow"],
+    "--lerobot": ["av", "pandas", "pyarrow"],
+}
 
 
 @contextmanager
@@ -168,21 +210,30 @@ def _progress(content: Content) -> Iterator[OnBytes]:
         yield lambda count: bar.advance(row, count)
 
 
-# --- rods -----------------------------------------------------------------------------------------------------
+# --- rods
+# -----------------------------------------------------------------------------------------------------
 
 
 def curvature(
     dataset: DatasetArgument,
     out: Annotated[Path, typer.Option(help="directory for the model and the report")],
-    steps: Annotated[int, typer.Option(help="of training; 1000 of 16 rods take 70 CPU seconds")] = 1000,
-    noise: Annotated[float, typer.Option(help="noise on every coordinate, standard deviation over L")] = 0.005,
+    steps: Annotated[
+        int, typer.Option(help="of training; 1000 of 16 rods take 70 CPU seconds")
+    ] = 1000,
+    noise: Annotated[
+        float, typer.Option(help="noise on every coordinate, standard deviation over L")
+    ] = 0.005,
     seed: Annotated[int, typer.Option()] = 0,
     batch_size: Annotated[int, typer.Option()] = 16,
     threads: Annotated[int, typer.Option(help="of torch")] = 2,
     device: Annotated[str, typer.Option(help="of torch: cpu, cuda")] = "cpu",
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="go on from the checkpoint in --out")
+    ] = False,
 ) -> None:
-    """Train the network that estimates curvature from a noisy centreline, and compare it with no learning."""
+    """Train the network that estimates curvature from a noisy centreline, and compare it with no
+    learning.
+    """
     from stickslip_training.rods.curvature import CurvatureTraining, train_curvature
 
     console = Console()
@@ -227,22 +278,42 @@ def _results(report: dict[str, Any]) -> Table:
 
 
 def reconstruct(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="one picture for each camera, named as the camera")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="one picture for each camera, named as the camera"),
+    ],
     calibration: Annotated[Path, typer.Option(help="cameras as in the rigs of stickslip-schemas")],
-    out: Annotated[Path, typer.Option(help="directory for the centreline, the overlay and the report")],
+    out: Annotated[
+        Path, typer.Option(help="directory for the centreline, the overlay and the report")
+    ],
     length: Annotated[float, typer.Option(help="of the rod, in the unit of the calibration")] = 1.0,
-    clamp: Annotated[tuple[float, float, float], typer.Option(help="where the rod leaves its clamp")] = (0, 0, 0),
-    direction: Annotated[tuple[float, float, float], typer.Option(help="of the rod in its clamp")] = (0, 0, -1),
+    clamp: Annotated[
+        tuple[float, float, float], typer.Option(help="where the rod leaves its clamp")
+    ] = (0, 0, 0),
+    direction: Annotated[
+        tuple[float, float, float], typer.Option(help="of the rod in its clamp")
+    ] = (0, 0, -1),
     radius: Annotated[float | None, typer.Option(help="of the rod; found if not given")] = None,
-    rig: Annotated[str | None, typer.Option(help="which rig of the calibration, if it has several")] = None,
-    points: Annotated[int, typer.Option(help="of the centreline, at uniform arc length", min=2)] = 150,
+    rig: Annotated[
+        str | None, typer.Option(help="which rig of the calibration, if it has several")
+    ] = None,
+    points: Annotated[
+        int, typer.Option(help="of the centreline, at uniform arc length", min=2)
+    ] = 150,
 ) -> None:
     """Reconstruct the centreline of a hanging rod from photographs by calibrated cameras."""
     from stickslip_training.reconstruction.photographs import reconstruct_folder, write_results
 
     with readable_errors():
         result = reconstruct_folder(
-            folder, calibration, length=length, clamp=clamp, direction=direction, rig=rig, points=points, radius=radius
+            folder,
+            calibration,
+            length=length,
+            clamp=clamp,
+            direction=direction,
+            rig=rig,
+            points=points,
+            radius=radius,
         )
         written = write_results(result, out)
     found, console = result.reconstruction, Console()

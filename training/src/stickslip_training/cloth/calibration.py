@@ -14,28 +14,39 @@ from stickslip_training.cloth.posterior import SHARE, Bins, Posterior, estimates
 def likeliest_temperatures(
     material: SingleFloats, mu: SingleFloats, true_material: Integers, true_mu: Floats, bins: Bins
 ) -> tuple[float, float]:
-    """Return the temperatures of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at which the truth is the most
-    likely."""
+    """Return the temperatures of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at which
+    the truth is the most likely."""
     rows, tried = np.arange(len(true_mu)), np.geomspace(0.4, 4.0, 47)
 
     def likeliest(log_p: SingleFloats, place: Integers) -> float:
         losses = [float(-np.log(softmax(log_p / t)[rows, place] + 1e-12).mean()) for t in tried]
         return float(tried[int(np.argmin(losses))])
 
-    return likeliest(material, true_material), likeliest(mu[rows, true_material], bins.place(true_mu))
+    return likeliest(material, true_material), likeliest(
+        mu[rows, true_material], bins.place(true_mu)
+    )
 
 
 def covering_temperature(
-    material: SingleFloats, mu: SingleFloats, true_mu: Floats, bins: Bins, of_material: float, share: float = SHARE
+    material: SingleFloats,
+    mu: SingleFloats,
+    true_mu: Floats,
+    bins: Bins,
+    of_material: float,
+    share: float = SHARE,
 ) -> float:
-    """Return the temperature of mu at which the intervals that should hold `share` of the truths hold that share.
+    """Return the temperature of mu at which the intervals that should hold `share` of the truths
+    hold that share.
 
-    A few large errors raise the likeliest temperature, which then widens all intervals; they hardly change this one.
+    A few large errors raise the likeliest temperature, which then widens all intervals; they hardly
+    change this one.
     """
     tried = np.geomspace(0.4, 6.0, 55)
 
     def held(temperature: float) -> float:
-        found = estimates(Posterior.of(material, mu, (), bins, (of_material, temperature)).mu, bins, share)
+        found = estimates(
+            Posterior.of(material, mu, (), bins, (of_material, temperature)).mu, bins, share
+        )
         return float(((found.low <= true_mu) & (true_mu <= found.high)).mean())
 
     return float(tried[int(np.argmin([abs(held(each) - share) for each in tried]))])

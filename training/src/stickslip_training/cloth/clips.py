@@ -1,7 +1,7 @@
 """The clips that a network sees: crops around the holders, and what is true of them.
 
-They are rendered from simulations (`render_clips`), or read from a dataset (`read_clips`) or from a file
-(`clips_of_file`).
+They are rendered from simulations (`render_clips`), or read from a dataset (`read_clips`) or from a
+file (`clips_of_file`).
 """
 
 import json
@@ -35,16 +35,16 @@ VIEWPOINTS = ("calibrated", "left", "right")
 INSTANTS = (60, 80, 130, 150, 210, 220)
 """Of the frames that a network sees, of 300: two along each of the first three legs.
 
-By then the cloth slides steadily: leave-one-out, a mesh between two neighbours in mu is 0.03 mm from the simulation
-there, and 18 mm at instant 20, where the side of the drop still shows.
+By then the cloth slides steadily: leave-one-out, a mesh between two neighbours in mu is 0.03 mm
+from the simulation there, and 18 mm at instant 20, where the side of the drop still shows.
 """
 
 RATE = 2.4
 """Instants a second [thesis, 4.2.3]."""
 
 LATE_MAX = 0.06
-"""Largest distance of a frame from its instant [s]. It moves mu by 0.005 in the mean and by up to 0.04 in 30 runs;
-a blend of the frames before and after is no better."""
+"""Largest distance of a frame from its instant [s]. It moves mu by 0.005 in the mean and by up to
+0.04 in 30 runs; a blend of the frames before and after is no better."""
 
 CHUNK = 32
 """Clips that are rendered or estimated at once outside of training."""
@@ -73,7 +73,9 @@ class Clips(Truth):
 
     def __getitem__(self, chosen: Integers | NDArray[np.bool_]) -> "Clips":
         parts: dict[str, Any] = {
-            name: value[torch.from_numpy(np.asarray(chosen))] if torch.is_tensor(value) else value[chosen]
+            name: value[torch.from_numpy(np.asarray(chosen))]
+            if torch.is_tensor(value)
+            else value[chosen]
             for name, value in vars(self).items()
         }
         return Clips(**parts)
@@ -90,10 +92,11 @@ class Clips(Truth):
 
 @dataclass(frozen=True, eq=False)
 class RenderedClips:
-    """Clips of another renderer, over dark floors, to train on besides the pictures that are rendered while training.
+    """Clips of another renderer, over dark floors, to train on besides the pictures that are
+    rendered while training.
 
-    They are a share of each batch, with worlds drawn about their cloth; `validation` chooses the weights and the
-    temperature.
+    They are a share of each batch, with worlds drawn about their cloth; `validation` chooses the
+    weights and the temperature.
     """
 
     train: Clips
@@ -103,17 +106,25 @@ class RenderedClips:
         for name in ("train", "validation"):
             part: Clips = getattr(self, name)
             if not len(part) or (part.material < 0).any():
-                raise ValueError(f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips")
+                raise ValueError(
+                    f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips"
+                )
         if self.train.cover.isnan().any():
-            raise ValueError("the clips for train must have a segmentation: other floors are drawn under their cloth")
+            raise ValueError(
+                "the clips for train must have a segmentation: other floors are drawn under their cloth"
+            )
         if shared := set(self.train.run.tolist()) & set(self.validation.run.tolist()):
-            raise ValueError(f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}")
+            raise ValueError(
+                f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}"
+            )
 
 
 def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[float, ...]]:
-    """Return the frames that are nearest to the instants that a network sees, and their own instants.
+    """Return the frames that are nearest to the instants that a network sees, and their own
+    instants.
 
-    Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX` from any frame.
+    Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX`
+    from any frame.
     """
     shown = np.asarray(instants, dtype=np.float64)
     frames = [int(np.abs(shown - instant).argmin()) for instant in INSTANTS]
@@ -131,12 +142,18 @@ def training_cameras() -> tuple[Camera, ...]:
 
 
 def render_clips(
-    runs: Runs, renders: int, seed: int, *, spread: float = 0.0, drawn_world: bool = False, device: str = "cpu"
+    runs: Runs,
+    renders: int,
+    seed: int,
+    *,
+    spread: float = 0.0,
+    drawn_world: bool = False,
+    device: str = "cpu",
 ) -> Clips:
     """Render every run `renders` times, each with a look of its own, by the cameras in turn.
 
-    `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world` each picture has a
-    world of its own, and a dark floor without. `device` renders.
+    `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world`
+    each picture has a world of its own, and a dark floor without. `device` renders.
     """
     frames, instants = frames_at(runs.instants)
     number = np.repeat(np.arange(len(runs)), renders)
@@ -146,7 +163,9 @@ def render_clips(
         for start in range(0, len(number), CHUNK):
             chosen = number[start : start + CHUNK]
             generator = torch.Generator(device).manual_seed(seed_of_step(seed, VALIDATION, start))
-            seen = randomly_turned(rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator)
+            seen = randomly_turned(
+                rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator
+            )
             looks = draw_style(len(chosen), len(frames), generator)
             meshes = torch.from_numpy(runs.positions[chosen][:, frames]).to(device)
             world = sample_surroundings(len(chosen), generator) if drawn_world else None
@@ -174,23 +193,32 @@ def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     def drawn(deviation: float) -> torch.Tensor:
         return deviation * torch.randn(len(crops), 1, 1, 1, generator=generator)
 
-    changed = crops.clamp(1e-3, 1.0) ** torch.exp(drawn(0.25)) * torch.exp(drawn(0.15)) + drawn(0.05)
+    changed = crops.clamp(1e-3, 1.0) ** torch.exp(drawn(0.25)) * torch.exp(drawn(0.15)) + drawn(
+        0.05
+    )
     shifts = torch.randint(-1, 2, (len(crops), 2), generator=generator).tolist()
     moved = [torch.roll(clip, shift, (1, 2)) for clip, shift in zip(changed, shifts, strict=True)]
     return torch.stack(moved) + 0.01 * torch.randn(crops.shape, generator=generator)
 
 
-# --- reading ---------------------------------------------------------------------------------------------------
+# --- reading
+# ---------------------------------------------------------------------------------------------------
 
 
-def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str, ...]) -> tuple[Clips, Integers]:
-    """Return the crops of the clips of a split, and their slots; `materials` are those that the network knows.
+def read_clips(
+    reader: DatasetReader, split: Split | None, materials: tuple[str, ...]
+) -> tuple[Clips, Integers]:
+    """Return the crops of the clips of a split, and their slots.
 
-    A clip of another material has the code -1. Raises ValueError where the dataset is of another kind, has no clip, or
-    shows other instants than a network needs.
+    `materials` are those that the network knows.
+
+    A clip of another material has the code -1. Raises ValueError where the dataset is of another
+    kind, has no clip, or shows other instants than a network needs.
     """
     if reader.kind != "cloth_drag":  # crops follow the path of its holders
-        raise ValueError(f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}")
+        raise ValueError(
+            f"kind of the dataset must be cloth_drag to measure friction: it is {reader.kind}"
+        )
     slots = reader.slots(split)
     if not len(slots):
         raise ValueError(f"the dataset has no clip in the split {split}")
@@ -203,7 +231,12 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
     names_of = [name for name in ("video", "segmentation") if name in reader.arrays]
     pictures = ([reader.read(name, some)[:, frames] for name in names_of] for some in chunks)
     crops, cover = _cropped(pictures, seen, instants)
-    known = np.array([materials.index(name) if name in materials else -1 for name in reader.categories("material")])
+    known = np.array(
+        [
+            materials.index(name) if name in materials else -1
+            for name in reader.categories("material")
+        ]
+    )
     clips = Clips(
         crops=crops,
         direction=seen.rotation[:, 2],
@@ -218,19 +251,25 @@ def read_clips(reader: DatasetReader, split: Split | None, materials: tuple[str,
 def _cropped(
     pictures: Iterable[Sequence[Array]], seen: Cameras, instants: tuple[float, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return crops and coverage of batches of pictures (n, F, H, W, 3) and, where they are known, classes."""
+    """Return crops and coverage of batches of pictures (n, F, H, W, 3) and, where they are known,
+    classes.
+    """
     crops, covers, first = [], [], 0
     for video, *classes in pictures:
         place = holder_crops(seen[first : first + len(video)], instants)
         first += len(video)
         crops.append(cut(grey(torch.from_numpy(video)), place))
-        masks = [torch.from_numpy((codes == SEGMENTS.index("cloth")).astype(np.float32)) for codes in classes]
+        masks = [
+            torch.from_numpy((codes == SEGMENTS.index("cloth")).astype(np.float32))
+            for codes in classes
+        ]
         covers.append(cut(masks[0], place) if masks else torch.full_like(crops[-1], math.nan))
     return torch.cat(crops), torch.cat(covers)
 
 
 def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
-    """Return the crops of the clips that `benchmarks/training/blender_clips.py` wrote, and what is true of each.
+    """Return the crops of the clips that `benchmarks/training/blender_clips.py` wrote, and what is
+    true of each.
 
     `Clips.run` is the number of the simulation in the packed file that the clips are of.
     """
@@ -239,17 +278,35 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
             raise ValueError(
                 f"{path} must be a file of clips with video, segmentation, instants and about: it has {file.files}"
             )
-        video, classes, shown = file["video"], file["segmentation"], tuple(map(int, file["instants"]))
+        video, classes, shown = (
+            file["video"],
+            file["segmentation"],
+            tuple(map(int, file["instants"])),
+        )
         about = [json.loads(str(line)) for line in file["about"]]
     frames, instants = frames_at(shown)
     named = {camera.name: camera for camera in load_rig(RIG)}
     seen = Cameras.of([named[clip["viewpoint"]] for clip in about])
     crops, cover = _cropped(
-        ([part[clip : clip + 1, frames] for part in (video, classes)] for clip in range(len(video))), seen, instants
+        (
+            [part[clip : clip + 1, frames] for part in (video, classes)]
+            for clip in range(len(video))
+        ),
+        seen,
+        instants,
     )
-    known = [materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about]
+    known = [
+        materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about
+    ]
     mu, run = (np.array([clip[name] for clip in about]) for name in ("mu", "run"))
-    clips = Clips(crops=crops, direction=seen.rotation[:, 2], material=np.array(known), mu=mu, run=run, cover=cover)
+    clips = Clips(
+        crops=crops,
+        direction=seen.rotation[:, 2],
+        material=np.array(known),
+        mu=mu,
+        run=run,
+        cover=cover,
+    )
     return clips, about
 
 
@@ -260,47 +317,81 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
     """
     if source.endswith(".npz"):
         if validation is None:
-            raise ValueError("validation must be a packed file of simulations, as runs is one: it is not given")
+            raise ValueError(
+                "validation must be a packed file of simulations, as runs is one: it is not given"
+            )
         train, judged = load_runs(source), load_runs(validation)
-        named = {name: sha256(Path(of).read_bytes()) for name, of in (("runs", source), ("validation", validation))}
+        named = {
+            name: sha256(Path(of).read_bytes())
+            for name, of in (("runs", source), ("validation", validation))
+        }
         return named, train, judged.named(train.materials)
     if validation is not None:
-        raise ValueError(f"validation must not be given with a dataset, which has a split for it: it is {validation}")
+        raise ValueError(
+            f"validation must not be given with a dataset, which has a split for it: it is {validation}"
+        )
     with DatasetReader(source) as reader:
         if missing := [split for split in SPLITS if not len(reader.slots(split))]:
-            raise ValueError(f"the splits train and validation must have simulations: {', '.join(missing)} has none")
+            raise ValueError(
+                f"the splits train and validation must have simulations: {', '.join(missing)} has none"
+            )
         train, judged = (runs_of_dataset(reader, split, INSTANTS)[0] for split in SPLITS)
-        return {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate}, train, judged
+        return (
+            {"manifest": reader.manifest_digest, "certificate": reader.manifest.certificate},
+            train,
+            judged,
+        )
 
 
-def training_clips(sources: list[str], train: Runs, validation: Runs) -> tuple[list[str], RenderedClips]:
-    """Return what identifies clips of simulations to train on and to validate, and the clips of both.
+def training_clips(
+    sources: list[str], train: Runs, validation: Runs
+) -> tuple[list[str], RenderedClips]:
+    """Return what identifies clips of simulations to train on and to validate, and the clips of
+    both.
 
     `sources` are one dataset, or files of clips, whose material and mu name their simulations.
     """
     if not all(source.endswith(".npz") for source in sources):
         if len(sources) > 1:
-            raise ValueError(f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}")
+            raise ValueError(
+                f"clips must be one dataset, or files (.npz), and are {', '.join(sources)}"
+            )
         with DatasetReader(sources[0]) as reader:
             learned, judged = (read_clips(reader, split, train.materials)[0] for split in SPLITS)
             # Simulations have numbers by split.
-            return [reader.manifest_digest], RenderedClips(learned, replace(judged, run=judged.run + len(learned)))
+            return [reader.manifest_digest], RenderedClips(
+                learned, replace(judged, run=judged.run + len(learned))
+            )
     runs = zip([*train.material, *validation.material], [*train.mu, *validation.mu], strict=True)
     numbers = {run: number for number, run in enumerate(runs)}
     shown = Clips.joined([clips_of_file(Path(source), train.materials)[0] for source in sources])
     places = [numbers.get(clip, -1) for clip in zip(shown.material, shown.mu, strict=True)]
     if others := places.count(-1):
-        raise ValueError(f"clips must show simulations to train on or to validate: {others} of {len(shown)} do not")
+        raise ValueError(
+            f"clips must show simulations to train on or to validate: {others} of {len(shown)} do not"
+        )
     known = replace(shown, run=np.array(places))
     named = [sha256(Path(source).read_bytes()) for source in sources]
     return named, RenderedClips(known[known.run < len(train)], known[known.run >= len(train)])
 
 
 def simulations(reader: DatasetReader, slots: Integers) -> Integers:
-    """Return a number for each slot that is the same for the clips of one simulation: one fabric, mu and bias."""
-    names = [name for name in ("material", "mu", "bias", "areal_density", "bending_rigidity") if name in reader.arrays]
-    columns: list[Array] = [reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names]
-    return np.unique(np.concatenate(columns, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    """Return a number for each slot that is the same for the clips of one simulation: one fabric,
+    mu and bias.
+    """
+    names = [
+        name
+        for name in ("material", "mu", "bias", "areal_density", "bending_rigidity")
+        if name in reader.arrays
+    ]
+    columns: list[Array] = [
+        reader.label(name)[slots].reshape(len(slots), -1).astype(np.float64) for name in names
+    ]
+    return (
+        np.unique(np.concatenate(columns, axis=1), axis=0, return_inverse=True)[1]
+        .reshape(-1)
+        .astype(np.int64)
+    )
 
 
 def truth_of_slots(reader: DatasetReader, slots: Integers) -> Truth:

@@ -1,8 +1,9 @@
 """The holder-registered crop: every frame is seen from where the two holders are, at one scale.
 
-The path of the holders is known, and so is the camera: the middle of the two holders lands on a known pixel, at a known
-depth. A crop puts that pixel at one place of the picture and shows `SCALE` pixels a metre at that depth, whatever the
-camera. This removes errors of a pixel, or of a few parts of a thousand in scale, of a real recording.
+The path of the holders is known, and so is the camera: the middle of the two holders lands on a
+known pixel, at a known depth. A crop puts that pixel at one place of the picture and shows `SCALE`
+pixels a metre at that depth, whatever the camera. This removes errors of a pixel, or of a few parts
+of a thousand in scale, of a real recording.
 """
 
 from collections.abc import Sequence
@@ -54,7 +55,9 @@ class Cameras:
         )
 
     def __getitem__(self, chosen: slice | torch.Tensor) -> "Cameras":
-        return Cameras(self.rotation[chosen], self.translation[chosen], self.focal[chosen], self.center[chosen])
+        return Cameras(
+            self.rotation[chosen], self.translation[chosen], self.focal[chosen], self.center[chosen]
+        )
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Project points (B, ..., 3) [m] to pixels (B, ..., 2) and depths (B, ...) [m]."""
@@ -77,7 +80,9 @@ class Crops:
         return Crops(self.origin[chosen], self.scale[chosen])
 
     def off_by(self, shift: torch.Tensor, stretch: torch.Tensor) -> "Crops":
-        """Return crops whose registration is wrong: by pixels of the crop (B, F, 2), and by a factor (B,) in scale."""
+        """Return crops whose registration is wrong: by pixels of the crop (B, F, 2), and by a
+        factor (B,) in scale.
+        """
         scale = self.scale * stretch[:, None]
         return Crops(self.origin - shift / scale[..., None], scale)
 
@@ -90,8 +95,8 @@ class Crops:
 
 
 def holder_path(instants: Sequence[float] | Array) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x and z (F,) [m]
-    [thesis, 4.2.3].
+    """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x
+    and z (F,) [m] [thesis, 4.2.3].
 
     6 cm down, then 30 cm to and fro: 10 mm/s^2 up to 10 mm/s, and as it began to an end.
     """
@@ -102,7 +107,9 @@ def holder_path(instants: Sequence[float] | Array) -> tuple[torch.Tensor, torch.
         s = np.clip(since, 0.0, duration)
         cruise = 0.01 * (s - 0.5)
         braking = distance - 0.005 * (duration - s) ** 2
-        return np.asarray(np.where(s < 1.0, 0.005 * s**2, np.where(s > duration - 1.0, braking, cruise)))
+        return np.asarray(
+            np.where(s < 1.0, 0.005 * s**2, np.where(s > duration - 1.0, braking, cruise))
+        )
 
     x = sum((-1) ** leg * travel(t - 7.0 - 31.0 * leg, 0.3) for leg in range(4))
     z = 0.21 - travel(t, 0.06)
@@ -120,7 +127,8 @@ def holder_crops(cameras: Cameras, instants: Sequence[float]) -> Crops:
 def cut(video: torch.Tensor, crops: Crops) -> torch.Tensor:
     """Cut the crops out of a video (B, F, H, W), grey levels: (B, F, 72, 88), 0 beyond its frame.
 
-    A crop's pixel is the mean of 3 x 3 places in it, so that a picture that is larger is not sampled too thinly.
+    A crop's pixel is the mean of 3 x 3 places in it, so that a picture that is larger is not
+    sampled too thinly.
     """
     clips, frames, height, width = video.shape
     rows, columns = torch.meshgrid(_thirds(HEIGHT), _thirds(WIDTH), indexing="ij")
@@ -139,6 +147,8 @@ def _thirds(count: int) -> torch.Tensor:
 
 
 def grey(video: torch.Tensor) -> torch.Tensor:
-    """Return the grey levels, 0 to 1, (..., H, W), of 8-bit sRGB (..., H, W, 3): the colour of cloth means nothing."""
+    """Return the grey levels, 0 to 1, (..., H, W), of 8-bit sRGB (..., H, W, 3): the colour of
+    cloth means nothing.
+    """
     weights = torch.tensor([0.299, 0.587, 0.114], device=video.device) / 255
     return video.to(torch.float32) @ weights

@@ -1,14 +1,15 @@
 """Whether a clip has an answer: how close its silhouettes come to those of training.
 
-The network sees a silhouette in every frame, pooled to 4 x 4 pixels. The six of a clip are one point, x. With d the
-mean distance of x from the `NEAREST` clips of dragged cloth that were trained on, and b that from the `NEAREST` clips
-without an answer (cloth that hangs free, is glued down, is of another size, or moves out of phase), the oddness of x is
+The network sees a silhouette in every frame, pooled to 4 x 4 pixels. The six of a clip are one
+point, x. With d the mean distance of x from the `NEAREST` clips of dragged cloth that were trained
+on, and b that from the `NEAREST` clips without an answer (cloth that hangs free, is glued down, is
+of another size, or moves out of phase), the oddness of x is
 
     s = d^3 / b
 
-and its familiarity is the share of good validation clips, as they are and with other exposures and places, that are at
-least as odd. A clip of a familiarity below `ALARMS` has no answer. Distances are along the principal components of the
-known silhouettes [Pearson 1901].
+and its familiarity is the share of good validation clips, as they are and with other exposures and
+places, that are at least as odd. A clip of a familiarity below `ALARMS` has no answer. Distances
+are along the principal components of the known silhouettes [Pearson 1901].
 """
 
 from dataclasses import dataclass, replace
@@ -52,7 +53,10 @@ def holders_at(instants: tuple[float, ...]) -> SingleFloats:
 
 
 def hanging(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
-    """Return cloth that hangs straight down; meshes are (runs, F, side, side, 3) [m], `held` as of `holders_at`."""
+    """Return cloth that hangs straight down.
+
+    Meshes are (runs, F, side, side, 3) [m], `held` as of `holders_at`.
+    """
     side = meshes.shape[2]
     flat = np.zeros((side, side, 3), dtype=np.float32)
     flat[..., 1] = np.linspace(-0.1, 0.1, side)
@@ -106,12 +110,22 @@ class Familiarity:
 
     @staticmethod
     def of(train: Runs, seed: int, good: SingleFloats, device: str = "cpu") -> "Familiarity":
-        """Render the known clips from runs; `good` are silhouettes that a network sees in good validation clips."""
-        runs = replace(train, positions=train.positions[:, frames_at(train.instants)[0]], instants=INSTANTS)
+        """Render the known clips from runs.
+
+        `good` are silhouettes that a network sees in good validation clips.
+        """
+        runs = replace(
+            train, positions=train.positions[:, frames_at(train.instants)[0]], instants=INSTANTS
+        )
         held = holders_at(INSTANTS)
-        sorts = [runs, *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER)]
+        sorts = [
+            runs,
+            *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER),
+        ]
         shown = [
-            render_clips(some, 1 if place else 4, seed + place, drawn_world=True, device=device).cover
+            render_clips(
+                some, 1 if place else 4, seed + place, drawn_world=True, device=device
+            ).cover
             for place, some in enumerate(sorts)
         ]
         pixels = pooled(torch.cat(shown)).flatten(1).numpy()
@@ -123,7 +137,9 @@ class Familiarity:
         return replace(found, good_oddness=np.sort(found.measure(good)[0]))
 
     def measure(self, silhouettes: SingleFloats) -> tuple[Floats, Integers]:
-        """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest known clip."""
+        """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest known
+        clip.
+        """
         seen = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
         far = cdist(seen, self.known)
         parts = (far[:, chosen] for chosen in (self.sort == 0, self.sort > 0))
@@ -131,8 +147,12 @@ class Familiarity:
         return good**3 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]
 
     def judge(self, silhouettes: SingleFloats) -> tuple[Floats, list[str | None]]:
-        """Return the familiarity of silhouettes (clips, F, 18, 22), and why a clip has no answer, or None."""
+        """Return the familiarity of silhouettes (clips, F, 18, 22), and why a clip has no answer,
+        or None.
+        """
         odd, sort = self.measure(silhouettes)
         share = 1.0 - np.searchsorted(self.good_oddness, odd) / len(self.good_oddness)
         reasons = [WITHOUT_ANSWER[place - 1][0] if place else UNKNOWN for place in sort.tolist()]
-        return share, [reason if low else None for reason, low in zip(reasons, share < ALARMS, strict=True)]
+        return share, [
+            reason if low else None for reason, low in zip(reasons, share < ALARMS, strict=True)
+        ]

@@ -26,7 +26,13 @@ from stickslip_training.cloth.clips import (
 )
 from stickslip_training.cloth.crop import Cameras, holder_crops
 from stickslip_training.cloth.familiarity import Familiarity, pooled
-from stickslip_training.cloth.model import FrictionModel, PosteriorNet, log_histograms, mirrored, silhouettes
+from stickslip_training.cloth.model import (
+    FrictionModel,
+    PosteriorNet,
+    log_histograms,
+    mirrored,
+    silhouettes,
+)
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
 from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
 from stickslip_training.cloth.runs import Runs, between
@@ -45,14 +51,18 @@ from stickslip_training.engine.fit import (
 )
 
 SILHOUETTES = 16
-"""Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and costs more."""
+"""Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and
+costs more.
+"""
 
 SETTLED = 2 / 3
-"""Share of the steps that teach what cloth is, while the reader sees true silhouettes; then it sees found ones [1]."""
+"""Share of the steps that teach what cloth is, while the reader sees true silhouettes; then it sees
+found ones [1].
+"""
 
 FIRST = 8
-"""Batches that standardize the units of a new network. 600 steps over dark floors learned mu to 0.08 with it,
-and to 0.14 without it."""
+"""Batches that standardize the units of a new network. 600 steps over dark floors learned mu to
+0.08 with it, and to 0.14 without it."""
 
 KEPT = 20
 """Batches of clips that a step chooses from, the last ones."""
@@ -71,20 +81,28 @@ class ClothTraining(FitSettings):
     learning_rate: float = 2e-3
     """Of AdamW at its highest; it falls to nothing like half a cosine."""
     repeats: int = 3
-    """Steps for each batch of clips: drawing it, with silhouettes, costs five times as much as learning from it."""
+    """Steps for each batch of clips: drawing it, with silhouettes, costs five times as much as
+    learning from it.
+    """
     dropout: float = 0.2
-    """Share of the joined features that a step leaves out [1]; with 0.1 a network learns few simulations by heart."""
+    """Share of the joined features that a step leaves out [1]; with 0.1 a network learns few
+    simulations by heart.
+    """
     smoothing: tuple[float, float] = (0.2, 0.02)
-    """Standard deviation of the target histogram of mu at the first and at the last step [1]: wide targets teach the
-    order of mu first."""
+    """Standard deviation of the target histogram of mu at the first and at the last step [1]: wide
+    targets teach the order of mu first."""
     gap: float = 0.3
     """Neighbours in mu that are no farther apart have meshes between them: see `runs.between`."""
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
     clip_share: float = 0.5
-    """Of a batch, where there are clips of another renderer. A long training needs 2,000: it learned 512 by heart."""
+    """Of a batch, where there are clips of another renderer. A long training needs 2,000: it
+    learned 512 by heart.
+    """
     worlds: bool = True
-    """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows dark floors only."""
+    """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows
+    dark floors only.
+    """
     width: int = 96
 
     def __post_init__(self) -> None:
@@ -94,18 +112,24 @@ class ClothTraining(FitSettings):
             raise ValueError(f"width must be a multiple of 48, and is {self.width}")
         for name in ("dropout", "clip_share"):
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} must be from 0 to less than 1, and is {getattr(self, name)}")
+                raise ValueError(
+                    f"{name} must be from 0 to less than 1, and is {getattr(self, name)}"
+                )
         if not all(0 < deviation < math.inf for deviation in self.smoothing):
-            raise ValueError(f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}")
+            raise ValueError(
+                f"smoothing must be two numbers above 0 and finite, and is {self.smoothing}"
+            )
         for name in ("gap", "turn"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be 0 or more and finite, and is {getattr(self, name)}")
+                raise ValueError(
+                    f"{name} must be 0 or more and finite, and is {getattr(self, name)}"
+                )
 
     def going_on(self) -> "ClothTraining":
         """Return the settings for a network that goes on from a model, and knows the order of mu.
 
-        Two simulations of one mu are read 0.06 apart: narrower targets teach simulations by heart. In fewer than 9,000
-        steps the average of weights spans the last ninth.
+        Two simulations of one mu are read 0.06 apart: narrower targets teach simulations by heart.
+        In fewer than 9,000 steps the average of weights spans the last ninth.
         """
         return replace(self, smoothing=(0.05, 0.05), averaging=0.999)
 
@@ -139,13 +163,19 @@ def train_friction(
         train, validation = (runs.named(start.materials) for runs in (train, validation))
     with torch_threads(settings.threads):
         learner = FrictionLearner(train, validation, settings, clips, start)
-        identity = (identity or {}) | {n: v for n, v in asdict(settings).items() if n not in ("threads", "device")}
-        return learner.calibrated(fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch))
+        identity = (identity or {}) | {
+            n: v for n, v in asdict(settings).items() if n not in ("threads", "device")
+        }
+        return learner.calibrated(
+            fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch)
+        )
 
 
 class FrictionLearner(Learner):
-    """Batches are runs, or meshes between two neighbours in mu, that are rendered anew; a step learns from clips of the
-    last batches, half of them mirrored."""
+    """Batches are runs, or meshes between two neighbours in mu, that are rendered anew.
+
+    A step learns from clips of the last batches, half of them mirrored.
+    """
 
     net: PosteriorNet
 
@@ -158,13 +188,19 @@ class FrictionLearner(Learner):
         start: FrictionModel | None = None,
     ) -> None:
         if len(train) == 0 or len(validation) == 0:
-            raise ValueError(f"there must be runs to train on and to validate: {len(train)} and {len(validation)}")
+            raise ValueError(
+                f"there must be runs to train on and to validate: {len(train)} and {len(validation)}"
+            )
         self.settings = settings
         self.frames, self.instants = frames_at(train.instants)
         self.train = train
         self.judged = validation
-        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames])).to(settings.device)
-        self.pairs = np.array(between(train, settings.gap) + [(run, run) for run in range(len(train))])
+        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames])).to(
+            settings.device
+        )
+        self.pairs = np.array(
+            between(train, settings.gap) + [(run, run) for run in range(len(train))]
+        )
         widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
         with torch.device(settings.device):
@@ -172,16 +208,26 @@ class FrictionLearner(Learner):
         self.clips = clips
         self.render = partial(render_clips, drawn_world=settings.worlds, device=settings.device)
         self.validation = (
-            self.render(validation, 6, settings.seed, spread=settings.turn) if clips is None else clips.validation
+            self.render(validation, 6, settings.seed, spread=settings.turn)
+            if clips is None
+            else clips.validation
         )
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32)).to(settings.device)
         with seeded(settings.seed):
-            sizes = {"materials": len(train.materials), "bins": MU_BINS.count, "frames": len(self.frames)}
+            sizes = {
+                "materials": len(train.materials),
+                "bins": MU_BINS.count,
+                "frames": len(self.frames),
+            }
             self.net = PosteriorNet(**sizes, width=settings.width, dropout=settings.dropout)
         self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
-        self.settled = math.ceil(SETTLED * settings.steps / settings.repeats)  # batches that teach what cloth is
+        self.settled = math.ceil(
+            SETTLED * settings.steps / settings.repeats
+        )  # batches that teach what cloth is
         if start is None:
-            crops, direction, _, _, cover = map(torch.cat, zip(*map(self.batch, range(FIRST)), strict=True))
+            crops, direction, _, _, cover = map(
+                torch.cat, zip(*map(self.batch, range(FIRST)), strict=True)
+            )
             self.net.to(settings.device).standardize(crops, direction, cover)
         elif start.materials != train.materials or start.net.sizes != self.net.sizes:
             raise ValueError(
@@ -210,17 +256,29 @@ class FrictionLearner(Learner):
         loss = -(log_material[rows, material] + (target * log_mu[rows, material]).sum(dim=1)).mean()
         if step < self.settled * self.settings.repeats:
             found = net.silhouettes(crops[::SILHOUETTES])
-            loss = loss + functional.binary_cross_entropy_with_logits(found, silhouettes[::SILHOUETTES])
+            loss = loss + functional.binary_cross_entropy_with_logits(
+                found, silhouettes[::SILHOUETTES]
+            )
         return torch.as_tensor(loss)
 
     def chosen(self, step: int) -> tuple[torch.Tensor, ...]:
-        """Return what a step learns from: clips of the last batches, and what is true of them; half are mirrored."""
+        """Return what a step learns from: clips of the last batches, and what is true of them; half
+        are mirrored.
+        """
         newest = step // self.settings.repeats
         last = range(max(0, newest - KEPT + 1), newest + 1)
         self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
-        random, count = np.random.default_rng((self.settings.seed, CHOICE, step)), self.settings.batch_size
-        drawn, places = list(self.drawn.values()), random.integers(len(last) * count, size=count).tolist()
-        parts = zip(*([part[at % count] for part in drawn[at // count]] for at in places), strict=True)
+        random, count = (
+            np.random.default_rng((self.settings.seed, CHOICE, step)),
+            self.settings.batch_size,
+        )
+        drawn, places = (
+            list(self.drawn.values()),
+            random.integers(len(last) * count, size=count).tolist(),
+        )
+        parts = zip(
+            *([part[at % count] for part in drawn[at // count]] for at in places), strict=True
+        )
         crops, direction, material, mu, silhouettes = map(torch.stack, parts)
         turned = torch.from_numpy(random.random(count) < 0.5).to(self.settings.device)
         crops[turned], direction[turned] = mirrored(crops[turned], direction[turned])
@@ -228,11 +286,20 @@ class FrictionLearner(Learner):
         return crops, direction, material, mu, silhouettes
 
     def batch(self, number: int) -> tuple[torch.Tensor, ...]:
-        """Return the crops, directions of view, materials, mu and silhouettes: true ones before `settled`."""
+        """Return the crops, directions of view, materials, mu and silhouettes: true ones before
+        `settled`.
+        """
         device, seeds = self.settings.device, (self.settings.seed, TRAINING, number)
         with torch.device(device):
-            random, generator = np.random.default_rng(seeds), torch.Generator(device).manual_seed(seed_of_step(*seeds))
-            some = 0 if self.clips is None else math.ceil(self.settings.clip_share * self.settings.batch_size)
+            random, generator = (
+                np.random.default_rng(seeds),
+                torch.Generator(device).manual_seed(seed_of_step(*seeds)),
+            )
+            some = (
+                0
+                if self.clips is None
+                else math.ceil(self.settings.clip_share * self.settings.batch_size)
+            )
             count = self.settings.batch_size - some
             chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
             share = random.random(count, dtype=np.float32)
@@ -244,23 +311,42 @@ class FrictionLearner(Learner):
             world = sample_surroundings(count, generator) if self.settings.worlds else None
             crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
             first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
-            mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(device)
+            mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(
+                device
+            )
             codes = torch.from_numpy(self.train.material[chosen[:, 0]])
             parts = [crops, cameras.rotation[:, 2], codes.to(device), mu, cover]
             if self.clips is not None and some:
-                given = self.elsewhere(self.clips.train[random.integers(len(self.clips.train), size=some)], generator)
+                given = self.elsewhere(
+                    self.clips.train[random.integers(len(self.clips.train), size=some)], generator
+                )
                 parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
             *parts, cover = parts
-            return *parts, pooled(cover) if number < self.settled else self.net.seen_silhouettes(parts[0])
+            return *parts, pooled(cover) if number < self.settled else self.net.seen_silhouettes(
+                parts[0]
+            )
 
     def elsewhere(self, clips: Clips, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
         """Return clips of another renderer as part of a batch, each in a drawn world."""
         device = self.settings.device
-        shown, cover, direction = (part.to(device) for part in (clips.crops, clips.cover, clips.direction))
-        looks, world = draw_style(len(clips), len(self.frames), generator), sample_surroundings(len(clips), generator)
+        shown, cover, direction = (
+            part.to(device) for part in (clips.crops, clips.cover, clips.direction)
+        )
+        looks, world = (
+            draw_style(len(clips), len(self.frames), generator),
+            sample_surroundings(len(clips), generator),
+        )
         cloth, world, cover = cloth_of_clip(shown, cover, looks, world, generator)
         cameras = self.rig[torch.cdist(direction, self.rig.rotation[:, 2]).argmin(dim=1)]
-        crops = pictured(cloth, cameras, holder_crops(cameras, self.instants), self.instants, looks, generator, world)
+        crops = pictured(
+            cloth,
+            cameras,
+            holder_crops(cameras, self.instants),
+            self.instants,
+            looks,
+            generator,
+            world,
+        )
         material, mu = (torch.from_numpy(part).to(device) for part in (clips.material, clips.mu))
         return crops, direction, material, mu.float(), cover
 

@@ -28,15 +28,18 @@ _SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames
 
 
 class PosteriorNet(nn.Module):
-    """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and log p(mu | m), (B,
-    M, K).
+    """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and
+    log p(mu | m), (B, M, K).
 
-    Every frame goes through the same four convolutions and keeps its places: friction shows in where an edge lies, to
-    a part of a pixel. The third also sees the silhouette, which has its size. Frames are at fixed phases of the path of
-    the holders, so each has a place of its own in the layer that joins them.
+    Every frame goes through the same four convolutions and keeps its places: friction shows in
+    where an edge lies, to a part of a pixel. The third also sees the silhouette, which has its
+    size. Frames are at fixed phases of the path of the holders, so each has a place of its own in
+    the layer that joins them.
     """
 
-    def __init__(self, *, materials: int, bins: int, frames: int, width: int = 96, dropout: float = 0.0) -> None:
+    def __init__(
+        self, *, materials: int, bins: int, frames: int, width: int = 96, dropout: float = 0.0
+    ) -> None:
         super().__init__()
         self.sizes = {"materials": materials, "bins": bins, "frames": frames, "width": width}
         channels = (1, width // 6, width // 3, width // 2, 2 * width // 3)
@@ -44,7 +47,11 @@ class PosteriorNet(nn.Module):
         for number, (before, after) in enumerate(pairwise(channels)):
             kernel = 5 if number == 0 else 3
             seen = before + (number == _SILHOUETTE_AT)
-            layers += [nn.Conv2d(seen, after, kernel, stride=2, padding=kernel // 2), nn.GroupNorm(8, after), nn.ReLU()]
+            layers += [
+                nn.Conv2d(seen, after, kernel, stride=2, padding=kernel // 2),
+                nn.GroupNorm(8, after),
+                nn.ReLU(),
+            ]
         self.encoder = nn.Sequential(*layers, nn.Flatten())
         places = channels[-1] * -(-HEIGHT // 16) * -(-WIDTH // 16)
         self.frame = nn.Sequential(nn.Linear(places, width), nn.LayerNorm(width), nn.ReLU())
@@ -60,8 +67,12 @@ class PosteriorNet(nn.Module):
         self.silhouette = _silhouette_net()
 
     @torch.no_grad()
-    def standardize(self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor) -> None:
-        """Scale and shift each linear unit to mean 0 and deviation 1 over clips [Mishkin & Matas 2016]."""
+    def standardize(
+        self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor
+    ) -> None:
+        """Scale and shift each linear unit to mean 0 and deviation 1 over clips [Mishkin & Matas
+        2016].
+        """
 
         def scaled(layer: nn.Module, _: Any, found: torch.Tensor) -> torch.Tensor:
             assert isinstance(layer, nn.Linear)
@@ -70,7 +81,10 @@ class PosteriorNet(nn.Module):
             layer.bias.sub_(mean).div_(deviation)
             return (found - mean) / deviation
 
-        hooks = [layer.register_forward_hook(scaled) for layer in (self.frame[0], self.joined[0], self.joined[3])]
+        hooks = [
+            layer.register_forward_hook(scaled)
+            for layer in (self.frame[0], self.joined[0], self.joined[3])
+        ]
         self.eval().features(crops, direction, silhouettes)
         for hook in hooks:
             hook.remove()
@@ -79,15 +93,22 @@ class PosteriorNet(nn.Module):
     def features(
         self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Return what material and mu are read off, (B, 2 width); `silhouettes` are found if they are not given."""
+        """Return what material and mu are read off, (B, 2 width).
+
+        `silhouettes` are found if they are not given.
+        """
         clips, frames = crops.shape[:2]
         deviation, mean = torch.std_mean(crops, dim=(1, 2, 3), keepdim=True)
         x = (crops - mean) / (deviation + 1e-3)
-        masks = (self.seen_silhouettes(crops) if silhouettes is None else silhouettes).flatten(0, 1)[:, None]
+        masks = (self.seen_silhouettes(crops) if silhouettes is None else silhouettes).flatten(
+            0, 1
+        )[:, None]
         early, late = self.encoder[: 3 * _SILHOUETTE_AT], self.encoder[3 * _SILHOUETTE_AT :]
         seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), masks], dim=1)
         features = self.frame(late(seen))
-        return torch.as_tensor(self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1)))
+        return torch.as_tensor(
+            self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1))
+        )
 
     def read(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return log p(m) and log p(mu | m) of features."""
@@ -96,11 +117,14 @@ class PosteriorNet(nn.Module):
 
     @torch.no_grad()
     def seen_silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
-        """Return the silhouettes that the network sees, 0 to 1, (B, F, 18, 22): the reader does not teach them."""
+        """Return the silhouettes that the network sees, 0 to 1, (B, F, 18, 22): the reader does not
+        teach them.
+        """
         return self.silhouettes(crops).sigmoid()
 
     def silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
-        """Return logits of the share that cloth covers of each 4 x 4 pixels of crops (B, F, 72, 88): (B, F, 18, 22).
+        """Return logits of the share that cloth covers of each 4 x 4 pixels of crops (B, F, 72,
+        88): (B, F, 18, 22).
 
         Mean and deviation over the frames of a clip are seen, too: a floor stays, and cloth moves.
         """
@@ -116,7 +140,11 @@ def _silhouette_net() -> nn.Sequential:
     layers: list[nn.Module] = [nn.PixelUnshuffle(2)]
     sizes = [(12, 32, 1, 1), (32, 48, 2, 1), *((48, 48, 1, dilation) for dilation in (1, 2, 4, 1))]
     for before, after, stride, dilation in sizes:
-        layers += [nn.Conv2d(before, after, 3, stride, dilation, dilation), nn.GroupNorm(8, after), nn.ReLU()]
+        layers += [
+            nn.Conv2d(before, after, 3, stride, dilation, dilation),
+            nn.GroupNorm(8, after),
+            nn.ReLU(),
+        ]
     return nn.Sequential(*layers, nn.Conv2d(48, 1, 1))
 
 
@@ -135,10 +163,14 @@ class FrictionModel:
     """Training runs, settings, measured errors and limits."""
 
     def estimate(self, clips: Clips) -> Posterior:
-        return Posterior.of(*log_histograms(self.net, clips), self.materials, self.bins, self.temperature)
+        return Posterior.of(
+            *log_histograms(self.net, clips), self.materials, self.bins, self.temperature
+        )
 
     def judge(self, clips: Clips) -> tuple[Floats, list[str | None]]:
-        """Return the familiarity of every clip, (clips,), and why it has no answer, or None: see `familiarity`."""
+        """Return the familiarity of every clip, (clips,), and why it has no answer, or None: see
+        `familiarity`.
+        """
         return self.familiarity.judge(silhouettes(self.net, clips))
 
 
@@ -151,8 +183,13 @@ def log_histograms(net: PosteriorNet, clips: Clips) -> tuple[SingleFloats, Singl
     """
 
     def joint(crops: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-        pairs = [net.read(net.features(*reading)) for reading in ((crops, direction), mirrored(crops, direction))]
-        return torch.stack([material[:, :, None] + mu for material, mu in pairs]).logsumexp(dim=0) - math.log(2)
+        pairs = [
+            net.read(net.features(*reading))
+            for reading in ((crops, direction), mirrored(crops, direction))
+        ]
+        return torch.stack([material[:, :, None] + mu for material, mu in pairs]).logsumexp(
+            dim=0
+        ) - math.log(2)
 
     log_p = torch.from_numpy(_in_chunks(net, clips, joint))
     material = log_p.logsumexp(dim=2)
@@ -176,24 +213,39 @@ def _in_chunks(
     net.eval()
     with torch.inference_mode():
         chunks = [slice(first, first + CHUNK) for first in range(0, len(clips), CHUNK)]
-        parts = [of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu() for some in chunks]
+        parts = [
+            of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu()
+            for some in chunks
+        ]
     return np.asarray(torch.cat(parts).numpy())
 
 
 def mean_model(models: Sequence[FrictionModel]) -> FrictionModel:
-    """Return the first model with the mean weights of all [Wortsman et al. 2022]; they must know the same materials."""
+    """Return the first model with the mean weights of all [Wortsman et al. 2022].
+
+    They must know the same materials.
+    """
     first, states = models[0], [model.net.state_dict() for model in models]
     if len({(each.materials, str(each.net.sizes)) for each in models}) > 1:
-        raise ValueError("the models to start from must know the same materials, and be of the same sizes")
+        raise ValueError(
+            "the models to start from must know the same materials, and be of the same sizes"
+        )
     net = PosteriorNet(**first.net.sizes)
-    net.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
+    net.load_state_dict(
+        {name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]}
+    )
     return replace(first, net=net.eval())
 
 
 def save_friction(path: Path, model: FrictionModel) -> None:
     """Write the model as safetensors, with its card; `load_friction` reads it."""
-    tensors = {f"net.{name}": tensor.contiguous() for name, tensor in model.net.state_dict().items()}
-    tensors |= {f"familiarity.{name}": torch.from_numpy(part) for name, part in vars(model.familiarity).items()}
+    tensors = {
+        f"net.{name}": tensor.contiguous() for name, tensor in model.net.state_dict().items()
+    }
+    tensors |= {
+        f"familiarity.{name}": torch.from_numpy(part)
+        for name, part in vars(model.familiarity).items()
+    }
     about = {
         "sizes": model.net.sizes,
         "materials": model.materials,
@@ -213,7 +265,10 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         net = PosteriorNet(**about["sizes"])
         net.load_state_dict({name: tensors[f"net.{name}"] for name in net.state_dict()})
-        known = {field.name: tensors[f"familiarity.{field.name}"].numpy() for field in fields(Familiarity)}
+        known = {
+            field.name: tensors[f"familiarity.{field.name}"].numpy()
+            for field in fields(Familiarity)
+        }
         of_material, of_mu = about["temperature"]
         return FrictionModel(
             net=net.eval(),
@@ -224,5 +279,13 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
             familiarity=Familiarity(**known),
             card=about["card"],
         )
-    except (safetensors.SafetensorError, KeyError, RuntimeError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} must be a model of `stickslip-train cloth train`: {error}") from error
+    except (
+        safetensors.SafetensorError,
+        KeyError,
+        RuntimeError,
+        TypeError,
+        json.JSONDecodeError,
+    ) as error:
+        raise ValueError(
+            f"{path} must be a model of `stickslip-train cloth train`: {error}"
+        ) from error

@@ -2,8 +2,9 @@
 
     p(m, mu) = p(m) p(mu | m)
 
-Its marginal and its conditional are the thesis's two models: mu of an unknown and of a known material. A histogram may
-have two branches, so the estimate of mu is the median of the marginal, with the shortest interval that holds 80 %.
+Its marginal and its conditional are the thesis's two models: mu of an unknown and of a known
+material. A histogram may have two branches, so the estimate of mu is the median of the marginal,
+with the shortest interval that holds 80 %.
 """
 
 from dataclasses import dataclass
@@ -51,7 +52,9 @@ class Estimates:
     median: Floats
     low: Floats
     high: Floats
-    """(clips,) each: `low` to `high` is the shortest interval that holds the share of the probability asked for."""
+    """(clips,) each: `low` to `high` is the shortest interval that holds the share of the
+    probability asked for.
+    """
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,9 @@ class Posterior:
 
     def log_likelihood(self, material: Integers, mu: Floats) -> Floats:
         """Return log p(m, mu) of the truth, (clips,), with mu a density."""
-        density = self.joint[np.arange(len(self)), material, self.bins.place(mu)] / (self.bins.edges[1] - self.bins.low)
+        density = self.joint[np.arange(len(self)), material, self.bins.place(mu)] / (
+            self.bins.edges[1] - self.bins.low
+        )
         return np.asarray(np.log(density + 1e-12))
 
     @staticmethod
@@ -89,7 +94,9 @@ class Posterior:
         bins: Bins,
         temperature: tuple[float, float],
     ) -> "Posterior":
-        """Return the histograms of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at these temperatures."""
+        """Return the histograms of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at these
+        temperatures.
+        """
         p_material, p_mu = softmax(log_material / temperature[0]), softmax(log_mu / temperature[1])
         return Posterior(materials, bins, p_material[..., None] * p_mu)
 

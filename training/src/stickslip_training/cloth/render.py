@@ -1,13 +1,15 @@
-"""Pictures of cloth meshes in torch, made while a network trains: any texture, view and light, drawn afresh.
+"""Pictures of cloth meshes in torch, made while a network trains: any texture, view and light,
+drawn afresh.
 
-The mesh is refined to a grid of points, a little closer together than pixels of the crop. Each visible point adds its
-brightness to the four pixels about it, with bilinear weights and in the measure of the area that it stands for:
+The mesh is refined to a grid of points, a little closer together than pixels of the crop. Each
+visible point adds its brightness to the four pixels about it, with bilinear weights and in the
+measure of the area that it stands for:
 
     alpha = min(1, sum_i w_i a_i),   picture = sum_i w_i a_i c_i / sum_i w_i a_i  over the background by alpha
 
-so an edge moves through a pixel as smoothly as it does in a photograph. A point is visible where nothing on its pixel
-is nearer by more than `LAYER`. Light is one distant lamp and some from all around. What is about the cloth is in
-`world`.
+so an edge moves through a pixel as smoothly as it does in a photograph. A point is visible where
+nothing on its pixel is nearer by more than `LAYER`. Light is one distant lamp and some from all
+around. What is about the cloth is in `world`.
 """
 
 import math
@@ -19,7 +21,14 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
-from stickslip_training.cloth.surroundings import ClothLayer, Surroundings, apply_codec, blurred, composite, enlarged
+from stickslip_training.cloth.surroundings import (
+    ClothLayer,
+    Surroundings,
+    apply_codec,
+    blurred,
+    composite,
+    enlarged,
+)
 
 POINTS = 56
 """Points along a side of the refined mesh."""
@@ -62,7 +71,12 @@ def draw_style(clips: int, frames: int, generator: torch.Generator) -> Style:
 
     azimuth, elevation = torch.deg2rad(uniform(-110, 50)), torch.deg2rad(uniform(32, 72))
     lamp = torch.stack(
-        [torch.cos(elevation) * torch.cos(azimuth), torch.cos(elevation) * torch.sin(azimuth), torch.sin(elevation)], -1
+        [
+            torch.cos(elevation) * torch.cos(azimuth),
+            torch.cos(elevation) * torch.sin(azimuth),
+            torch.sin(elevation),
+        ],
+        -1,
     )
     wander = 0.25 * torch.randn(clips, frames, 2, generator=generator)
     steady = 0.4 * torch.randn(clips, 1, 2, generator=generator)
@@ -81,14 +95,16 @@ def draw_style(clips: int, frames: int, generator: torch.Generator) -> Style:
 
 
 def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
-    """Draw reflectances of cloth, (clips, POINTS, POINTS): plain, stripes, checks, dots, blots, and mixtures of
-    them."""
+    """Draw reflectances of cloth, (clips, POINTS, POINTS): plain, stripes, checks, dots, blots, and
+    mixtures of them."""
     v, u = torch.meshgrid(torch.linspace(0, 1, POINTS), torch.linspace(0, 1, POINTS), indexing="ij")
     r = torch.rand(14, clips, 1, 1, generator=generator)
     first, second = (_wave(u, v, r[start : start + 5]) for start in (0, 5))
     plain, mean = torch.full_like(first, 0.5), 0.5 * (first + second)
     coarse = torch.randint(5, 18, (clips, 1), generator=generator).expand(-1, 2)
-    blots = torch.sigmoid(12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5))
+    blots = torch.sigmoid(
+        12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5)
+    )
     sorts = [plain, first, first * second, torch.maximum(first, second), mean, blots]
     pattern = torch.stack(sorts)[(6 * r[10, :, 0, 0]).long(), torch.arange(clips)]
     low, high = 0.12 + 0.75 * r[11:13].amin(dim=0), 0.12 + 0.75 * r[11:13].amax(dim=0)
@@ -98,25 +114,38 @@ def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
 def _wave(u: torch.Tensor, v: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
     """Return stripes, 0 to 1: of any direction, width and sharpness."""
     angle = math.pi * torch.where(r[1] < 0.4, r[0], r[0].round() / 2)
-    wave = torch.sin(2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * torch.cos(angle) + v * torch.sin(angle)) + r[3]))
+    wave = torch.sin(
+        2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * torch.cos(angle) + v * torch.sin(angle)) + r[3])
+    )
     return torch.sigmoid((1 + 12 * r[4]) * (wave - 0.6 * (r[3] - 0.5)))
 
 
 def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:
-    """Turn cameras about the middle of the drag scene by angles (B,) [rad]: about the vertical, and up."""
+    """Turn cameras about the middle of the drag scene by angles (B,) [rad]: about the vertical, and
+    up.
+    """
     middle = cameras.translation.new_tensor([0.15, 0.0, 0.05]).expand(len(azimuth), 3)
     seen = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
-    c, s, zero, one = torch.cos(azimuth), torch.sin(azimuth), torch.zeros_like(azimuth), torch.ones_like(azimuth)
+    c, s, zero, one = (
+        torch.cos(azimuth),
+        torch.sin(azimuth),
+        torch.zeros_like(azimuth),
+        torch.ones_like(azimuth),
+    )
     around = torch.stack([c, s, zero, -s, c, zero, zero, zero, one], dim=-1).reshape(-1, 3, 3)
     c, s = torch.cos(elevation), torch.sin(elevation)
     up = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], dim=-1).reshape(-1, 3, 3)
     rotation = up @ cameras.rotation @ around
-    return Cameras(rotation, seen - (rotation @ middle[..., None])[..., 0], cameras.focal, cameras.center)
+    return Cameras(
+        rotation, seen - (rotation @ middle[..., None])[..., 0], cameras.focal, cameras.center
+    )
 
 
 def randomly_turned(cameras: Cameras, deviation: float, generator: torch.Generator) -> Cameras:
     """Turn each camera by angles of its own of this standard deviation [degree]."""
-    azimuth, elevation = torch.deg2rad(deviation * torch.randn(2, len(cameras.focal), generator=generator))
+    azimuth, elevation = torch.deg2rad(
+        deviation * torch.randn(2, len(cameras.focal), generator=generator)
+    )
     return turned(cameras, azimuth, elevation)
 
 
@@ -128,17 +157,20 @@ def render_crops(
     generator: torch.Generator | None = None,
     world: Surroundings | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render the holder-registered crops of meshes (B, F, side, side, 3) [m], and how much of each pixel cloth covers.
+    """Render the holder-registered crops of meshes (B, F, side, side, 3) [m], and how much of each
+    pixel cloth covers.
 
-    Both are (B, F, 72, 88), grey levels and shares. `cameras` register the crops; `world` says how the true ones
-    differ, and what else is in the picture: without it, nothing but a dark floor. `generator` draws the noise; without
-    it there is none.
+    Both are (B, F, 72, 88), grey levels and shares. `cameras` register the crops; `world` says how
+    the true ones differ, and what else is in the picture: without it, nothing but a dark floor.
+    `generator` draws the noise; without it there is none.
     """
     crops = holder_crops(cameras, instants)
     true = cameras if world is None else world.true_cameras(cameras)
     shade = shading(positions, true, style)
     parts = []
-    count = 1 if positions.device.type == "cpu" else len(positions)  # one clip's points fit into a processor's cache
+    count = (
+        1 if positions.device.type == "cpu" else len(positions)
+    )  # one clip's points fit into a processor's cache
     for clip in range(0, len(positions), count):
         one = slice(clip, clip + count)
         fine = _refined(torch.cat([positions[one], shade[one, ..., None]], dim=-1), POINTS)
@@ -146,7 +178,9 @@ def render_crops(
         place = true[one], crops[one].off_by(style.shift[one], style.stretch[one])
         lamp = style.lamp[one][:, None, None, None]
         fallen = points - lamp * (points[..., 2:] / lamp[..., 2:])
-        shadow = torch.zeros(1) if world is None else splat(fallen, torch.ones_like(colors), *place)[0]
+        shadow = (
+            torch.zeros(1) if world is None else splat(fallen, torch.ones_like(colors), *place)[0]
+        )
         parts.append((*splat(points, colors, *place), shadow))
     cloth = ClothLayer(*(torch.cat(part) for part in zip(*parts, strict=True)))
     return pictured(cloth, true, crops, instants, style, generator, world), cloth.alpha
@@ -161,16 +195,23 @@ def pictured(
     generator: torch.Generator | None,
     world: Surroundings | None,
 ) -> torch.Tensor:
-    """Return the grey levels of cloth in a world, or over the dark floor of `style`, (B, F, 72, 88)."""
+    """Return the grey levels of cloth in a world, or over the dark floor of `style`, (B, F, 72,
+    88).
+    """
     if world is None:
         floor = style.floor[:, None, None, None]
-        light = style.exposure[:, None, None, None] * cloth.alpha * cloth.light + (1.0 - cloth.alpha) * floor
+        light = (
+            style.exposure[:, None, None, None] * cloth.alpha * cloth.light
+            + (1.0 - cloth.alpha) * floor
+        )
     else:
         light = composite(cloth, cameras, crops, instants, style, world).clamp(max=1.0)
     picture = light.clamp(min=1e-5) ** style.gamma[:, None, None, None]
     picture = blurred(picture, style.blur)
     if generator is not None:
-        picture = picture + style.noise[:, None, None, None] * torch.randn(picture.shape, generator=generator)
+        picture = picture + style.noise[:, None, None, None] * torch.randn(
+            picture.shape, generator=generator
+        )
     return (picture if world is None else apply_codec(picture, world.codec)).clamp(0.0, 1.0)
 
 
@@ -192,7 +233,9 @@ def _spline(nodes: int, points: int) -> torch.Tensor:
 
 
 def shading(positions: torch.Tensor, cameras: Cameras, style: Style) -> torch.Tensor:
-    """Return the light that vertices (B, F, side, side, 3) send to the camera per reflectance [Lambert]."""
+    """Return the light that vertices (B, F, side, side, 3) send to the camera per reflectance
+    [Lambert].
+    """
     across, along = torch.gradient(positions, dim=(2, 3))
     normal = torch.nn.functional.normalize(torch.linalg.cross(across, along), dim=-1)
     eye = -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0]
@@ -209,7 +252,9 @@ def splat(
     *,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with colours (B, F, N, N)."""
+    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with
+    colours (B, F, N, N).
+    """
     clips, frames = points.shape[:2]
     height, width = size
     pixels, depth = cameras.project(points)
@@ -225,7 +270,9 @@ def splat(
     corner = start + (top.long() + 1) * wide + left.long() + 1
     nearest = corner + (right > 0.5) + (down > 0.5) * wide
     total = clips * frames * wide * high
-    buffer = torch.full((total,), math.inf).scatter_reduce_(0, nearest.reshape(-1), depth.reshape(-1), "amin")
+    buffer = torch.full((total,), math.inf).scatter_reduce_(
+        0, nearest.reshape(-1), depth.reshape(-1), "amin"
+    )
     weight = area * (depth <= buffer[nearest] + LAYER)
     sums = torch.zeros(2, total)
     for step, share in (
@@ -242,7 +289,9 @@ def splat(
 
 
 def _areas(places: torch.Tensor) -> torch.Tensor:
-    """Return the area that each point of a grid stands for [px^2], (B, F, N, N); half of it at edges."""
+    """Return the area that each point of a grid stands for [px^2], (B, F, N, N); half of it at
+    edges.
+    """
     across, along = torch.gradient(places, dim=(2, 3))
     area = (across[..., 0] * along[..., 1] - across[..., 1] * along[..., 0]).abs()
     edge = torch.ones(places.shape[2])

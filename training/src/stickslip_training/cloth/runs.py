@@ -1,7 +1,7 @@
 """Simulated drop-and-drag as meshes: what clips are rendered from while a network trains.
 
-A packed file holds the instants that clips show of many runs with one mesh (`benchmarks/training/cloth_runs.py` writes
-it); a dataset that stores its meshes holds them, too.
+A packed file holds the instants that clips show of many runs with one mesh
+(`benchmarks/training/cloth_runs.py` writes it); a dataset that stores its meshes holds them, too.
 """
 
 import json
@@ -21,8 +21,8 @@ STEP = 1e-5
 """Of the positions in a packed file [m]."""
 
 SLIDING = 60
-"""The instant, of 300, at which the branch is read: on the first leg the free edge trails the holders, or is pushed
-ahead of them."""
+"""The instant, of 300, at which the branch is read: on the first leg the free edge trails the
+holders, or is pushed ahead of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,9 @@ class Runs:
     """Simulations of one mesh, a square grid of `side` x `side` vertices."""
 
     positions: SingleFloats
-    """(runs, frames, side, side, 3) [m]: rows from the free edge up to the held one, columns along y."""
+    """(runs, frames, side, side, 3) [m]: rows from the free edge up to the held one, columns along
+    y.
+    """
     instants: tuple[int, ...]
     """Of the frames, of 300 at 2.4 a second."""
     materials: tuple[str, ...]
@@ -40,7 +42,9 @@ class Runs:
     mu: Floats
     """(runs,)"""
     landed: Integers
-    """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on the first leg."""
+    """(runs,): +1 or -1, the side along x to which the free edge lies, seen from the holders, on
+    the first leg.
+    """
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -50,9 +54,14 @@ class Runs:
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def named(self, materials: tuple[str, ...]) -> "Runs":
-        """Return the runs with the codes of other names; raise ValueError where one of theirs is missing."""
+        """Return the runs with the codes of other names.
+
+        Raise ValueError where one of theirs is missing.
+        """
         if missing := set(self.materials) - set(materials):
-            raise ValueError(f"materials must have those of the runs, and lack {', '.join(sorted(missing))}")
+            raise ValueError(
+                f"materials must have those of the runs, and lack {', '.join(sorted(missing))}"
+            )
         codes = np.array([materials.index(name) for name in self.materials])
         return replace(self, materials=materials, material=codes[self.material])
 
@@ -74,10 +83,14 @@ def load_runs(path: str | Path) -> Runs:
     return _runs(positions, rest, instants, materials, material, mu)
 
 
-def runs_of_dataset(reader: DatasetReader, split: Split | None, instants: Sequence[int]) -> tuple[Runs, Integers]:
-    """Return the simulations of a dataset that stores its meshes, and the slot of one sample of each.
+def runs_of_dataset(
+    reader: DatasetReader, split: Split | None, instants: Sequence[int]
+) -> tuple[Runs, Integers]:
+    """Return the simulations of a dataset that stores its meshes, and the slot of one sample of
+    each.
 
-    Samples of one simulation have the same material, mu and the mesh at the last instant that is read.
+    Samples of one simulation have the same material, mu and the mesh at the last instant that is
+    read.
     """
     for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:
@@ -110,21 +123,29 @@ def _runs(
     mu: Floats,
 ) -> Runs:
     grid = positions[:, :, grid_order(rest)].astype(np.float32)
-    sliding = next((frame for frame, instant in enumerate(instants) if instant >= SLIDING), len(instants) - 1)
+    sliding = next(
+        (frame for frame, instant in enumerate(instants) if instant >= SLIDING), len(instants) - 1
+    )
     landed = landed_side(positions[:, sliding], rest)
     return Runs(grid, instants, materials, material, np.asarray(mu, dtype=np.float64), landed)
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
-    """Return the side along x, +1 or -1, of the free edge of positions at the instant `SLIDING`, (runs, V, 3) [m]."""
+    """Return the side along x, +1 or -1, of the free edge of positions at the instant `SLIDING`,
+    (runs, V, 3) [m].
+    """
     x = positions[:, :, 0]
-    free, held = (np.isclose(rest[:, 1], end, atol=1e-6) for end in (rest[:, 1].min(), rest[:, 1].max()))
+    free, held = (
+        np.isclose(rest[:, 1], end, atol=1e-6) for end in (rest[:, 1].min(), rest[:, 1].max())
+    )
     return np.where(x[:, free].mean(axis=1) - x[:, held].mean(axis=1) > 0, 1, -1)
 
 
 def grid_order(rest: SingleFloats) -> Integers:
-    """Return the vertices, (side, side), of the square grid that `rest` (V, 2) is; raise ValueError where it is
-    none."""
+    """Return the vertices, (side, side), of the square grid that `rest` (V, 2) is.
+
+    Raise ValueError where it is none.
+    """
     side = round(len(rest) ** 0.5)
     order = np.lexsort(np.round(rest.T / 1e-6).astype(np.int64))
     if side * side == len(rest):
@@ -132,14 +153,18 @@ def grid_order(rest: SingleFloats) -> Integers:
         steps = np.diff(grid[..., 1], axis=0), np.diff(grid[..., 0], axis=1)
         if all(np.allclose(step, step.flat[0], atol=1e-6) and step.flat[0] > 0 for step in steps):
             return order.reshape(side, side)
-    raise ValueError(f"rest must be a square grid of vertices to be rendered from: its {len(rest)} vertices are none")
+    raise ValueError(
+        f"rest must be a square grid of vertices to be rendered from: its {len(rest)} vertices are none"
+    )
 
 
 def between(runs: Runs, gap: float) -> list[tuple[int, int]]:
-    """Return pairs of runs of one fabric and one landed side that are neighbours in mu, no farther apart than `gap`.
+    """Return pairs of runs of one fabric and one landed side that are neighbours in mu, no farther
+    apart than `gap`.
 
-    The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg move with mu, and
-    keep their kind. Below `STEEP` they move fast, and two branches exist: neighbours there may be half as far apart.
+    The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg
+    move with mu, and keep their kind. Below `STEEP` they move fast, and two branches exist:
+    neighbours there may be half as far apart.
     """
     pairs = []
     for code in np.unique(runs.material):

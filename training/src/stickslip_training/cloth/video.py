@@ -1,14 +1,15 @@
 """Import of a user's video of the drag scene: clock and registration from the path of the holders.
 
-The path of the two holders is known, so it gives both the clock and the registration of the camera. Two small patches
-of cloth under the holders are tracked [Lucas and Kanade 1981]. With P the projection by the calibrated
-camera, and h_c(t) the place of holder c on the path,
+The path of the two holders is known, so it gives both the clock and the registration of the camera.
+Two small patches of cloth under the holders are tracked [Lucas and Kanade 1981]. With P the
+projection by the calibrated camera, and h_c(t) the place of holder c on the path,
 
     p_c(t) = P(h_c(t - t0)) + w(t)
 
-gives the start t0 of the path. The common motion w(t) of both holders is that of a shaking camera, which is removed.
-Where the floor has marks, it gives w(t) to 0.1 px, and the holders' patches, which change as they come nearer, to
-0.3 px: see `floor_motion`. The difference between the two holders is the residual.
+gives the start t0 of the path. The common motion w(t) of both holders is that of a shaking camera,
+which is removed. Where the floor has marks, it gives w(t) to 0.1 px, and the holders' patches,
+which change as they come nearer, to 0.3 px: see `floor_motion`. The difference between the two
+holders is the residual.
 """
 
 import math
@@ -38,8 +39,8 @@ WINDOW = 0.012
 """Side of the tracked patch [m]."""
 
 MATCH_MAX = 1.0
-"""Largest distance of a match with the kept frame from the sum of the steps since; beyond it another frame is kept
-[px]."""
+"""Largest distance of a match with the kept frame from the sum of the steps since; beyond it
+another frame is kept [px]."""
 
 _WIDE = 224  # width of the pictures that limits are for [px]
 
@@ -50,14 +51,17 @@ TIMING_MAX = 0.1
 """Largest spread of the starts found in the whole video and in its two halves [s]."""
 
 FLOOR_MAX = 0.08
-"""Largest standard deviation of the floor's motion at which it counts as the camera's [px of a picture 224 px wide].
-Noise without marks has 0.09 or more, and 24 films over six floors have 0.073 or less."""
+"""Largest standard deviation of the floor's motion at which it counts as the camera's [px of a
+picture 224 px wide]. Noise without marks has 0.09 or more, and 24 films over six floors have 0.073
+or less."""
 
 APART_MAX = 2.0
 """Largest difference between the motions of floor and holders [px of a picture 224 px wide]."""
 
 CUT_MAX = 1.0
-"""Latest time at which a video may begin after the start [s]: the holders have come 5 mm down by then."""
+"""Latest time at which a video may begin after the start [s]: the holders have come 5 mm down by
+then.
+"""
 
 
 class VideoError(ValueError):
@@ -71,9 +75,12 @@ class Registration:
     start: float
     """Time in the video at which the holders start [s]."""
     timing: float
-    """Spread of the starts: of the whole video or as given, of its first and of its second half [s]."""
+    """Spread of the starts: of the whole video or as given, of its first and of its second half
+    [s].
+    """
     residual: float
-    """RMS of the difference between the two holders, per coordinate [px of a picture 224 px wide]."""
+    """RMS of the difference between the two holders, per coordinate [px of a picture 224 px wide].
+    """
 
     def refusals(self) -> list[str]:
         """Return why the video must not be measured, if it must not."""
@@ -96,7 +103,11 @@ def load_camera(path: str | Path) -> Camera:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} must be TOML: {error}") from error
     rotation = content.get("rotation")
-    if isinstance(rotation, list) and len(rotation) == 3 and all(isinstance(r, int | float) for r in rotation):
+    if (
+        isinstance(rotation, list)
+        and len(rotation) == 3
+        and all(isinstance(r, int | float) for r in rotation)
+    ):
         content["rotation"] = Rotation.from_rotvec(rotation).as_matrix().tolist()
     try:
         return Camera.model_validate({"name": "custom", **content})
@@ -120,20 +131,29 @@ def import_video(
         VideoError: The video cannot be measured.
     """
     if frame_rate is not None and not 0 < frame_rate < math.inf:
-        raise VideoError(f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}")
+        raise VideoError(
+            f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}"
+        )
     times, tracks = _follow(path, camera, frame_rate)
     last = INSTANTS[-1] / RATE - CUT_MAX
     if times[-1] - times[0] < last:
-        raise VideoError(f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.1f} s")
+        raise VideoError(
+            f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.1f} s"
+        )
     if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
-        raise VideoError(f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}")
+        raise VideoError(
+            f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}"
+        )
     registration, wanders = _register(times, tracks, camera.straight, start)
     if reasons := registration.refusals():
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
     first, *pictures = _pictures(path, camera, [0, *chosen])
     pixel, off = camera.width / _WIDE, wanders[chosen]
-    found = [floor_motion(first, picture, near) for picture, near in zip(pictures, off / pixel, strict=True)]
+    found = [
+        floor_motion(first, picture, near)
+        for picture, near in zip(pictures, off / pixel, strict=True)
+    ]
     motions, deviations = map(np.array, zip(*found, strict=True))
     if max(deviations) <= FLOOR_MAX:
         if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
@@ -141,7 +161,9 @@ def import_video(
             raise VideoError(f"the floor and the holders {rule}, and differ by {apart:.1f}")
         off = motions * pixel
     registered = holder_crops(Cameras.of([camera.straight]), instants)
-    place = Crops(registered.origin + torch.from_numpy(off.astype(np.float32))[None], registered.scale)
+    place = Crops(
+        registered.origin + torch.from_numpy(off.astype(np.float32))[None], registered.scale
+    )
     crops = cut(torch.from_numpy(np.stack(pictures).astype(np.float32) / 255)[None], place)
     clip = Clips(
         crops=crops,
@@ -154,7 +176,8 @@ def import_video(
     return clip, registration
 
 
-# --- following the holders -------------------------------------------------------------------------------------
+# --- following the holders
+# -------------------------------------------------------------------------------------
 
 
 def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
@@ -162,7 +185,9 @@ def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
     try:
         import av
     except ModuleNotFoundError as error:
-        raise VideoError("reading videos needs PyAV: pip install 'stickslip-training[video]'") from error
+        raise VideoError(
+            "reading videos needs PyAV: pip install 'stickslip-training[video]'"
+        ) from error
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
@@ -170,15 +195,22 @@ def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
             for frame in container.decode(video=0):
                 if frame.time is None:
                     raise VideoError(f"every frame of {path} must have a time, and one has none")
-                yield float(frame.time), frame.to_ndarray(format="gray").astype(np.uint8, copy=False)
+                yield (
+                    float(frame.time),
+                    frame.to_ndarray(format="gray").astype(np.uint8, copy=False),
+                )
     except (av.error.FFmpegError, OSError) as error:
         raise VideoError(f"{path} must be a video that FFmpeg reads: {error}") from error
 
 
 def holder_points(instants: Array) -> Floats:
-    """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2, 3) [m]."""
+    """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2,
+    3) [m].
+    """
     x, z = (np.asarray(part, dtype=np.float64) for part in holder_path(instants))
-    return np.stack(np.broadcast_arrays(x[:, None], (-PATCH, PATCH), z[:, None] - PATCH_BELOW), axis=-1)
+    return np.stack(
+        np.broadcast_arrays(x[:, None], (-PATCH, PATCH), z[:, None] - PATCH_BELOW), axis=-1
+    )
 
 
 def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple[Floats, Floats]:
@@ -186,7 +218,9 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
     try:
         import cv2
     except ModuleNotFoundError as error:
-        raise VideoError("following the holders needs OpenCV: pip install 'stickslip-training[video]'") from error
+        raise VideoError(
+            "following the holders needs OpenCV: pip install 'stickslip-training[video]'"
+        ) from error
     seen, depth = camera.project(holder_points(np.zeros(1))[0])
     window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
@@ -207,7 +241,8 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
             step, found, _ = flow(before, picture, place, None, maxLevel=2)
             if not found.all():
                 raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
-            # Errors of steps from frame to frame add up. Those of a match with one kept frame do not.
+            # Errors of steps from frame to frame add up. Those of a match with one kept frame do
+            # not.
             first = {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
             place, found, _ = flow(kept, picture, kept_place, step.copy(), **first)
             if not found.all() or np.abs(place - step).max() > MATCH_MAX:
@@ -225,9 +260,11 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
     return np.array(times), focal * flat + center
 
 
-def _register(times: Floats, tracks: Floats, camera: Camera, start: float | None) -> tuple[Registration, Floats]:
-    """Return the registration, and the common motion of both holders besides the path, from the first frame on, (N, 2)
-    [px]."""
+def _register(
+    times: Floats, tracks: Floats, camera: Camera, start: float | None
+) -> tuple[Registration, Floats]:
+    """Return the registration, and the common motion of both holders besides the path, from the
+    first frame on, (N, 2) [px]."""
 
     def off(t0: float, some: slice = slice(None)) -> Floats:
         """Return tracks less the path, less their mean, (N, 2, 2)."""
@@ -265,32 +302,46 @@ def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.N
     import cv2
 
     matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    found = {number: picture for number, (_, picture) in enumerate(_frames(path)) if number in chosen}
+    found = {
+        number: picture for number, (_, picture) in enumerate(_frames(path)) if number in chosen
+    }
     return [cv2.undistort(found[number], matrix, np.array(camera.distortion)) for number in chosen]
 
 
-def floor_motion(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], near: Floats) -> tuple[Floats, float]:
-    """Return how far the floor has moved between two pictures (H, W), (2,), and the standard deviation of that.
+def floor_motion(
+    before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], near: Floats
+) -> tuple[Floats, float]:
+    """Return how far the floor has moved between two pictures (H, W), (2,), and the standard
+    deviation of that.
 
-    All are in pixels of a picture 224 px wide. The motion is looked for within 2 px or so of `near`, which the holders
-    tell, and of 0, since they may be lost and a tripod does not move. The surer of both is returned.
+    All are in pixels of a picture 224 px wide. The motion is looked for within 2 px or so of
+    `near`, which the holders tell, and of 0, since they may be lost and a tripod does not move. The
+    surer of both is returned.
     """
     import cv2
 
     size = (_WIDE, round(_WIDE * before.shape[0] / before.shape[1]))
-    small = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) for picture in (before, after)]
-    a, b = (cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in small)
+    small = [
+        cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for picture in (before, after)
+    ]
+    a, b = (
+        cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 3.0)
+        for picture in small
+    )
     return min((_aligned(a, b, start) for start in (near, np.zeros(2))), key=lambda found: found[1])
 
 
 def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:
-    """Return the motion d from picture A to B, (H, W) each without what is wider than 3 px, and its deviation [px].
+    """Return the motion d from picture A to B, (H, W) each without what is wider than 3 px, and its
+    deviation [px].
 
     From `start` on, Gauss-Newton steps with the weights of the step before minimize
 
         sum_x r^2 / (1 + (e / e_f)^4),   r(x) = B(x + d) - A(x),   e^2 = r^2 within 3 px of x
 
-    A fifth of the picture has an e below e_f: that is floor, and not cloth. Only slopes of both make d certain.
+    A fifth of the picture has an e below e_f: that is floor, and not cloth. Only slopes of both
+    make d certain.
     """
     import cv2
 
@@ -301,12 +352,16 @@ def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:
     motion, step, slopes = start.copy(), np.ones(2), inner(np.gradient(a)[::-1])
     for _ in range(20):
         place = np.hstack([np.eye(2), motion[:, None]])
-        moved = cv2.warpAffine(b, place, a.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        moved = cv2.warpAffine(
+            b, place, a.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
         energy = inner(cv2.GaussianBlur((moved - a) ** 2, (0, 0), 3.0))
         weight = 1 / (1 + (energy / max(rounded, np.quantile(energy, 0.2))) ** 2)
         if np.abs(step).max() < 0.01:
             break
-        step = np.linalg.lstsq((weight * slopes) @ slopes.T, (weight * slopes) @ inner(moved - a), rcond=None)[0]
+        step = np.linalg.lstsq(
+            (weight * slopes) @ slopes.T, (weight * slopes) @ inner(moved - a), rcond=None
+        )[0]
         motion -= step
     common = (weight * slopes) @ inner(np.gradient(moved)[::-1]).T
     sure = np.linalg.eigvalsh((common + common.T) / 2)[0]

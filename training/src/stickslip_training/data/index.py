@@ -1,7 +1,8 @@
-"""Where a version keeps its samples, and reading them: labels, curves of many samples a chunk, one chunk a sample.
+"""Where a version keeps its samples, and reading them: labels, curves of many samples a chunk, one
+chunk a sample.
 
-A read of bytes per clip, mesh or set of views: shard indexes are kept, a chunk's crc32c is checked, and it is decoded
-into its place in the caller's buffer.
+A read of bytes per clip, mesh or set of views: shard indexes are kept, a chunk's crc32c is checked,
+and it is decoded into its place in the caller's buffer.
 """
 
 from collections import OrderedDict
@@ -12,16 +13,30 @@ from typing import Any
 import numpy as np
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format import codecs
-from stickslip_schemas.format.manifest import BrokenSectionError, Contents, FileEntry, Manifest, ManifestSection
+from stickslip_schemas.format.manifest import (
+    BrokenSectionError,
+    Contents,
+    FileEntry,
+    Manifest,
+    ManifestSection,
+)
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_training.arrays import Array
-from stickslip_training.data.sources import CorruptDataError, InvalidDatasetError, MissingFileError, Source
+from stickslip_training.data.sources import (
+    CorruptDataError,
+    InvalidDatasetError,
+    MissingFileError,
+    Source,
+)
 
 
 class Index:
-    """The files of a version. A file that is read whole is checked against its digest, and so is the shard of a
-    directory before the first of its samples is read."""
+    """The files of a version.
+
+    A file that is read whole is checked against its digest, and so is the shard of a directory
+    before the first of its samples is read.
+    """
 
     def __init__(
         self,
@@ -51,9 +66,12 @@ class Index:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         manifest = Manifest.model_validate_json(state["manifest"])
-        self.__dict__.update(state, manifest=manifest, _contents=Contents(manifest, state["source"].read))
+        self.__dict__.update(
+            state, manifest=manifest, _contents=Contents(manifest, state["source"].read)
+        )
 
-    # --- files --------------------------------------------------------------------------------------------------
+    # --- files
+    # --------------------------------------------------------------------------------------------------
 
     @contextmanager
     def contents(self) -> Iterator[Contents]:
@@ -87,10 +105,14 @@ class Index:
 
     def _compare(self, file: FileEntry, digest: str | None) -> None:
         if digest is not None and digest != file.sha256:
-            raise CorruptDataError(f"{self.at(file)} has SHA-256 {digest}, and the manifest says {file.sha256}")
+            raise CorruptDataError(
+                f"{self.at(file)} has SHA-256 {digest}, and the manifest says {file.sha256}"
+            )
 
     def check_section(self, slot: int) -> None:
-        """Check that the section of a sample fits the labels, and lists every shard with a valid sample."""
+        """Check that the section of a sample fits the labels, and lists every shard with a valid
+        sample.
+        """
         number = self._contents.number_of(slot)
         if number in self._checked_sections:
             return
@@ -99,12 +121,18 @@ class Index:
         valid = self.label("valid")[slots]
         rejected = sorted(item.slot for item in section.rejections)
         if (section.first + np.flatnonzero(~valid)).tolist() != rejected:
-            raise InvalidDatasetError(f"array valid must be false at the manifest's rejections, which are {rejected}")
+            raise InvalidDatasetError(
+                f"array valid must be false at the manifest's rejections, which are {rejected}"
+            )
         keys = self.label("sample_key")[slots]
-        listed = np.frombuffer(bytes.fromhex("".join(section.sample_keys)), dtype=np.uint8).reshape(keys.shape)
+        listed = np.frombuffer(bytes.fromhex("".join(section.sample_keys)), dtype=np.uint8).reshape(
+            keys.shape
+        )
         wrong = section.first + np.flatnonzero(valid & (keys != listed).any(axis=1))
         if wrong.size:
-            raise InvalidDatasetError(f"array sample_key is not what the manifest says of samples {wrong.tolist()}")
+            raise InvalidDatasetError(
+                f"array sample_key is not what the manifest says of samples {wrong.tolist()}"
+            )
         # A missing shard raises now, and not in the middle of an epoch.
         shards = (section.first + np.flatnonzero(valid)) // self.manifest.spec.samples_per_shard
         for shard in np.unique(shards).tolist():
@@ -113,7 +141,8 @@ class Index:
                     self.file(array.shard_path(shard), f"array {array.name}, shard {shard}")
         self._checked_sections.add(number)
 
-    # --- arrays -------------------------------------------------------------------------------------------------
+    # --- arrays
+    # -------------------------------------------------------------------------------------------------
 
     def label(self, name: str) -> Array:
         """Return a label of all slots, (slots, ...), read-only."""
@@ -149,7 +178,9 @@ class Index:
             samples = self.manifest.spec.samples_per_shard
             size = codecs.shard_index_size(samples)
             if size > file.size:
-                raise CorruptDataError(f"array {array.name}: {self.at(file)} is too short for a shard index")
+                raise CorruptDataError(
+                    f"array {array.name}: {self.at(file)} is too short for a shard index"
+                )
             data = self.source.read(file, file.size - size, size)
             if self._check_shards:
                 self._compare(file, self.source.digest(file))

@@ -1,8 +1,8 @@
 """Read samples of a dataset version, from a directory, a bucket or over HTTP, into NumPy arrays.
 
-Opening checks the seal, manifest, metadata and labels against one another. There are no threads and nothing
-asynchronous, so a reader may be used before and after a fork, and it can be pickled. Missing data raises; it is never
-replaced by zeros.
+Opening checks the seal, manifest, metadata and labels against one another. There are no threads and
+nothing asynchronous, so a reader may be used before and after a fork, and it can be pickled.
+Missing data raises; it is never replaced by zeros.
 """
 
 import json
@@ -46,7 +46,10 @@ Slots = Sequence[int] | npt.NDArray[np.integer[Any]]
 
 
 class DatasetReader:
-    """One version of a dataset, open for reading. Samples are named by their slot, 0 to `len(reader)` - 1."""
+    """One version of a dataset, open for reading.
+
+    Samples are named by their slot, 0 to `len(reader)` - 1.
+    """
 
     manifest_digest: str
     """SHA-256 of the manifest."""
@@ -65,13 +68,12 @@ class DatasetReader:
     ) -> None:
         """Open a version.
 
-        Args:
-            source: Directory of the version, or its URL (see `sources`).
-            api_key: Key for a server; the default is the environment variable `STICKSLIP_API_KEY`.
-            verify: Read every file first, and check it against the manifest.
-            check_shards: Check a shard in a directory before its first sample is read. Over HTTP only `verify` checks
-                shards, for samples are parts of them.
-            cache_bytes: Memory for decoded chunks of curves, which hold many samples.
+        Args: source: Directory of the version, or its URL (see `sources`). api_key: Key for a
+            server; the default is the environment variable `STICKSLIP_API_KEY`. verify: Read every
+            file first, and check it against the manifest. check_shards: Check a shard in a
+            directory before its first sample is read. Over HTTP only `verify` checks shards, for
+            samples are parts of them. cache_bytes: Memory for decoded chunks of curves, which hold
+            many samples.
 
         Raises:
             DatasetError: The version is damaged, or contradicts the contract.
@@ -81,8 +83,12 @@ class DatasetReader:
             self.manifest_digest, group, manifest = _read_sealed(self.source)
             parsed = _parse_manifest(manifest)
             self.selection = _read_selection(self.source, self.manifest_digest)
-            self.arrays = {array.name: array for array in self.selection.choose_arrays(layout(parsed.spec))}
-            self.index = Index(self.source, parsed, self.arrays, check_shards=check_shards, cache_bytes=cache_bytes)
+            self.arrays = {
+                array.name: array for array in self.selection.choose_arrays(layout(parsed.spec))
+            }
+            self.index = Index(
+                self.source, parsed, self.arrays, check_shards=check_shards, cache_bytes=cache_bytes
+            )
             if verify:
                 self.verify()
             self._check_metadata(group)
@@ -112,7 +118,9 @@ class DatasetReader:
 
     @cached_property
     def chosen(self) -> Array:
-        """True where there is a sample in the part of the version that the source holds, bool (slots,)."""
+        """True where there is a sample in the part of the version that the source holds, bool
+        (slots,).
+        """
         return self.selection.choose_samples(self.arrays.values(), self.label)
 
     def __len__(self) -> int:
@@ -131,7 +139,8 @@ class DatasetReader:
     def slots(self, split: Split | None = None) -> npt.NDArray[np.int64]:
         """Return the slots of `split`, or of all splits, in increasing order.
 
-        Rejected samples, which have labels only, and those of other parts of the version are left out.
+        Rejected samples, which have labels only, and those of other parts of the version are left
+        out.
         """
         chosen = self.chosen.copy()
         if split is not None:
@@ -145,10 +154,14 @@ class DatasetReader:
         try:
             return self.arrays[name]
         except KeyError:
-            raise ValueError(f"array must be one of {', '.join(self.arrays)}, and is {name!r}") from None
+            raise ValueError(
+                f"array must be one of {', '.join(self.arrays)}, and is {name!r}"
+            ) from None
 
     def label(self, name: str) -> Array:
-        """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector; read-only."""
+        """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector;
+        read-only.
+        """
         array = self.array(name)
         if not array.is_label:
             raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
@@ -159,7 +172,10 @@ class DatasetReader:
         return tuple(array.name for array in self.arrays.values() if array.is_label)
 
     def categories(self, name: str) -> tuple[str, ...]:
-        """Return the names of the codes 0, 1, ... of a categorical label; none where it is no such label."""
+        """Return the names of the codes 0, 1, ... of a categorical label.
+
+        None where it is no such label.
+        """
         return tuple(map(str, self.array(name).categories))
 
     def rejections(self) -> Iterator[Rejection]:
@@ -179,7 +195,8 @@ class DatasetReader:
         return out
 
     def read_into(self, name: str, slots: Slots, out: Array) -> None:
-        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample shape).
+        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample
+        shape).
 
         `out` of clips may also have the order in memory that their chunks have, which is quicker.
 
@@ -192,7 +209,9 @@ class DatasetReader:
         """
         array = self.array(name)
         shape = (len(slots), *array.shape)
-        ordered = out.flags.c_contiguous or (out.ndim == len(shape) and in_order_of_chunks(array, out))
+        ordered = out.flags.c_contiguous or (
+            out.ndim == len(shape) and in_order_of_chunks(array, out)
+        )
         if out.shape != shape or out.dtype != np.dtype(array.dtype) or not ordered:
             raise ValueError(
                 f"out must be C-ordered {array.dtype} of shape {shape} for {name}, and is {out.dtype} of {out.shape}"
@@ -206,29 +225,37 @@ class DatasetReader:
             raise IndexError(f"slot must be from 0 to {len(self) - 1}, and is {slot}")
         if not self.valid[slot]:
             reasons = [item for item in self.index.section(slot).rejections if item.slot == slot]
-            raise RejectedSampleError(f"sample {slot} was rejected: {reasons[0].reason}, {reasons[0].message}")
+            raise RejectedSampleError(
+                f"sample {slot} was rejected: {reasons[0].reason}, {reasons[0].message}"
+            )
         if not self.chosen[slot]:
             raise MissingFileError(
                 f"sample {slot} is not in the part of the dataset that {self.source} holds: "
                 f"{self.selection.model_dump_json()}"
             )
 
-    # --- checks -------------------------------------------------------------------------------------------------
+    # --- checks
+    # -------------------------------------------------------------------------------------------------
 
     def verify(self) -> None:
-        """Check the size and the SHA-256 of every file of the manifest; opening has checked the manifest itself."""
+        """Check the size and the SHA-256 of every file of the manifest.
+
+        Opening has checked the manifest itself.
+        """
         with self.index.contents() as contents:
             part = part_files(contents, self.selection, self.label)
         for file in part:
             if ".." in file.path.split("/"):
-                raise InvalidDatasetError(f"the manifest names {file.path}, which is not inside the dataset")
+                raise InvalidDatasetError(
+                    f"the manifest names {file.path}, which is not inside the dataset"
+                )
             self.index.read_file(file)
         for slot in np.flatnonzero(self.chosen).tolist():
             self.index.check_section(slot)
 
     def _check_metadata(self, group: dict[str, Any]) -> None:
-        """Check the Zarr metadata against the layout: what is read follows from the layout alone, and a chunk of
-        another shape or codec would be nonsense that passes its checksum."""
+        """Check the Zarr metadata against the layout: what is read follows from the layout alone,
+        and a chunk of another shape or codec would be nonsense that passes its checksum."""
         if group.get("zarr_format") != 3 or group.get("node_type") != "group":
             raise InvalidDatasetError(f"{GROUP_NAME} must be of a Zarr v3 group")
         inline = group.get("consolidated_metadata")
@@ -248,7 +275,9 @@ class DatasetReader:
         A section is checked when the first of its samples is read.
         """
         for array in self.arrays.values():
-            for number in range(-(-len(self) // self.manifest.spec.samples_per_file(array)) if array.is_label else 0):
+            for number in range(
+                -(-len(self) // self.manifest.spec.samples_per_file(array)) if array.is_label else 0
+            ):
                 self.index.file(array.shard_path(number), f"array {array.name}, file {number}")
         if not self.manifest.sections:
             self.index.check_section(0)
@@ -258,7 +287,9 @@ class DatasetReader:
             )
         split = self.label("split")
         if split.max() >= len(SPLITS):
-            raise InvalidDatasetError(f"array split must be less than {len(SPLITS)}, and there is a {split.max()}")
+            raise InvalidDatasetError(
+                f"array split must be less than {len(SPLITS)}, and there is a {split.max()}"
+            )
         counts = np.bincount(split[self.valid], minlength=len(SPLITS)).tolist()
         stated = [self.manifest.split_counts.get(name, 0) for name in SPLITS]
         if stated != counts:
@@ -269,7 +300,9 @@ class DatasetReader:
 
 
 def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
-    """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked against one another."""
+    """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked
+    against one another.
+    """
     manifest = source.read_manifest()
     group = source.fetch(GROUP_NAME)[0]
     try:
@@ -280,7 +313,9 @@ def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
 
 
 def _read_selection(source: Source, manifest: str) -> Selection:
-    """Return the part of the version with this manifest that the source holds, which may be all of it."""
+    """Return the part of the version with this manifest that the source holds, which may be all of
+    it.
+    """
     if not isinstance(source, DirectorySource):
         return Selection()  # servers have whole versions
     try:
@@ -292,7 +327,9 @@ def _read_selection(source: Source, manifest: str) -> Selection:
     except ValidationError as error:
         raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is damaged: {error}") from None
     if part.manifest != manifest:
-        raise InvalidDatasetError(f"{source}/{SELECTION_NAME} is of another version, whose manifest is {part.manifest}")
+        raise InvalidDatasetError(
+            f"{source}/{SELECTION_NAME} is of another version, whose manifest is {part.manifest}"
+        )
     return part.selection
 
 
@@ -310,7 +347,8 @@ def _parse_manifest(data: bytes) -> Manifest:
     return manifest
 
 
-# --- Zarr metadata ----------------------------------------------------------------------------------------------
+# --- Zarr metadata
+# ----------------------------------------------------------------------------------------------
 
 
 def _parse_metadata(data: bytes, path: str) -> dict[str, Any]:
@@ -320,11 +358,15 @@ def _parse_metadata(data: bytes, path: str) -> dict[str, Any]:
     except ValueError as error:
         raise InvalidDatasetError(f"{path} is no JSON: {error}") from None
     if not isinstance(metadata, dict):
-        raise InvalidDatasetError(f"{path} must be a JSON object, and is a {type(metadata).__name__}")
+        raise InvalidDatasetError(
+            f"{path} must be a JSON object, and is a {type(metadata).__name__}"
+        )
     return metadata
 
 
-def _check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> None:
+def _check_array(
+    metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_file: int
+) -> None:
     """Raise InvalidDatasetError where the metadata of one array contradict its layout."""
     if not isinstance(metadata, dict):
         raise InvalidDatasetError(f"array {array.name}: there must be metadata, and there are none")
@@ -341,7 +383,9 @@ def _check_array(metadata: Any, array: ArrayLayout, *, sample_count: int, sample
         "fill_value": "NaN" if array.fill != array.fill else array.fill,
         "storage_transformers": [],
     }
-    defaults = _DEFAULTS | ({"bytes": {"endian": "little"}} if np.dtype(array.dtype).itemsize == 1 else {})
+    defaults = _DEFAULTS | (
+        {"bytes": {"endian": "little"}} if np.dtype(array.dtype).itemsize == 1 else {}
+    )
     found = {
         **metadata,
         "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding"), defaults),
@@ -360,7 +404,10 @@ _CRC = {"name": "crc32c", "configuration": {}}
 
 
 def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
-    compressor: dict[str, Any] = {"name": "zstd" if packing(array) is None else "blosc", "configuration": {}}
+    compressor: dict[str, Any] = {
+        "name": "zstd" if packing(array) is None else "blosc",
+        "configuration": {},
+    }
     chunk: list[dict[str, Any]] = [_LITTLE, compressor, _CRC]
     if (order := axes_order(array)) is not None:
         chunk.insert(0, {"name": "transpose", "configuration": {"order": list(order)}})
@@ -376,12 +423,13 @@ def _codecs(array: ArrayLayout) -> list[dict[str, Any]]:
 
 
 _DEFAULTS = {"default": {"separator": "/"}, "sharding_indexed": {"index_location": "end"}}
-"""Configurations that the metadata may leave out; for values of one byte, the order of bytes, too."""
+"""Configurations that the metadata may leave out; for values of one byte, the order of bytes, too.
+"""
 
 
 def _normalised(codec: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
-    """Give a codec or an encoding, or each of a list, its configuration, but for what a reader need not know: the level
-    of zstd, all of blosc's."""
+    """Give a codec or an encoding, or each of a list, its configuration, but for what a reader need
+    not know: the level of zstd, all of blosc's."""
     if isinstance(codec, list):
         return [_normalised(each, defaults) for each in codec]
     codec = {"name": codec} if isinstance(codec, str) else codec
@@ -391,4 +439,7 @@ def _normalised(codec: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
     configuration = defaults.get(str(name), {}) | (codec.get("configuration") or {})
     nested = [key for key in ("codecs", "index_codecs") if key in configuration]
     inner = {key: _normalised(configuration[key], defaults) for key in nested}
-    return {"name": name, "configuration": {} if name in ("zstd", "blosc") else configuration | inner}
+    return {
+        "name": name,
+        "configuration": {} if name in ("zstd", "blosc") else configuration | inner,
+    }

@@ -1,15 +1,16 @@
 """Samples of a dataset of any kind as batches for PyTorch.
 
-`Samples` is map-style, and reads a whole batch at a time (`__getitems__`) into one buffer, so `collate` has nothing to
-do: give it to a DataLoader as `collate_fn`, or let `loader()` do that.
+`Samples` is map-style, and reads a whole batch at a time (`__getitems__`) into one buffer, so
+`collate` has nothing to do: give it to a DataLoader as `collate_fn`, or let `loader()` do that.
 
-A buffer that is used again costs less than a new one, which the kernel has to map and clear: clips read into reused
-buffers cost a sixth less (benchmarks/results/reader.json). With `ring=n`, n buffers are used in turn, and **a batch is
-valid until n further batches have been drawn**: use it or copy it before. In the workers of a DataLoader every batch
-has a buffer of its own, for a worker reads ahead and hands its batches over by reference.
+A buffer that is used again costs less than a new one, which the kernel has to map and clear: clips
+read into reused buffers cost a sixth less (benchmarks/results/reader.json). With `ring=n`, n
+buffers are used in turn, and **a batch is valid until n further batches have been drawn**: use it
+or copy it before. In the workers of a DataLoader every batch has a buffer of its own, for a worker
+reads ahead and hands its batches over by reference.
 
-The clips of a batch are tensors with strides: rows of all frames are together in memory, as they are on disk. Use
-`reshape`, not `view`, or `contiguous()`.
+The clips of a batch are tensors with strides: rows of all frames are together in memory, as they
+are on disk. Use `reshape`, not `view`, or `contiguous()`.
 """
 
 import os
@@ -28,9 +29,14 @@ from stickslip_training.data.reader import DatasetReader, Split
 
 
 class Item(dict[str, torch.Tensor]):
-    """Tensors by name, of one sample; `name("material")` says what the code of a categorical label means."""
+    """Tensors by name, of one sample.
 
-    def __init__(self, tensors: Mapping[str, torch.Tensor], categories: Mapping[str, tuple[str, ...]]) -> None:
+    `name("material")` says what the code of a categorical label means.
+    """
+
+    def __init__(
+        self, tensors: Mapping[str, torch.Tensor], categories: Mapping[str, tuple[str, ...]]
+    ) -> None:
         super().__init__(tensors)
         self.categories = categories
         """Names of the codes 0, 1, ... of each categorical label."""
@@ -43,11 +49,16 @@ class Item(dict[str, torch.Tensor]):
         try:
             return self.categories[label]
         except KeyError:
-            raise ValueError(f"label must be one of {', '.join(self.categories)}, and is {label!r}") from None
+            raise ValueError(
+                f"label must be one of {', '.join(self.categories)}, and is {label!r}"
+            ) from None
 
 
 class Batch(Item):
-    """Tensors by name, the first dimension of each is the sample; `names("material")` says what the codes mean."""
+    """Tensors by name, the first dimension of each is the sample.
+
+    `names("material")` says what the codes mean.
+    """
 
     def names(self, label: str) -> list[str]:
         """Return the name of each sample's category."""
@@ -55,8 +66,12 @@ class Batch(Item):
         return [names[code] for code in self[label].tolist()]
 
     def __missing__(self, key: Any) -> torch.Tensor:
-        if isinstance(key, int):  # torch's own collate function takes a list of items, and asks for its first
-            raise TypeError("a batch comes whole from the dataset: make the DataLoader with collate_fn=collate")
+        if isinstance(
+            key, int
+        ):  # torch's own collate function takes a list of items, and asks for its first
+            raise TypeError(
+                "a batch comes whole from the dataset: make the DataLoader with collate_fn=collate"
+            )
         raise KeyError(key)
 
 
@@ -69,9 +84,9 @@ def collate(batch: Any) -> Batch:
 class Samples(Dataset[Item]):
     """Samples of one split: arrays are read sample by sample, labels are in memory.
 
-    An item holds the arrays and labels that were asked for, by name, and `slot` int64 and `sample_key` uint8 (32,).
-    Labels are float32 where they are quantities, and int64 where they are codes or counts: `item.name("material")` and
-    `batch.names("material")` name a category.
+    An item holds the arrays and labels that were asked for, by name, and `slot` int64 and
+    `sample_key` uint8 (32,). Labels are float32 where they are quantities, and int64 where they are
+    codes or counts: `item.name("material")` and `batch.names("material")` name a category.
     """
 
     def __init__(
@@ -85,26 +100,34 @@ class Samples(Dataset[Item]):
     ) -> None:
         """Open `split` of a dataset, or all of it.
 
-        Args:
-            source: A directory, a URL or an open reader.
-            split: The split; None takes all samples.
-            arrays: Arrays of an item; by default the video, or all curves of a dataset without videos.
-            labels: Labels of an item; by default all that are one number.
-            ring: Buffers that are used in turn; 0 makes a new one for each batch.
+        Args: source: A directory, a URL or an open reader. split: The split; None takes all
+            samples. arrays: Arrays of an item; by default the video, or all curves of a dataset
+            without videos. labels: Labels of an item; by default all that are one number. ring:
+            Buffers that are used in turn; 0 makes a new one for each batch.
 
         Raises:
             ValueError: The dataset has no such array, or `ring` is negative.
         """
         if ring < 0:
-            raise ValueError(f"ring must be a number of buffers, 0 for a new one each time, and is {ring}")
+            raise ValueError(
+                f"ring must be a number of buffers, 0 for a new one each time, and is {ring}"
+            )
         self.reader = source if isinstance(source, DatasetReader) else DatasetReader(source)
         known = self.reader.arrays
         if arrays is None:
-            curves = [array.name for array in known.values() if not array.is_label and not array.per_sample]
+            curves = [
+                array.name
+                for array in known.values()
+                if not array.is_label and not array.per_sample
+            ]
             arrays = ["video"] if "video" in known else curves
         if labels is None:
             common = {array.name for array in COMMON_ARRAYS}
-            labels = [name for name in self.reader.label_names if not known[name].shape and name not in common]
+            labels = [
+                name
+                for name in self.reader.label_names
+                if not known[name].shape and name not in common
+            ]
         for name in arrays:
             if name not in known:
                 raise ValueError(f"the dataset has no array {name}; it has {', '.join(known)}")
@@ -113,8 +136,12 @@ class Samples(Dataset[Item]):
         """Slot in the dataset of each item, int64 (items,)."""
         self._arrays = tuple(arrays)
         values = {name: self.reader.label(name)[self.slots] for name in labels}
-        self._labels = {n: v.astype(np.float32 if v.dtype.kind == "f" else np.int64) for n, v in values.items()}
-        self.categories = {name: self.reader.categories(name) for name in labels if self.reader.categories(name)}
+        self._labels = {
+            n: v.astype(np.float32 if v.dtype.kind == "f" else np.int64) for n, v in values.items()
+        }
+        self.categories = {
+            name: self.reader.categories(name) for name in labels if self.reader.categories(name)
+        }
         """Names of the codes 0, 1, ... of each categorical label."""
         self._ring_length = ring
         self._ring: list[dict[str, torch.Tensor]] = []
@@ -131,7 +158,10 @@ class Samples(Dataset[Item]):
         """Return one sample: tensors without a sample dimension, in memory of its own."""
         slot = self.slots[[index]]
         item = {name: torch.from_numpy(self.reader.read(name, slot)[0]) for name in self._arrays}
-        item |= {name: torch.from_numpy(values[index : index + 1].copy())[0] for name, values in self._labels.items()}
+        item |= {
+            name: torch.from_numpy(values[index : index + 1].copy())[0]
+            for name, values in self._labels.items()
+        }
         item |= {"slot": torch.tensor(int(slot[0])), "sample_key": self._sample_keys(slot)[0]}
         return Item(item, self.categories)
 
@@ -148,9 +178,16 @@ class Samples(Dataset[Item]):
         batch["sample_key"] = self._sample_keys(slots)
         return batch
 
-    def loader(self, batch_size: int, *, shuffle: bool = False, **options: Any) -> "DataLoader[Item]":
-        """Return a DataLoader over this dataset; `options` are those of DataLoader, but for `collate_fn`."""
-        return DataLoader(self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options)
+    def loader(
+        self, batch_size: int, *, shuffle: bool = False, **options: Any
+    ) -> "DataLoader[Item]":
+        """Return a DataLoader over this dataset.
+
+        `options` are those of DataLoader, but for `collate_fn`.
+        """
+        return DataLoader(
+            self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options
+        )
 
     def close(self) -> None:
         self.reader.close()
@@ -171,19 +208,24 @@ class Samples(Dataset[Item]):
         return {name: tensor[:count] for name, tensor in self._ring[place].items()}
 
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
-        return {name: torch.from_numpy(empty_in_order(self.reader.array(name), count)) for name in self._arrays}
+        return {
+            name: torch.from_numpy(empty_in_order(self.reader.array(name), count))
+            for name in self._arrays
+        }
 
 
 class Stream:
     """An epoch of batches each time it is iterated over, or the rest of one.
 
-    The samples of an epoch are in an order that `seed` and the number of the epoch decide. They are dealt out in rounds
-    of `batch_size * world_size`, and process `rank` takes its part of each round. So no two processes see the same
-    sample in an epoch, and a run with half the processes and twice the batch size sees the same rounds. The last round
-    is left out if it is not full, unless there is one process: it then has a smaller batch.
+    The samples of an epoch are in an order that `seed` and the number of the epoch decide. They are
+    dealt out in rounds of `batch_size * world_size`, and process `rank` takes its part of each
+    round. So no two processes see the same sample in an epoch, and a run with half the processes
+    and twice the batch size sees the same rounds. The last round is left out if it is not full,
+    unless there is one process: it then has a smaller batch.
 
-    `state_dict` counts the batches that the loop has been given: those that workers of the DataLoader have read ahead
-    are read again. Put it into your checkpoint, and `load_state_dict` goes on with the next batch, bit for bit.
+    `state_dict` counts the batches that the loop has been given: those that workers of the
+    DataLoader have read ahead are read again. Put it into your checkpoint, and `load_state_dict`
+    goes on with the next batch, bit for bit.
     """
 
     def __init__(
@@ -199,12 +241,19 @@ class Stream:
     ) -> None:
         """Begin with the first batch of epoch 0.
 
-        `rank` and `world_size` are those of torch.distributed where it runs, else 0 and 1. `options` are those of
-        DataLoader. Raises ValueError where a number makes no sense, or no round is full.
+        `rank` and `world_size` are those of torch.distributed where it runs, else 0 and 1.
+        `options` are those of DataLoader. Raises ValueError where a number makes no sense, or no
+        round is full.
         """
         runs = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if runs else 0
-        self.world_size = world_size if world_size is not None else torch.distributed.get_world_size() if runs else 1
+        self.world_size = (
+            world_size
+            if world_size is not None
+            else torch.distributed.get_world_size()
+            if runs
+            else 1
+        )
         if batch_size < 1 or self.world_size < 1:
             raise ValueError(
                 f"batch_size and world_size must be at least 1, and are {batch_size} and {self.world_size}"
@@ -217,7 +266,9 @@ class Stream:
         self.drawn = 0
         """Batches of this epoch that have been given out."""
         if not len(self):
-            raise ValueError(f"a round is {batch_size * self.world_size} samples, and the dataset has {len(dataset)}")
+            raise ValueError(
+                f"a round is {batch_size * self.world_size} samples, and the dataset has {len(dataset)}"
+            )
 
     def __len__(self) -> int:
         """Return the batches of an epoch."""
@@ -227,7 +278,9 @@ class Stream:
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches that are left of this epoch; then the next epoch begins."""
         batches = self._batches()[self.drawn :]
-        for batch in DataLoader(self.dataset, batch_sampler=batches, collate_fn=collate, **self._options):
+        for batch in DataLoader(
+            self.dataset, batch_sampler=batches, collate_fn=collate, **self._options
+        ):
             self.drawn += 1
             assert isinstance(batch, Batch)
             yield batch
@@ -235,20 +288,32 @@ class Stream:
 
     def _batches(self) -> list[list[int]]:
         count = len(self.dataset)
-        order = np.random.default_rng([self.seed, self.epoch]).permutation(count) if self.shuffle else np.arange(count)
+        order = (
+            np.random.default_rng([self.seed, self.epoch]).permutation(count)
+            if self.shuffle
+            else np.arange(count)
+        )
         size = self.batch_size * self.world_size
         first = self.rank * self.batch_size
-        return [order[begin + first :][: self.batch_size].tolist() for begin in range(0, len(self) * size, size)]
+        return [
+            order[begin + first :][: self.batch_size].tolist()
+            for begin in range(0, len(self) * size, size)
+        ]
 
     def state_dict(self) -> dict[str, Any]:
         """Return how far it has come, in types that JSON has."""
         return self._same() | {"epoch": self.epoch, "drawn": self.drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where the stream was that `state` is of; raise ValueError where it is of another order."""
+        """Go on where the stream was that `state` is of.
+
+        Raise ValueError where it is of another order.
+        """
         for name, value in self._same().items():
             if state.get(name) != value:
-                raise ValueError(f"{name} of the stream is {value!r}, and of the state {state.get(name)!r}")
+                raise ValueError(
+                    f"{name} of the stream is {value!r}, and of the state {state.get(name)!r}"
+                )
         self.epoch, self.drawn = int(state["epoch"]), int(state["drawn"])
 
     def _same(self) -> dict[str, Any]:

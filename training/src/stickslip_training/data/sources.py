@@ -1,8 +1,8 @@
-"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range requests; what can
-be wrong with them.
+"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range
+requests; what can be wrong with them.
 
-A source keeps nothing open that two processes could fight over: a file is opened for each read, and an HTTP client
-belongs to the process that made it. So a source can be pickled and survives a fork.
+A source keeps nothing open that two processes could fight over: a file is opened for each read, and
+an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
 """
 
 import hashlib
@@ -52,7 +52,8 @@ class Source(ABC):
 
     @abstractmethod
     def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
-        """Return the bytes of a file, or those of a part of it, and the size of the file if it is known.
+        """Return the bytes of a file, or those of a part of it, and the size of the file if it is
+        known.
 
         Raises MissingFileError where there is no such file.
         """
@@ -65,16 +66,24 @@ class Source(ABC):
             raise MissingFileError(f"{error}: this is no committed dataset version") from None
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
-        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the manifest."""
+        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the
+        manifest.
+        """
         length = file.size - offset if length is None else length
         try:
-            data, size = self.fetch(file.path, None if length == file.size else range(offset, offset + length))
+            data, size = self.fetch(
+                file.path, None if length == file.size else range(offset, offset + length)
+            )
         except MissingFileError as error:
             raise MissingFileError(f"{error}, and the manifest says it is") from None
         if size not in (None, file.size):
-            raise CorruptDataError(f"{self}/{file.path} has {size} bytes, and the manifest says {file.size}")
+            raise CorruptDataError(
+                f"{self}/{file.path} has {size} bytes, and the manifest says {file.size}"
+            )
         if len(data) != length:
-            raise CorruptDataError(f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected")
+            raise CorruptDataError(
+                f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected"
+            )
         return data
 
     def digest(self, file: FileEntry) -> str | None:
@@ -89,7 +98,9 @@ def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -
     """Return the source that a path or a URL means."""
     text = os.fspath(source)
     if re.match(r"https?://", text):
-        return HttpSource(text, api_key=api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE))
+        return HttpSource(
+            text, api_key=api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE)
+        )
     if text.startswith("s3://"):
         return BucketSource(text)
     return DirectorySource(Path(text))
@@ -135,8 +146,9 @@ class _RemoteSource(Source):
 class BucketSource(_RemoteSource):
     """A dataset version in an S3 bucket: `s3://BUCKET/PREFIX/datasets/<id>/v<n>`.
 
-    Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read is one request. The
-    client has threads, which a fork does not have: a DataLoader with workers needs `multiprocessing_context="spawn"`.
+    Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read
+    is one request. The client has threads, which a fork does not have: a DataLoader with workers
+    needs `multiprocessing_context="spawn"`.
     """
 
     PATIENCE = timedelta(seconds=60)
@@ -144,15 +156,21 @@ class BucketSource(_RemoteSource):
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
         if not parts.netloc or parts.query or parts.fragment:
-            raise ValueError(f"a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is {url!r}")
+            raise ValueError(
+                f"a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is {url!r}"
+            )
         super().__init__(url)
         self._bucket, self._prefix = parts.netloc, unquote(parts.path).strip("/")
 
     def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
         if part is None:
-            return self._asked(path, lambda obstore, objects: obstore.get(objects, path).bytes().to_bytes()), None
+            return self._asked(
+                path, lambda obstore, objects: obstore.get(objects, path).bytes().to_bytes()
+            ), None
         within = {"start": part.start, "end": part.stop}
-        return self._asked(path, lambda obstore, objects: obstore.get_range(objects, path, **within).to_bytes()), None
+        return self._asked(
+            path, lambda obstore, objects: obstore.get_range(objects, path, **within).to_bytes()
+        ), None
 
     def close(self) -> None:
         self._client = None
@@ -171,20 +189,24 @@ class BucketSource(_RemoteSource):
         try:
             if self._client is None:
                 retries: Any = {"retry_timeout": self.PATIENCE}
-                self._client = obstore.store.S3Store(self._bucket, prefix=self._prefix or None, retry_config=retries)
+                self._client = obstore.store.S3Store(
+                    self._bucket, prefix=self._prefix or None, retry_config=retries
+                )
                 self._pid = os.getpid()
             return bytes(request(obstore, self._client))
         except FileNotFoundError:
             raise MissingFileError(f"{self}/{name} is not there") from None
         except obstore.exceptions.BaseError as error:
-            raise SourceError(f"{self}/{name} cannot be read: {str(error).splitlines()[0]}") from error
+            raise SourceError(
+                f"{self}/{name} cannot be read: {str(error).splitlines()[0]}"
+            ) from error
 
 
 class HttpSource(_RemoteSource):
     """A dataset version behind a URL.
 
-    Either a version of the service, `.../v1/datasets/<id>/versions/<n>` (with or without `/files` or `/manifest`), or
-    any URL below which the dataset's files lie, `manifest.json` among them.
+    Either a version of the service, `.../v1/datasets/<id>/versions/<n>` (with or without `/files`
+    or `/manifest`), or any URL below which the dataset's files lie, `manifest.json` among them.
     """
 
     TRIES = 4
@@ -212,7 +234,9 @@ class HttpSource(_RemoteSource):
             return data, len(data)
         sent = re.fullmatch(r"bytes (\d+-\d+)/(\d+)", response.headers.get("Content-Range", ""))
         if sent is None or sent[1] != asked:
-            raise CorruptDataError(f"{url} sent {sent and sent[0]}, and bytes {asked} were expected")
+            raise CorruptDataError(
+                f"{url} sent {sent and sent[0]}, and bytes {asked} were expected"
+            )
         return data, int(sent[2])
 
     def close(self) -> None:
@@ -226,7 +250,9 @@ class HttpSource(_RemoteSource):
 
         if self._client is None or self._pid != os.getpid():
             # A fork shares the parent's sockets: the child must not use them, nor close them.
-            headers_of_all = {"Accept-Encoding": "identity"}  # ranges are of the file, not of a compressed form of it
+            headers_of_all = {
+                "Accept-Encoding": "identity"
+            }  # ranges are of the file, not of a compressed form of it
             if self._api_key:
                 headers_of_all["Authorization"] = f"Bearer {self._api_key}"
             self._client = httpx.Client(headers=headers_of_all, timeout=30.0, follow_redirects=True)

@@ -1,8 +1,9 @@
 """The training loop of every model: steps, averaged weights, validation, checkpoints, resume.
 
-What is learned is a `Learner`'s business. A run is a function of its settings: every step draws its batch from the seed
-and its own number, and torch's generator is seeded with both, so the same settings, data, machine and number of threads
-give the same weights, and a run that is resumed goes on exactly as if it had not stopped.
+What is learned is a `Learner`'s business. A run is a function of its settings: every step draws its
+batch from the seed and its own number, and torch's generator is seeded with both, so the same
+settings, data, machine and number of threads give the same weights, and a run that is resumed goes
+on exactly as if it had not stopped.
 """
 
 import copy
@@ -40,7 +41,9 @@ class FitSettings:
     """Steps after which the network is validated and a report made."""
     seed: int = 0
     averaging: float = 0.0
-    """Decay of the running average over steps that is the model's weights; 0 takes the last weights as they are."""
+    """Decay of the running average over steps that is the model's weights; 0 takes the last weights
+    as they are.
+    """
     clip: float | None = None
     """The largest norm of a step's gradient; longer ones are shortened to it."""
     threads: int = 2
@@ -68,7 +71,9 @@ class Learner(ABC):
 
     @abstractmethod
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
-        """Return the loss of the batch of `step`, which must depend on nothing but the seed and `step`."""
+        """Return the loss of the batch of `step`, which must depend on nothing but the seed and
+        `step`.
+        """
 
     def learning_rate(self, step: int) -> float | None:
         """Return the learning rate of `step`; None leaves that of the optimiser."""
@@ -115,7 +120,9 @@ class Fitted:
     run: Progress
 
     def facts(self) -> dict[str, Any]:
-        """Return what a report says of every run, as plain values, with the versions that its numbers depend on."""
+        """Return what a report says of every run, as plain values, with the versions that its
+        numbers depend on.
+        """
         return {
             "steps": self.run.step,
             "best_step": self.run.best_step,
@@ -138,8 +145,9 @@ def fit(
 ) -> Fitted:
     """Train the network of `learner`.
 
-    A checkpoint is kept below `out`, where one is given. With `resume` the run goes on from it; `identity` and the
-    settings but for the length, threads and device must be those of the run that is resumed, or ValueError is raised.
+    A checkpoint is kept below `out`, where one is given. With `resume` the run goes on from it;
+    `identity` and the settings but for the length, threads and device must be those of the run that
+    is resumed, or ValueError is raised.
     """
     with torch_threads(settings.threads), torch.random.fork_rng():
         return _Run(learner, settings, out, dict(identity or {}), on_epoch).go(resume)
@@ -156,7 +164,9 @@ class _Run:
     def __post_init__(self) -> None:
         kept = ("epoch", "seed", "averaging", "clip")
         self.identity |= {name: getattr(self.settings, name) for name in kept}
-        self.net = self.learner.net.to(self.settings.device)  # the learner sees it move, and puts its batches there
+        self.net = self.learner.net.to(
+            self.settings.device
+        )  # the learner sees it move, and puts its batches there
         self.averaged = copy.deepcopy(self.net).eval()
         self.optimizer = self.learner.optimizer(self.net.parameters())
         self.state = Progress()
@@ -177,8 +187,8 @@ class _Run:
                 checkpointed = state.seconds
         self._checkpoint()
         if state.epoch_losses:
-            # The steps ended in the middle of an epoch. That is news for this run's report and model, and not for the
-            # checkpoint: a run that goes on from it will end the epoch.
+            # The steps ended in the middle of an epoch. That is news for this run's report and
+            # model, and not for the checkpoint: a run that goes on from it will end the epoch.
             self._end_epoch()
         self.averaged.load_state_dict(state.best)
         return Fitted(self.averaged.eval(), state)
@@ -202,7 +212,10 @@ class _Run:
         state.step += 1
 
     def _average(self) -> None:
-        """Move the average towards the weights; faster at first, so that it forgets where they began."""
+        """Move the average towards the weights.
+
+        Faster at first, so that it forgets where they began.
+        """
         step = self.state.step
         share = 1.0 - min(self.settings.averaging, (1 + step) / (10 + step))
         with torch.no_grad():
@@ -212,7 +225,9 @@ class _Run:
                 held.copy_(value)
 
     def _end_epoch(self) -> None:
-        """Validate, keep the weights if they are the best so far (or if there is nothing to choose them by), report."""
+        """Validate, keep the weights if they are the best so far (or if there is nothing to choose
+        them by), report.
+        """
         state = self.state
         validation = self.learner.validate(self.averaged.eval())
         report = EpochReport(
@@ -227,11 +242,15 @@ class _Run:
         if validation is None or validation < state.best_loss:
             state.best_loss = math.inf if validation is None else validation
             state.best_step = state.step
-            state.best = {name: tensor.detach().cpu().clone() for name, tensor in self.averaged.state_dict().items()}
+            state.best = {
+                name: tensor.detach().cpu().clone()
+                for name, tensor in self.averaged.state_dict().items()
+            }
         if self.on_epoch is not None:
             self.on_epoch(report)
 
-    # --- checkpoints ------------------------------------------------------------------------------------------
+    # --- checkpoints
+    # ------------------------------------------------------------------------------------------
 
     def _checkpoint(self) -> None:
         if self.out is None:
@@ -241,7 +260,10 @@ class _Run:
             "net": self.net.state_dict(),
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "state": {**vars(self.state), "history": [asdict(report) for report in self.state.history]},
+            "state": {
+                **vars(self.state),
+                "history": [asdict(report) for report in self.state.history],
+            },
         }
         save_tensors(self.out / CHECKPOINT_NAME, content)
 
@@ -252,7 +274,9 @@ class _Run:
         content = load_tensors(path, device=self.settings.device)
         for name, value in self.identity.items():
             if (stored := content["identity"].get(name)) != value:
-                raise ValueError(f"{name} must be that of the run that is resumed, {stored}, and is {value}")
+                raise ValueError(
+                    f"{name} must be that of the run that is resumed, {stored}, and is {value}"
+                )
         self.net.load_state_dict(content["net"])
         self.averaged.load_state_dict(content["averaged"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -262,7 +286,8 @@ class _Run:
         self.state.best = {name: tensor.cpu() for name, tensor in self.state.best.items()}
 
 
-# --- files ----------------------------------------------------------------------------------------------------
+# --- files
+# ----------------------------------------------------------------------------------------------------
 
 
 def save_tensors(path: Path, content: dict[str, Any]) -> None:
@@ -279,11 +304,17 @@ def load_tensors(path: str | Path, *, device: str = "cpu") -> dict[str, Any]:
 
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:
-    """Write `report.json` below `out`, whole or not at all; a number that is none raises ValueError."""
-    write_durably(out / "report.json", f"{json.dumps(report, indent=2, allow_nan=False)}\n".encode())
+    """Write `report.json` below `out`, whole or not at all.
+
+    A number that is none raises ValueError.
+    """
+    write_durably(
+        out / "report.json", f"{json.dumps(report, indent=2, allow_nan=False)}\n".encode()
+    )
 
 
-# --- for learners ---------------------------------------------------------------------------------------------
+# --- for learners
+# ---------------------------------------------------------------------------------------------
 
 
 def seed_of_step(*numbers: int) -> int:
@@ -311,7 +342,9 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def cosine_rate(highest: float, step: int, steps: int, warm_up: int) -> float:
-    """Return a learning rate that rises for `warm_up` steps and falls to nothing at `steps` like half a cosine."""
+    """Return a learning rate that rises for `warm_up` steps and falls to nothing at `steps` like
+    half a cosine.
+    """
     return highest * min(1.0, (step + 1) / warm_up) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 

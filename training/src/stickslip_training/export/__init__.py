@@ -1,1 +1,3 @@
-"""Datasets in formats that other libraries read: HDF5, WebDataset, Parquet, LeRobot, and OBJ meshes."""
+"""Datasets in formats that other libraries read: HDF5, WebDataset, Parquet, LeRobot, and OBJ
+meshes.
+"""

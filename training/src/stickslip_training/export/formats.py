@@ -1,7 +1,9 @@
-"""Exports: the samples of a part of a version, in the order of their slots, one at a time, in formats of others.
+"""Exports: the samples of a part of a version, in the order of their slots, one at a time, in
+formats of others.
 
-Rejected samples are left out in every format, so no fill value is ever taken for a sample. The array `slot` says which
-slot of the version each sample has. An export is there whole or not at all, and overwrites nothing.
+Rejected samples are left out in every format, so no fill value is ever taken for a sample. The
+array `slot` says which slot of the version each sample has. An export is there whole or not at all,
+and overwrites nothing.
 """
 
 import io
@@ -53,9 +55,14 @@ class Content:
         chosen = reader.chosen & selection.choose_samples(everything, reader.label)
         self.slots = np.flatnonzero(chosen).astype(np.int64)
         if not len(self.slots):
-            raise ValueError(f"no valid sample is in this part of the dataset: {selection.model_dump_json()}")
+            raise ValueError(
+                f"no valid sample is in this part of the dataset: {selection.model_dump_json()}"
+            )
         # All samples of an export are valid.
-        self.arrays = (SLOT, *(array for array in selection.choose_arrays(everything) if array.name != "valid"))
+        self.arrays = (
+            SLOT,
+            *(array for array in selection.choose_arrays(everything) if array.name != "valid"),
+        )
 
     @property
     def name(self) -> str:
@@ -85,7 +92,9 @@ class Content:
         return self.reader.read(name, slots)
 
     def parts(self) -> Iterator[tuple[str, int, int, npt.NDArray[np.int64]]]:
-        """Yield split, number, count of the files of that split, and slots of each file, split by split."""
+        """Yield split, number, count of the files of that split, and slots of each file, split by
+        split.
+        """
         size = max(1, FILE_BYTES // self.sample_bytes)
         splits = self.reader.label("split")[self.slots]
         for code, split in enumerate(SPLITS):
@@ -98,7 +107,9 @@ class Content:
         """Return the bytes of the version's manifest."""
         data = self.reader.source.read_manifest()
         if sha256(data) != self.reader.manifest_digest:
-            raise CorruptDataError(f"the manifest of {self.reader.source} has changed since it was opened")
+            raise CorruptDataError(
+                f"the manifest of {self.reader.source} has changed since it was opened"
+            )
         return data
 
     def identity(self) -> dict[str, Any]:
@@ -129,7 +140,10 @@ class Content:
 
 
 def to_directory(
-    content: Content, target: Path, on_bytes: OnBytes, write: Callable[[Content, Path, OnBytes], None]
+    content: Content,
+    target: Path,
+    on_bytes: OnBytes,
+    write: Callable[[Content, Path, OnBytes], None],
 ) -> None:
     """Let `write` fill a directory, and add the manifest and a description."""
     with made_whole(target) as scratch:
@@ -141,7 +155,8 @@ def to_directory(
 
 @contextmanager
 def made_whole(target: Path) -> Iterator[Path]:
-    """Give a path beside `target` to write to, which becomes `target` at the end, or vanishes after an error.
+    """Give a path beside `target` to write to, which becomes `target` at the end, or vanishes after
+    an error.
 
     Raises FileExistsError, and overwrites nothing, where `target` exists.
     """
@@ -164,17 +179,20 @@ def made_whole(target: Path) -> Iterator[Path]:
 
 def _refuse_existing(target: Path) -> None:
     if os.path.lexists(target):
-        raise FileExistsError(f"{target} exists, and an export overwrites nothing: name another place")
+        raise FileExistsError(
+            f"{target} exists, and an export overwrites nothing: name another place"
+        )
 
 
-# --- formats: functions write into a new file or an empty directory ------------------------------------------
+# --- formats: functions write into a new file or an empty directory
+# ------------------------------------------
 
 
 def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
     """Write one file: a dataset for each array, with the names, types and values of the version.
 
-    The first dimension is the sample, and `slot` says which one. Every chunk has a checksum (fletcher32), which the
-    HDF5 library checks.
+    The first dimension is the sample, and `slot` says which one. Every chunk has a checksum
+    (fletcher32), which the HDF5 library checks.
     """
     import h5py
 
@@ -183,11 +201,19 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
         for name, value in content.identity().items():
             file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value or ""
         manifest = np.frombuffer(content.manifest(), dtype=np.uint8)
-        file.create_dataset("manifest.json", data=manifest, chunks=manifest.shape, compression="gzip", fletcher32=True)
+        file.create_dataset(
+            "manifest.json",
+            data=manifest,
+            chunks=manifest.shape,
+            compression="gzip",
+            fletcher32=True,
+        )
         for array in content.arrays:
             rows = max(1, min(count, CHUNK_BYTES // array.sample_bytes))
             shape, chunks = (count, *array.shape), (rows, *array.shape)
-            out = file.create_dataset(array.name, shape=shape, dtype=array.dtype, chunks=chunks, fletcher32=True)
+            out = file.create_dataset(
+                array.name, shape=shape, dtype=array.dtype, chunks=chunks, fletcher32=True
+            )
             for dimension, name in zip(out.dims, ("sample", *array.dimensions), strict=True):
                 dimension.label = name
             for key, value in describe(array).items():
@@ -199,22 +225,28 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
 
 
 def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write `train-000000.tar` and so on: for each sample `SLOT.json` with its labels, and a `SLOT.ARRAY.npy` for each
-    other array.
+    """Write `train-000000.tar` and so on: for each sample `SLOT.json` with its labels, and a
+    `SLOT.ARRAY.npy` for each other array.
 
-    Categories are codes, as in the version; `dataset.json` names them. Infinity and NaN are written as Python's json
-    reads them.
+    Categories are codes, as in the version; `dataset.json` names them. Infinity and NaN are written
+    as Python's json reads them.
     """
     for split, number, _, slots in content.parts():
-        with tarfile.open(directory / f"{split}-{number:06d}.tar", "x", format=tarfile.USTAR_FORMAT) as tar:
-            labels = {array.name: content.read(array.name, slots).tolist() for array in content.labels}
+        with tarfile.open(
+            directory / f"{split}-{number:06d}.tar", "x", format=tarfile.USTAR_FORMAT
+        ) as tar:
+            labels = {
+                array.name: content.read(array.name, slots).tolist() for array in content.labels
+            }
             for place, slot in enumerate(slots):
                 sample = {name: values[place] for name, values in labels.items()}
                 _add(tar, f"{slot:08d}.json", json.dumps(sample).encode())
                 for array in content.arrays:
                     if not array.is_label:
                         buffer = io.BytesIO()
-                        np.save(buffer, content.read(array.name, slots[[place]])[0], allow_pickle=False)
+                        np.save(
+                            buffer, content.read(array.name, slots[[place]])[0], allow_pickle=False
+                        )
                         _add(tar, f"{slot:08d}.{array.name}.npy", buffer.getvalue())
                 on_bytes(content.sample_bytes)
 
@@ -228,32 +260,48 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write `SLOT/0000.obj` and so on, one for each instant with all sheets, and `SLOT/labels.json`.
+    """Write `SLOT/0000.obj` and so on, one for each instant with all sheets, and
+    `SLOT/labels.json`.
 
-    Meshes are in metres, z up, with the flat cloth as texture coordinates from 0 to 1 along its longer side. OBJ is
-    text, and its numbers, read as 32-bit floats, are those of the dataset, bit by bit.
+    Meshes are in metres, z up, with the flat cloth as texture coordinates from 0 to 1 along its
+    longer side. OBJ is text, and its numbers, read as 32-bit floats, are those of the dataset, bit
+    by bit.
     """
     names = {array.name for array in content.arrays}
-    sheets = [name.removesuffix("positions") for name in sorted(names) if name.split(".")[-1] == "positions"]
-    missing = [f"{sheet}{part}" for sheet in sheets or [""] for part in ("positions", "rest", "triangles")]
+    sheets = [
+        name.removesuffix("positions")
+        for name in sorted(names)
+        if name.split(".")[-1] == "positions"
+    ]
+    missing = [
+        f"{sheet}{part}" for sheet in sheets or [""] for part in ("positions", "rest", "triangles")
+    ]
     if missing := [name for name in missing if name not in names]:
-        raise ValueError(f"a mesh needs {', '.join(missing)}, which this part of {content.name} does not have")
+        raise ValueError(
+            f"a mesh needs {', '.join(missing)}, which this part of {content.name} does not have"
+        )
     for slot in content.slots:
         alone = np.array([slot])
         folder = directory / f"{slot:08d}"
         folder.mkdir()
-        labels = {array.name: content.read(array.name, alone)[0].tolist() for array in content.labels}
+        labels = {
+            array.name: content.read(array.name, alone)[0].tolist() for array in content.labels
+        }
         (folder / "labels.json").write_text(json.dumps(labels, indent=2) + "\n")
         written: list[str] = []
         first = 1
         for sheet in sheets:
             positions, rest, triangles = (
-                content.read(f"{sheet}{part}", alone)[0] for part in ("positions", "rest", "triangles")
+                content.read(f"{sheet}{part}", alone)[0]
+                for part in ("positions", "rest", "triangles")
             )
             low = rest.min(axis=0)
             uv = ((rest - low) / (rest.max(axis=0) - low).max()).astype(np.float32)
             fixed = "".join(f"vt {u:.9g} {v:.9g}\n" for u, v in uv.tolist())
-            fixed += "".join("f " + " ".join(f"{i}/{i}" for i in face) + "\n" for face in (triangles + first).tolist())
+            fixed += "".join(
+                "f " + " ".join(f"{i}/{i}" for i in face) + "\n"
+                for face in (triangles + first).tolist()
+            )
             first += len(rest)
             written = written or [""] * len(positions)
             for instant, vertices in enumerate(positions.tolist()):
@@ -267,25 +315,30 @@ def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
 def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write `data/train-00000-of-00002.parquet` and so on, and a card.
 
-    Each file carries the features, so `datasets.load_dataset(DIR)` gives every array with its shape and type, and every
-    categorical label with its names.
+    Each file carries the features, so `datasets.load_dataset(DIR)` gives every array with its shape
+    and type, and every categorical label with its names.
     """
     import datasets
     import pyarrow
     from pyarrow import parquet
 
     (directory / "data").mkdir()
-    schema = datasets.Features({array.name: _feature(array) for array in content.arrays}).arrow_schema
+    schema = datasets.Features(
+        {array.name: _feature(array) for array in content.arrays}
+    ).arrow_schema
     rows = max(1, GROUP_BYTES // content.sample_bytes)
     splits = []
     for split, number, count, slots in content.parts():
         splits += [split] if number == 0 else []
         path = directory / "data" / f"{split}-{number:05d}-of-{count:05d}.parquet"
-        with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
+        with parquet.ParquetWriter(
+            path, schema, compression="zstd", write_page_checksum=True
+        ) as writer:
             for first in range(0, len(slots), rows):
                 some = slots[first : first + rows]
                 columns = [
-                    _column(content.read(array.name, some), schema.field(array.name).type) for array in content.arrays
+                    _column(content.read(array.name, some), schema.field(array.name).type)
+                    for array in content.arrays
                 ]
                 writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
                 on_bytes(len(some) * content.sample_bytes)
@@ -305,7 +358,9 @@ def _feature(array: ArrayLayout) -> Any:
 
 
 def _column(values: Array, kind: Any) -> Any:
-    """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the further axes."""
+    """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the
+    further axes.
+    """
     import pyarrow
 
     column = pyarrow.array(values.reshape(-1))

@@ -1,10 +1,12 @@
-"""LeRobotDataset v3 [huggingface/lerobot, codebase version v3.0]: what holders do to cloth, for learning robots.
+"""LeRobotDataset v3 [huggingface/lerobot, codebase version v3.0]: what holders do to cloth, for
+learning robots.
 
-An episode is a simulation with one texture and one look of light and floor, seen by all viewpoints of the dataset.
-`action` has of each holder its position, the first two columns of its rotation [Zhou et al. 2019], and whether it
-holds, at the next frame; `observation.state` has the same of this frame, the poses of all bodies, and the places of
-five vertices of each sheet: four corners and the middle. `observation.time` is the time in the scene [s], for videos
-have their frames evenly. Labels are columns of the episodes.
+An episode is a simulation with one texture and one look of light and floor, seen by all viewpoints
+of the dataset. `action` has of each holder its position, the first two columns of its rotation
+[Zhou et al. 2019], and whether it holds, at the next frame; `observation.state` has the same of
+this frame, the poses of all bodies, and the places of five vertices of each sheet: four corners and
+the middle. `observation.time` is the time in the scene [s], for videos have their frames evenly.
+Labels are columns of the episodes.
 
 Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
 """
@@ -36,7 +38,10 @@ _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write the files into an empty directory; raise ValueError where there are no holders or no whole episode."""
+    """Write the files into an empty directory.
+
+    Raise ValueError where there are no holders or no whole episode.
+    """
     import pandas
     import pyarrow
     from pyarrow import parquet
@@ -51,8 +56,12 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     views = list(episodes[0][1])
     instants = np.array(arrays["video"].attributes["instants"])
     length, span = len(instants), int(np.ptp(instants))
-    per_second = Fraction(arrays["holder_pose"].attributes["instants_per_second"]).limit_denominator(1000)
-    rate = per_second * (length - 1) / span if span else Fraction(1)  # a video has its frames evenly
+    per_second = Fraction(
+        arrays["holder_pose"].attributes["instants_per_second"]
+    ).limit_denominator(1000)
+    rate = (
+        per_second * (length - 1) / span if span else Fraction(1)
+    )  # a video has its frames evenly
     every: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     tables: list[Any] = []
@@ -65,7 +74,11 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
         where: dict[str, Any] = {}
         for view, slot in slots.items():
             key, video = f"observation.images.{view}", content.read("video", np.array([slot]))[0]
-            _encode(video, directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file), rate)
+            _encode(
+                video,
+                directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file),
+                rate,
+            )
             stats[key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
             where |= {
                 f"videos/{key}/chunk_index": chunk,
@@ -95,13 +108,19 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
                 **where,
-                **{f"stats/{name}/{key}": value for name, own in stats.items() for key, value in own.items()},
+                **{
+                    f"stats/{name}/{key}": value
+                    for name, own in stats.items()
+                    for key, value in own.items()
+                },
             }
         )
     path = directory / "meta/episodes/chunk-000/file-000.parquet"
     path.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), path)
-    pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(directory / "meta" / "tasks.parquet")
+    pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(
+        directory / "meta" / "tasks.parquet"
+    )
     totals = {name: _merged([stats[name] for stats in every]) for name in every[0]}
     (directory / "meta" / "stats.json").write_text(json.dumps(totals))
     info = _info(episodes, names, views, float(rate), arrays["video"].shape)
@@ -109,13 +128,20 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
 
 
 def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
-    """Yield the split and the samples by viewpoint of each episode that all viewpoints see, split by split."""
+    """Yield the split and the samples by viewpoint of each episode that all viewpoints see, split
+    by split.
+    """
     reader = content.reader
-    labels = [name for name in reader.spec.named_axes if name in reader.arrays and name != "viewpoint"]
+    labels = [
+        name for name in reader.spec.named_axes if name in reader.arrays and name != "viewpoint"
+    ]
     seen: dict[tuple[Any, ...], dict[str, int]] = {}
     views = reader.categories("viewpoint")
     for slot in content.slots.tolist():
-        key = (int(reader.label("split")[slot]), *(reader.label(name)[slot].item() for name in labels))
+        key = (
+            int(reader.label("split")[slot]),
+            *(reader.label(name)[slot].item() for name in labels),
+        )
         seen.setdefault(key, {})[views[reader.label("viewpoint")[slot]]] = slot
     every = {view for slots in seen.values() for view in slots}
     whole = [(key[0], slots) for key, slots in seen.items() if slots.keys() == every]
@@ -128,8 +154,12 @@ def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
         yield SPLITS[split], dict(sorted(slots.items()))
 
 
-def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Return `action` and `observation.state` of the frames of a sample, float32, and the names of their numbers."""
+def _numbers(
+    content: Content, slot: int, instants: Array
+) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """Return `action` and `observation.state` of the frames of a sample, float32, and the names of
+    their numbers.
+    """
     alone = np.array([slot])
     arrays = {array.name: array for array in content.arrays}
 
@@ -144,10 +174,14 @@ def _numbers(content: Content, slot: int, instants: Array) -> tuple[dict[str, Ar
     parts, names = [held], list(own)
     if "body_pose" in arrays:
         parts.append(_flat_poses(over_time("body_pose")).reshape(len(holders), -1))
-        names += [f"{body}.{what}" for body in arrays["body_pose"].attributes["names"] for what in _POSE]
+        names += [
+            f"{body}.{what}" for body in arrays["body_pose"].attributes["names"] for what in _POSE
+        ]
     for name in (name for name in arrays if name.endswith(".positions")):
         sheet = name.removesuffix(".positions")
-        rest = content.read(f"{sheet}.rest", alone)[0]  # a flat sheet (V, 2): its corners and its middle are tracked
+        rest = content.read(f"{sheet}.rest", alone)[
+            0
+        ]  # a flat sheet (V, 2): its corners and its middle are tracked
         low, high = rest.min(axis=0), rest.max(axis=0)
         places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
         tracked = [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
@@ -177,7 +211,11 @@ def _encode(video: Array, path: Path, rate: Fraction) -> None:
         stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "rgb24"
         stream.thread_count = 1  # the same clip has the same bytes
         for picture in video:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            file.mux(
+                stream.encode(
+                    av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+                )
+            )
         file.mux(stream.encode())
 
 
@@ -188,7 +226,9 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
     length = len(frames["action"])
     index = np.arange(length, dtype=np.int64)
     columns = {
-        name: v.ravel() if v.shape[1] == 1 else pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1])
+        name: v.ravel()
+        if v.shape[1] == 1
+        else pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1])
         for name, v in frames.items()
     }
     counters = {"timestamp": (index / float(rate)).astype(np.float32), "frame_index": index}
@@ -199,8 +239,15 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
 def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
     """Return what LeRobot normalises with, of values (n, k), as lists of a shape, (k,) by default."""
     exact = values.astype(np.float64)
-    found = {"min": exact.min(axis=0), "max": exact.max(axis=0), "mean": exact.mean(axis=0), "std": exact.std(axis=0)}
-    return {name: value.reshape(shape or -1).tolist() for name, value in found.items()} | {"count": [len(values)]}
+    found = {
+        "min": exact.min(axis=0),
+        "max": exact.max(axis=0),
+        "mean": exact.mean(axis=0),
+        "std": exact.std(axis=0),
+    }
+    return {name: value.reshape(shape or -1).tolist() for name, value in found.items()} | {
+        "count": [len(values)]
+    }
 
 
 def _merged(parts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -208,12 +255,21 @@ def _merged(parts: list[dict[str, Any]]) -> dict[str, Any]:
     each = {name: np.array([part[name] for part in parts]) for name in parts[0]}
     mean = each["mean"].mean(axis=0)
     variance = (each["std"] ** 2 + (each["mean"] - mean) ** 2).mean(axis=0)
-    found = {"min": each["min"].min(axis=0), "max": each["max"].max(axis=0), "mean": mean, "std": np.sqrt(variance)}
-    return {name: value.tolist() for name, value in found.items()} | {"count": each["count"].sum(axis=0).tolist()}
+    found = {
+        "min": each["min"].min(axis=0),
+        "max": each["max"].max(axis=0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+    }
+    return {name: value.tolist() for name, value in found.items()} | {
+        "count": each["count"].sum(axis=0).tolist()
+    }
 
 
 def _labels(content: Content, slot: int) -> dict[str, Any]:
-    """Return the labels of an episode: those that are one number of a sample, and names instead of codes."""
+    """Return the labels of an episode: those that are one number of a sample, and names instead of
+    codes.
+    """
     found: dict[str, Any] = {}
     for array in content.labels:
         if not array.shape and array.name != "viewpoint":
@@ -223,12 +279,17 @@ def _labels(content: Content, slot: int) -> dict[str, Any]:
 
 
 def _info(
-    episodes: list[tuple[str, Any]], names: dict[str, list[str]], views: list[str], rate: float, shape: tuple[int, ...]
+    episodes: list[tuple[str, Any]],
+    names: dict[str, list[str]],
+    views: list[str],
+    rate: float,
+    shape: tuple[int, ...],
 ) -> dict[str, Any]:
     """Return `info.json`; `shape` is that of a clip."""
     length, height, width, _ = shape
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [len(numbers)], "names": numbers} for name, numbers in names.items()
+        name: {"dtype": "float32", "shape": [len(numbers)], "names": numbers}
+        for name, numbers in names.items()
     }
     features |= {
         f"observation.images.{view}": {
@@ -261,7 +322,9 @@ def _info(
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": int(rate) if rate == int(rate) else rate,
-        "splits": {split: f"{a}:{b}" for split, a, b in zip(SPLITS, ends, ends[1:], strict=False) if b > a},
+        "splits": {
+            split: f"{a}:{b}" for split, a, b in zip(SPLITS, ends, ends[1:], strict=False) if b > a
+        },
         "data_path": DATA,
         "video_path": VIDEO,
         "features": features,

@@ -1,4 +1,6 @@
-"""A user's photographs: a folder with one picture for each camera of a calibration file, named as the camera."""
+"""A user's photographs: a folder with one picture for each camera of a calibration file, named as
+the camera.
+"""
 
 import json
 import tomllib
@@ -36,8 +38,8 @@ def save_overlay(
     found: npt.NDArray[np.float64],
     true: npt.NDArray[np.float64] | None = None,
 ) -> None:
-    """Write a PNG of the views (y, x, rgb) side by side, with the reconstructed centreline (n, 3) [camera unit] and,
-    below it, the true one if it is known."""
+    """Write a PNG of the views (y, x, rgb) side by side, with the reconstructed centreline (n, 3)
+    [camera unit] and, below it, the true one if it is known."""
     module = import_pillow()
     from PIL import ImageDraw
 
@@ -46,13 +48,21 @@ def save_overlay(
     for pixels, camera in zip(views, cameras, strict=True):
         factor = max(1, round(LEAST_HEIGHT / camera.height))
         panel = module.fromarray(np.asarray(pixels)).convert("RGB")
-        panel = panel.resize((camera.width * factor, camera.height * factor), module.Resampling.NEAREST)
+        panel = panel.resize(
+            (camera.width * factor, camera.height * factor), module.Resampling.NEAREST
+        )
         pen = ImageDraw.Draw(panel)
         for points, color in curves:
             line = (camera.project(points)[0] + 0.5) * factor - 0.5
-            pen.line([tuple(point) for point in line.tolist()], fill=color, width=max(1, camera.height // 800))
+            pen.line(
+                [tuple(point) for point in line.tolist()],
+                fill=color,
+                width=max(1, camera.height // 800),
+            )
         panels.append(panel)
-    sheet = module.new("RGB", (sum(panel.width for panel in panels), max(panel.height for panel in panels)))
+    sheet = module.new(
+        "RGB", (sum(panel.width for panel in panels), max(panel.height for panel in panels))
+    )
     left = 0
     for panel in panels:
         sheet.paste(panel, (left, 0))
@@ -76,21 +86,31 @@ class FolderReconstruction:
 
 
 def reconstruct_folder(
-    folder: str | Path, calibration: str | Path, *, length: float, rig: str | None = None, **options: Any
+    folder: str | Path,
+    calibration: str | Path,
+    *,
+    length: float,
+    rig: str | None = None,
+    **options: Any,
 ) -> FolderReconstruction:
     """Reconstruct the rod in the photographs of a folder.
 
-    The calibration is laid out as `rigs/rod-4.toml` of the schemas; `rig` says which of its rigs, if it has several.
-    Lengths and positions are in its unit; `options` are those of `reconstruct`. Photographs must have been freed of
-    lens distortion.
+    The calibration is laid out as `rigs/rod-4.toml` of the schemas; `rig` says which of its rigs,
+    if it has several. Lengths and positions are in its unit; `options` are those of `reconstruct`.
+    Photographs must have been freed of lens distortion.
     """
     cameras = read_calibration(calibration, rig)
     views = [read_photograph(Path(folder), camera) for camera in cameras]
-    return FolderReconstruction(reconstruct(views, cameras, length=length, **options), cameras, views, length)
+    return FolderReconstruction(
+        reconstruct(views, cameras, length=length, **options), cameras, views, length
+    )
 
 
 def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, ...]:
-    """Return the cameras of a rig of a calibration file; errors name the field, the rule and the value."""
+    """Return the cameras of a rig of a calibration file.
+
+    Errors name the field, the rule and the value.
+    """
     try:
         rigs = read_rigs(path)
     except ValidationError as error:
@@ -104,7 +124,9 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
     names = ", ".join(rigs)
     if rig is None:
         if len(rigs) != 1:
-            raise ReconstructionError(f"rig must be given where a calibration has several; {path} has {names}")
+            raise ReconstructionError(
+                f"rig must be given where a calibration has several; {path} has {names}"
+            )
         rig = next(iter(rigs))
     if rig not in rigs:
         raise ReconstructionError(f"rig must be one of {names} in {path}; got {rig!r}")
@@ -118,11 +140,17 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
 
 
 def read_photograph(folder: Path, camera: Camera) -> npt.NDArray[np.uint8]:
-    """Return the one picture of a folder that is named as the camera, upright as its EXIF says, (y, x, rgb)."""
+    """Return the one picture of a folder that is named as the camera, upright as its EXIF says, (y,
+    x, rgb).
+    """
     image = import_pillow()
     from PIL import ImageOps
 
-    named = [path for path in sorted(folder.glob("*")) if path.stem == camera.name and path.suffix.lower() in ENDINGS]
+    named = [
+        path
+        for path in sorted(folder.glob("*"))
+        if path.stem == camera.name and path.suffix.lower() in ENDINGS
+    ]
     if len(named) != 1:
         wanted = " or ".join(camera.name + ending for ending in ENDINGS)
         raise ReconstructionError(f"{folder} must hold one picture {wanted}; found {len(named)}")
@@ -137,8 +165,17 @@ def write_results(result: FolderReconstruction, out: Path) -> list[str]:
     s = np.linspace(0.0, result.length, len(found.centerline))
     table = np.column_stack([s, found.centerline, found.deviation, found.views_seen])
     header = "arc_length,x,y,z,deviation,views_seen"
-    np.savetxt(out / "centerline.csv", table, fmt=["%.9g"] * 5 + ["%d"], delimiter=",", header=header, comments="")
-    arrays: dict[str, Any] = {name: getattr(found, name) for name in ("deviation", "residual", "views_seen")}
+    np.savetxt(
+        out / "centerline.csv",
+        table,
+        fmt=["%.9g"] * 5 + ["%d"],
+        delimiter=",",
+        header=header,
+        comments="",
+    )
+    arrays: dict[str, Any] = {
+        name: getattr(found, name) for name in ("deviation", "residual", "views_seen")
+    }
     np.savez(out / "centerline.npz", arc_length=s, centerline=found.centerline, **arrays)
     save_overlay(out / "overlay.png", result.views, result.cameras, found.centerline)
     report = {

@@ -1,13 +1,15 @@
 """From calibrated views of a hanging rod to its centreline.
 
 1. Silhouettes: the coverage of each pixel [silhouette].
-2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod, and the centroid of a
-   cylinder that moves through the visual hull, as in the thesis [starts].
-3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does so best wins.
-4. The winner is judged: what it leaves unexplained, what it claims that is not there, and whether another curve would
-   do as well.
+2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod, and the
+   centroid of a cylinder that moves through the visual hull, as in the thesis [starts].
+3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does
+   so best wins.
+4. The winner is judged: what it leaves unexplained, what it claims that is not there, and whether
+   another curve would do as well.
 
-Nothing of rods' physics is used but that they do not stretch and bend smoothly, so hair and tendrils will do.
+Nothing of rods' physics is used but that they do not stretch and bend smoothly, so hair and
+tendrils will do.
 """
 
 from collections.abc import Sequence
@@ -52,8 +54,8 @@ class Verdict(StrEnum):
 
 
 LIMITS = {"misfit": 0.25, "unexplained share": 0.03, "unsupported share": 0.03, "stretch": 0.02}
-"""Of a good curve, as shares of the silhouettes' area and of the length; `benchmarks/reconstruction.py` says how they
-tell good from bad."""
+"""Of a good curve, as shares of the silhouettes' area and of the length;
+`benchmarks/reconstruction.py` says how they tell good from bad."""
 RIVAL = 1.1  # a different curve whose misfit is less than so many times the winner's is a rival
 
 
@@ -64,9 +66,13 @@ class Reconstruction:
     centerline: Floats
     """Positions at uniform arc length, clamp first, (points, 3)."""
     deviation: Floats
-    """Standard deviation of each position, if pixels err independently, (points,). Wrong turns are not in it."""
+    """Standard deviation of each position, if pixels err independently, (points,). Wrong turns are
+    not in it.
+    """
     residual: Floats
-    """By how much each view would still move each point sideways [px], (views, points); NaN where it is hidden."""
+    """By how much each view would still move each point sideways [px], (views, points); NaN where
+    it is hidden.
+    """
     views_seen: npt.NDArray[np.int64]
     """Number of views in which each point lies open, (points,)."""
     radius: float
@@ -101,13 +107,16 @@ def reconstruct(
 ) -> Reconstruction:
     """Return the centreline of the rod that `views` show, one picture (y, x, rgb) for each camera.
 
-    `length`, `clamp` (where the rod leaves its clamp), `direction` (of the rod there) and `radius` are in the unit and
-    the axes of the cameras. A radius that is not given is found. Pictures must be free of lens distortion.
+    `length`, `clamp` (where the rod leaves its clamp), `direction` (of the rod there) and `radius`
+    are in the unit and the axes of the cameras. A radius that is not given is found. Pictures must
+    be free of lens distortion.
     """
     if not length > 0.0:
         raise ValueError(f"length must be positive; got {length}")
     if radius is not None and not SLENDER[0] <= radius / length <= SLENDER[1]:
-        raise ValueError(f"radius must be {SLENDER[0]} to {SLENDER[1]} of the length; got {radius} of {length}")
+        raise ValueError(
+            f"radius must be {SLENDER[0]} to {SLENDER[1]} of the length; got {radius} of {length}"
+        )
     if points < 2:
         raise ValueError(f"points must be at least 2; got {points}")
     origin, heading = _vector("clamp", clamp), _vector("direction", direction)
@@ -120,10 +129,16 @@ def reconstruct(
     judged = sorted(((_match(seen, fit), fit) for fit in fits), key=lambda item: item[0])
     (misfit, unexplained, unsupported), fit = judged[0]
     shape = at_uniform_arc_length(fit.control, points)
-    rivals = [other[0] / misfit for other, rival in judged[1:] if _distance(rival.control, fit.control) > APART]
+    rivals = [
+        other[0] / misfit
+        for other, rival in judged[1:]
+        if _distance(rival.control, fit.control) > APART
+    ]
     rival = min(rivals, default=float("inf"))
     residual = _residual(seen, fit, points)
-    verdict, reasons = _judge((misfit, unexplained, unsupported, abs(arc_length(shape)[-1] - 1.0)), rival)
+    verdict, reasons = _judge(
+        (misfit, unexplained, unsupported, abs(arc_length(shape)[-1] - 1.0)), rival
+    )
     return Reconstruction(
         centerline=origin + length * shape,
         deviation=length * _deviation(fit, points),
@@ -147,11 +162,16 @@ def _vector(name: str, value: npt.ArrayLike) -> Floats:
 
 
 def _silhouettes(
-    pictures: npt.ArrayLike | Sequence[npt.ArrayLike], cameras: Sequence[Camera], length: float, clamp: Floats
+    pictures: npt.ArrayLike | Sequence[npt.ArrayLike],
+    cameras: Sequence[Camera],
+    length: float,
+    clamp: Floats,
 ) -> list[View]:
     images = [np.asarray(picture) for picture in pictures]  # type: ignore[union-attr]
     if len(images) != len(cameras) or len(images) < 2:
-        raise ValueError(f"there must be one view for each of at least 2 cameras; got {len(images)} for {len(cameras)}")
+        raise ValueError(
+            f"there must be one view for each of at least 2 cameras; got {len(images)} for {len(cameras)}"
+        )
     seen = []
     for image, camera in zip(images, cameras, strict=True):
         if image.shape[:2] != (camera.height, camera.width):
@@ -177,18 +197,24 @@ def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: 
 
 
 def _half_width(coverage: Floats) -> float:
-    """Estimate the rod's half width [px]: a strip's is its area over its outline, both sides counted."""
+    """Estimate the rod's half width [px]: a strip's is its area over its outline, both sides
+    counted.
+    """
     solid = np.minimum(coverage, 1.0)
     return float(solid.sum() / max(float(np.hypot(*np.gradient(solid)).sum()), 1e-9))
 
 
 def _radius(views: Sequence[View]) -> float:
     """Estimate the radius [L]."""
-    found = [_half_width(view.coverage) * float(np.linalg.norm(view.t)) / view.focal for view in views]
+    found = [
+        _half_width(view.coverage) * float(np.linalg.norm(view.t)) / view.focal for view in views
+    ]
     return float(np.clip(np.median(found), *SLENDER))
 
 
-def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radius: bool) -> list[Fit]:
+def _refined(
+    views: Sequence[View], radius: float, direction: Floats, fixed_radius: bool
+) -> list[Fit]:
     """Return the fits of all different starts."""
     lines = follow(views, radius, direction, STARTS)
     by_hull = moving_cylinder(visual_hull(views), radius, direction)
@@ -197,13 +223,23 @@ def _refined(views: Sequence[View], radius: float, direction: Floats, fixed_radi
     coarse_views = [view.shrunk(2) for view in views]
     starts = [start(fit_curve(line, CONTROL_POINTS), radius, len(views)) for line in lines]
     coarse = [
-        refine(coarse_views, fit, direction, extra_blur=1.2, shading=False, fixed_radius=True, iterations=10)
+        refine(
+            coarse_views,
+            fit,
+            direction,
+            extra_blur=1.2,
+            shading=False,
+            fixed_radius=True,
+            iterations=10,
+        )
         for fit in starts
     ]
     kept: list[Fit] = []
     for fit in sorted(coarse, key=lambda fit: fit.cost):
         hopeless = bool(kept) and fit.cost > HOPELESS * kept[0].cost
-        if not hopeless and all(_distance(fit.control, other.control) > 0.5 * APART for other in kept):
+        if not hopeless and all(
+            _distance(fit.control, other.control) > 0.5 * APART for other in kept
+        ):
             kept.append(fit)
     return [refine(views, fit, direction, fixed_radius=fixed_radius) for fit in kept]
 
@@ -236,23 +272,31 @@ def _match(views: Sequence[View], fit: Fit) -> tuple[float, float, float]:
 def _judge(values: Sequence[float], rival: float) -> tuple[Verdict, tuple[str, ...]]:
     """Compare values with `LIMITS`, in their order; return the verdict, and why it is not good."""
     limited = zip(LIMITS.items(), values, strict=True)
-    reasons = tuple(f"{name} {value:.3f} is above {limit}" for (name, limit), value in limited if value > limit)
+    reasons = tuple(
+        f"{name} {value:.3f} is above {limit}" for (name, limit), value in limited if value > limit
+    )
     if reasons:
         return Verdict.failed, reasons
     if rival < RIVAL:
-        return Verdict.ambiguous, (f"another curve has {rival:.2f} times the misfit; less than {RIVAL} is too close",)
+        return Verdict.ambiguous, (
+            f"another curve has {rival:.2f} times the misfit; less than {RIVAL} is too close",
+        )
     return Verdict.good, ()
 
 
 def _deviation(fit: Fit, points: int) -> Floats:
     B = basis(np.linspace(0.0, 1.0, points), len(fit.control))
     assert fit.covariance is not None
-    variance = sum(np.einsum("ij,jk,ik->i", B, fit.covariance[axis::3, axis::3], B) for axis in range(3))
+    variance = sum(
+        np.einsum("ij,jk,ik->i", B, fit.covariance[axis::3, axis::3], B) for axis in range(3)
+    )
     return np.asarray(np.sqrt(variance))
 
 
 def _residual(views: Sequence[View], fit: Fit, points: int) -> Floats:
-    """Return, in each view, the sideways shift [px] that would fit the pixels about each point best."""
+    """Return, in each view, the sideways shift [px] that would fit the pixels about each point
+    best.
+    """
     s = samples(views, fit)
     residual = np.full((len(views), points), np.nan)
     for index, view in enumerate(views):

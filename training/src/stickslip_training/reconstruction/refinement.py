@@ -1,13 +1,13 @@
 """Move a curve until the tube about it looks as the views do (analysis by synthesis).
 
-Unknown are the control points of the curve, the radius, the blur, and how light falls on the rod in each view. The sum
-of squares
+Unknown are the control points of the curve, the radius, the blur, and how light falls on the rod in
+each view. The sum of squares
 
     rho((seen - drawn) / 0.05) over the pixels near the rod
     + length, clamp and smoothness, each against what it may be off (the constants below)
 
-is reduced by Levenberg-Marquardt steps with exact derivatives of the drawing; rho is Cauchy's, so that dirt, highlights
-and specks pull little.
+is reduced by Levenberg-Marquardt steps with exact derivatives of the drawing; rho is Cauchy's, so
+that dirt, highlights and specks pull little.
 """
 
 from collections.abc import Sequence
@@ -85,9 +85,15 @@ def refine(
     fixed_radius: bool = False,
     iterations: int = 30,
 ) -> Fit:
-    """Minimise; `extra_blur` [px] blurs the views first, which makes the curve findable from farther off."""
+    """Minimise.
+
+    `extra_blur` [px] blurs the views first, which makes the curve findable from farther off.
+    """
     if extra_blur > 0.0:
-        views = [replace(view, coverage=ndimage.gaussian_filter(view.coverage, extra_blur)) for view in views]
+        views = [
+            replace(view, coverage=ndimage.gaussian_filter(view.coverage, extra_blur))
+            for view in views
+        ]
     problem = _Problem(views, fit, direction, extra_blur, shading, fixed_radius)
     x = problem.pack(fit)
     system = problem.system(x)
@@ -129,10 +135,18 @@ class _System:
 
 
 class _Problem:
-    """Unknowns x = (control points, log radius, log blur, light and slope of each view) and their sum of squares."""
+    """Unknowns x = (control points, log radius, log blur, light and slope of each view) and their
+    sum of squares.
+    """
 
     def __init__(
-        self, views: Sequence[View], fit: Fit, direction: Floats, extra_blur: float, shading: bool, fixed_radius: bool
+        self,
+        views: Sequence[View],
+        fit: Fit,
+        direction: Floats,
+        extra_blur: float,
+        shading: bool,
+        fixed_radius: bool,
     ) -> None:
         self._views, self._extra = views, extra_blur
         self._K = K = len(fit.control)
@@ -142,7 +156,9 @@ class _Problem:
         self._shape = shape = fit.light.shape
         own = np.arange(fit.light.size).reshape(shape)
         shared = np.arange(3 * K + 2)
-        self._columns = [np.concatenate([shared, 3 * K + 2 + row, 3 * K + 2 + own.size + row]) for row in own]
+        self._columns = [
+            np.concatenate([shared, 3 * K + 2 + row, 3 * K + 2 + own.size + row]) for row in own
+        ]
         self._free = np.ones(3 * K + 2 + 2 * fit.light.size, dtype=bool)
         self._free[3 * K] = not fixed_radius
         self._free[3 * K + 1] = shading
@@ -154,7 +170,12 @@ class _Problem:
 
     def pack(self, fit: Fit) -> Floats:
         return np.concatenate(
-            [fit.control.ravel(), [np.log(fit.radius), np.log(fit.blur)], fit.light.ravel(), fit.slope.ravel()]
+            [
+                fit.control.ravel(),
+                [np.log(fit.radius), np.log(fit.blur)],
+                fit.light.ravel(),
+                fit.slope.ravel(),
+            ]
         )
 
     def unpack(self, x: Floats) -> Fit:
@@ -179,7 +200,12 @@ class _Problem:
         velocity = self._speed @ fit.control
         speed = np.linalg.norm(velocity, axis=1)
         stretch = (speed - 1.0) / STRETCH / np.sqrt(3.0)  # three of them to a control point
-        J = (velocity / speed[:, None])[:, None, :] * self._speed[:, :, None] / STRETCH / np.sqrt(3.0)
+        J = (
+            (velocity / speed[:, None])[:, None, :]
+            * self._speed[:, :, None]
+            / STRETCH
+            / np.sqrt(3.0)
+        )
         J = J.reshape(len(speed), -1)
         end = 3 * self._K
         normal[:end, :end] += J.T @ J
@@ -223,7 +249,9 @@ class _Problem:
         blocks: list[tuple[Floats, Floats]] = []
 
         def add(rows: Floats, target: Floats | float = 0.0) -> None:
-            blocks.append((rows, np.broadcast_to(np.asarray(target, dtype=np.float64), (len(rows),))))
+            blocks.append(
+                (rows, np.broadcast_to(np.asarray(target, dtype=np.float64), (len(rows),)))
+            )
 
         def on_axes(row: Floats) -> Floats:  # one row for each of x, y and z
             rows = np.zeros((3, size))
@@ -251,7 +279,9 @@ class _Problem:
                 rows[:nodes, at : at + nodes] = np.eye(nodes) / spread
                 rows[nodes:, at : at + nodes] = bend
                 add(rows, np.concatenate([np.full(nodes, value / spread), np.zeros(len(bend))]))
-        return np.concatenate([rows for rows, _ in blocks]), np.concatenate([target for _, target in blocks])
+        return np.concatenate([rows for rows, _ in blocks]), np.concatenate(
+            [target for _, target in blocks]
+        )
 
 
 def _hats(s: Floats) -> Floats:

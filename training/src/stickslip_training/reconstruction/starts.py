@@ -1,11 +1,13 @@
 """Starts for the refinement: curves from the clamp to the free end.
 
-`follow` goes through all views at once, in steps of one length. Of all ways, a beam of those is kept whose points lie
-in the middle of every silhouette and that bend evenly. At a crossing in one view, the other views and the even bend
-decide. A way that takes a short cut has length left over for which no silhouette has room.
+`follow` goes through all views at once, in steps of one length. Of all ways, a beam of those is
+kept whose points lie in the middle of every silhouette and that bend evenly. At a crossing in one
+view, the other views and the even bend decide. A way that takes a short cut has length left over
+for which no silhouette has room.
 
-`visual_hull` is a cloud of points, and `moving_cylinder` the thesis's way from it to a centreline [thesis, 5.3.1]. A
-cloud has no order, and where turns of a curl come close in several views it has bridges and phantoms.
+`visual_hull` is a cloud of points, and `moving_cylinder` the thesis's way from it to a centreline
+[thesis, 5.3.1]. A cloud has no order, and where turns of a curl come close in several views it has
+bridges and phantoms.
 """
 
 from collections.abc import Sequence
@@ -21,14 +23,21 @@ from stickslip_training.reconstruction.views import View
 
 STEPS = 100
 BEAM = 200  # ways that are kept
-RINGS = ((0.07, 6), (0.16, 8), (0.30, 12), (0.5, 12))  # angles to the even bend [rad], directions on each
+RINGS = (
+    (0.07, 6),
+    (0.16, 8),
+    (0.30, 12),
+    (0.5, 12),
+)  # angles to the even bend [rad], directions on each
 UNEVEN = 1.0  # cost of a change of direction against the even bend [1/rad^2]
 BENT = 0.05  # cost of any change of direction [1/rad^2]
 CELL = 0.006  # [L]: of two ways at one place, in one direction, the better is kept
 TURN = 0.35  # the side of a cell of directions
 APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
 BLUR = 0.6  # deviation of the filter of `_middle`, over the rod's radius
-PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))  # what it leaves in the middle of a straight strip of coverage 1
+PEAK = float(
+    erf(1.0 / BLUR / np.sqrt(2.0))
+)  # what it leaves in the middle of a straight strip of coverage 1
 
 
 def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 5) -> list[Floats]:
@@ -47,7 +56,9 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
         candidates = _cone(ahead)  # (n, m, 3)
         n, m = candidates.shape[:2]
         middle = heading[:, None] + candidates
-        places = (trail[:, -1:] + step * middle / np.linalg.norm(middle, axis=-1, keepdims=True)).reshape(-1, 3)
+        places = (
+            trail[:, -1:] + step * middle / np.linalg.norm(middle, axis=-1, keepdims=True)
+        ).reshape(-1, 3)
         flat = candidates.reshape(-1, 3)
         parent = np.repeat(np.arange(n), m)
         total = (
@@ -108,31 +119,44 @@ def _squared(vectors: Floats) -> Floats:
 
 def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDArray[np.int64]:
     """Return the cheapest ways, at most BEAM of them and one of each cell of places and directions."""
-    few = np.argpartition(cost, 8 * BEAM)[: 8 * BEAM] if len(cost) > 8 * BEAM else np.arange(len(cost))
+    few = (
+        np.argpartition(cost, 8 * BEAM)[: 8 * BEAM]
+        if len(cost) > 8 * BEAM
+        else np.arange(len(cost))
+    )
     order = few[np.argsort(cost[few], kind="stable")]
-    sides = np.concatenate([np.rint(places[order] / CELL), np.rint(directions[order] / TURN)], axis=1).astype(np.int64)
+    sides = np.concatenate(
+        [np.rint(places[order] / CELL), np.rint(directions[order] / TURN)], axis=1
+    ).astype(np.int64)
     cell = np.zeros(len(order), dtype=np.int64)
     for side in sides.T:
-        cell = cell * 1024 + side + 512  # a side is a few hundred cells long at most; six of them fit in 60 bits
+        cell = (
+            cell * 1024 + side + 512
+        )  # a side is a few hundred cells long at most; six of them fit in 60 bits
     _, first = np.unique(cell, return_index=True)
     return order[np.sort(first)[:BEAM]]
 
 
 ROOM = 1.05  # [L]: the rod cannot reach farther from its clamp
-HULL_CELL = 0.0025  # [L]: the cloud's spacing, about half a pixel of the views that the project renders
+HULL_CELL = (
+    0.0025  # [L]: the cloud's spacing, about half a pixel of the views that the project renders
+)
 MOST_CELLS = 400_000  # a hull this large is no rod's
 
 
 def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
-    """Return the points, at most `cell` [L] apart, whose images lie in every silhouette, (n, 3) [L].
+    """Return the points, at most `cell` [L] apart, whose images lie in every silhouette, (n, 3)
+    [L].
 
-    There are none where the silhouettes leave room for far more than a slender rod.
-    Cubes are halved again and again; those are kept whose surrounding ball touches every silhouette.
+    There are none where the silhouettes leave room for far more than a slender rod. Cubes are
+    halved again and again; those are kept whose surrounding ball touches every silhouette.
     """
     outside = [ndimage.distance_transform_edt(view.coverage < 0.5) for view in views]
     halvings = int(np.ceil(np.log2(2.0 * ROOM / cell)))
     centers, side = np.zeros((1, 3)), 2.0 * ROOM
-    corners = np.array([[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25)])
+    corners = np.array(
+        [[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25)]
+    )
     for level in range(halvings + 1):
         if level > 0:
             centers, side = (centers[:, None] + side * corners).reshape(-1, 3), side / 2.0
@@ -152,17 +176,20 @@ def _touches(view: View, distance: Floats, points: Floats, reach: float) -> npt.
     out_of_frame = np.linalg.norm(nearest - inside, axis=1)
     u, v = inside.astype(np.int64).T
     away = np.maximum(distance[v, u], out_of_frame)
-    allowed = float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71  # half a pixel's diagonal
+    allowed = (
+        float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71
+    )  # half a pixel's diagonal
     if reach == 0.0:
         allowed = np.zeros(len(points))
     return np.asarray(away <= allowed)
 
 
 def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float = 0.01) -> Floats:
-    """Return a polyline (n, 3) [L] through a cloud: centroids of what a cylinder holds that moves along the rod.
+    """Return a polyline (n, 3) [L] through a cloud: centroids of what a cylinder holds that moves
+    along the rod.
 
-    The cylinder begins at the clamp, reaches two steps ahead and is three radii wide; it turns towards each centroid,
-    and the polyline ends where it is empty, or after twice the rod's length.
+    The cylinder begins at the clamp, reaches two steps ahead and is three radii wide; it turns
+    towards each centroid, and the polyline ends where it is empty, or after twice the rod's length.
     """
     points, heading = [np.zeros(3)], direction / np.linalg.norm(direction)
     for _ in range(int(2.0 / step)):

@@ -1,16 +1,19 @@
-"""Views: how much of each pixel a bright rod covers, and what a camera sees of a tube about a curve.
+"""Views: how much of each pixel a bright rod covers, and what a camera sees of a tube about a
+curve.
 
-A rod a few pixels wide is known to a tenth of a pixel only if the brightness of the pixels on its edge is used, not
-just whether they are bright. So a silhouette is a coverage: the share of each pixel that is rod.
+A rod a few pixels wide is known to a tenth of a pixel only if the brightness of the pixels on its
+edge is used, not just whether they are bright. So a silhouette is a coverage: the share of each
+pixel that is rod.
 
-About the projected centreline, at signed distance n from it [px], a tube of half width r has the coverage
+About the projected centreline, at signed distance n from it [px], a tube of half width r has the
+coverage
 
     c(n) = Phi((n + r) / b) - Phi((n - r) / b)          Phi the normal distribution, b the blur of the picture
 
-and the brightness c (light + slope n / r): lamps make one side brighter, and a model without the slope would move the
-centreline towards it. Where two parts of the rod cross in a view, the nearer covers the farther,
-I = I_1 + (1 - c_1) I_2. The free end is round. Pixels behind the clamp are left out: whatever holds the rod may be seen
-there.
+and the brightness c (light + slope n / r): lamps make one side brighter, and a model without the
+slope would move the centreline towards it. Where two parts of the rod cross in a view, the nearer
+covers the farther, I = I_1 + (1 - c_1) I_2. The free end is round. Pixels behind the clamp are left
+out: whatever holds the rod may be seen there.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +31,12 @@ from stickslip_training.arrays import Floats, Integers
 GROUND_DEGREE = 2  # of the polynomial in (x, y) that an unevenly lit ground follows
 GROUND_SAMPLES = 20_000  # pixels that the polynomial is fitted to
 NEIGHBOURHOOD = 4.0  # [px], standard deviation of the window in which the rod has one brightness
-FAINTEST = 0.05  # of the rod's typical brightness: what is darker is ground, however quiet the ground is
-NOISE_FACTOR = 6.0  # standard deviations of the ground's noise that the brightness of the rod must exceed
+FAINTEST = (
+    0.05  # of the rod's typical brightness: what is darker is ground, however quiet the ground is
+)
+NOISE_FACTOR = (
+    6.0  # standard deviations of the ground's noise that the brightness of the rod must exceed
+)
 SMALLEST_PART = 0.02  # of the silhouette's area: smaller bright spots are dirt
 DEGREE = 3
 BAND = 2.5  # blurs beyond the edge of the rod that are looked at
@@ -40,18 +47,25 @@ class ReconstructionError(ValueError):
 
 
 def silhouette(light: Floats) -> Floats:
-    """Return the coverage (y, x) in a picture of linear light (y, x, channel): 0 on the ground, about 1 on the rod, in
-    between on its edge.
+    """Return the coverage (y, x) in a picture of linear light (y, x, channel): 0 on the ground,
+    about 1 on the rod, in between on its edge.
 
-    The ground must be darker than the rod but need not be evenly so; the colour of the rod is found. Coverage is
-    relative to the brightness of the rod around the pixel, and may exceed 1 where the rod shines.
+    The ground must be darker than the rod but need not be evenly so; the colour of the rod is
+    found. Coverage is relative to the brightness of the rod around the pixel, and may exceed 1
+    where the rod shines.
     """
     light = light - _ground(light)
     luminance = light.sum(axis=2).clip(0.0)
-    color = np.einsum("yxc,yx->c", light, luminance**2)  # of the rod, whose pixels outweigh the ground's by far
-    signal = light @ (color / max(float(np.linalg.norm(color)), 1e-12))  # the ground's noise counts least along it
+    color = np.einsum(
+        "yxc,yx->c", light, luminance**2
+    )  # of the rod, whose pixels outweigh the ground's by far
+    signal = light @ (
+        color / max(float(np.linalg.norm(color)), 1e-12)
+    )  # the ground's noise counts least along it
     noise = 1.4826 * float(np.median(np.abs(signal - np.median(signal))))
-    typical = float(np.sum(signal.clip(0) ** 2) / max(np.sum(signal.clip(0)), 1e-12))  # weighted by itself: the rod's
+    typical = float(
+        np.sum(signal.clip(0) ** 2) / max(np.sum(signal.clip(0)), 1e-12)
+    )  # weighted by itself: the rod's
     floor = max(NOISE_FACTOR * noise, FAINTEST * typical)
     if typical < 2.0 * NOISE_FACTOR * noise or typical < 1e-3:
         raise ReconstructionError(
@@ -67,12 +81,16 @@ def silhouette(light: Floats) -> Floats:
 
 
 def to_linear(image: npt.ArrayLike) -> Floats:
-    """Decode sRGB [IEC 61966-2-1], 8 or 16 bit or floating numbers in [0, 1], to linear light (y, x, channel)."""
+    """Decode sRGB [IEC 61966-2-1], 8 or 16 bit or floating numbers in [0, 1], to linear light (y,
+    x, channel).
+    """
     pixels = np.asarray(image)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3):
-        raise ValueError(f"image must have shape (y, x), (y, x, 1) or (y, x, 3); got {np.shape(image)}")
+        raise ValueError(
+            f"image must have shape (y, x), (y, x, 1) or (y, x, 3); got {np.shape(image)}"
+        )
     scale = float(np.iinfo(pixels.dtype).max) if np.issubdtype(pixels.dtype, np.integer) else 1.0
     encoded = pixels.astype(np.float64) / scale
     if not np.isfinite(encoded).all():
@@ -113,7 +131,9 @@ def _large_parts(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one camera saw of the rod, and how points of the rod come to its pixels: u = f (R x + t)_xy / depth + c."""
+    """What one camera saw of the rod, and how points of the rod come to its pixels: u = f (R x +
+    t)_xy / depth + c.
+    """
 
     name: str
     coverage: Floats
@@ -128,8 +148,19 @@ class View:
     """Principal point, column and row [px], (2,)."""
 
     @classmethod
-    def of(cls, camera: Camera, coverage: Floats, *, length: float, clamp: npt.ArrayLike, factor: int = 1) -> Self:
-        """Bring a camera to the rod's units; the picture has been shrunk by a factor before its coverage was found."""
+    def of(
+        cls,
+        camera: Camera,
+        coverage: Floats,
+        *,
+        length: float,
+        clamp: npt.ArrayLike,
+        factor: int = 1,
+    ) -> Self:
+        """Bring a camera to the rod's units.
+
+        The picture has been shrunk by a factor before its coverage was found.
+        """
         R = np.asarray(camera.rotation)
         return cls(
             name=camera.name,
@@ -165,24 +196,33 @@ class View:
 
 
 def shrink_image(image: Floats, factor: int) -> Floats:
-    """Average blocks of pixels of (y, x) or (y, x, channel); the rest at the right and at the bottom is dropped."""
+    """Average blocks of pixels of (y, x) or (y, x, channel).
+
+    The rest at the right and at the bottom is dropped.
+    """
     height, width = (n // factor * factor for n in image.shape[:2])
-    blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
+    blocks = image[:height, :width].reshape(
+        height // factor, factor, width // factor, factor, *image.shape[2:]
+    )
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
-# --- curves: cubic B-splines over [0, 1] with evenly spaced knots, (K, 3) control points ----------------------
+# --- curves: cubic B-splines over [0, 1] with evenly spaced knots, (K, 3) control points
+# ----------------------
 
 
 def basis(s: Floats, count: int, derivative: int = 0) -> Floats:
     """Return B, (n, count): B @ control points are the points, or the derivatives, at s, (n,)."""
     inner = np.linspace(0.0, 1.0, count - DEGREE + 1)
-    knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])  # the ends are the first and the last point
+    knots = np.concatenate(
+        [np.zeros(DEGREE), inner, np.ones(DEGREE)]
+    )  # the ends are the first and the last point
     return np.asarray(BSpline(knots, np.eye(count), DEGREE)(s, nu=derivative))
 
 
 def fit_curve(points: Floats, count: int) -> Floats:
-    """Return the control points (count, 3) of the spline nearest to a polyline (n, 3), by its arc length.
+    """Return the control points (count, 3) of the spline nearest to a polyline (n, 3), by its arc
+    length.
 
     The spline's parameter runs from 0 to 1 whatever the polyline's length.
     """
@@ -191,7 +231,9 @@ def fit_curve(points: Floats, count: int) -> Floats:
     sampled = np.stack([np.interp(dense, s, axis) for axis in points.T], axis=1)
     B = basis(np.linspace(0.0, 1.0, len(dense)), count)
     smooth = 1e-2 * np.diff(np.eye(count), 3, axis=0)
-    control: Floats = np.linalg.lstsq(np.vstack([B, smooth]), np.vstack([sampled, np.zeros((count - 3, 3))]))[0]
+    control: Floats = np.linalg.lstsq(
+        np.vstack([B, smooth]), np.vstack([sampled, np.zeros((count - 3, 3))])
+    )[0]
     return control
 
 
@@ -208,7 +250,8 @@ def at_uniform_arc_length(control: Floats, count: int) -> Floats:
     return np.asarray(basis(wanted, len(control)) @ control)
 
 
-# --- tubes ----------------------------------------------------------------------------------------------------
+# --- tubes
+# ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,17 +288,25 @@ class TubeImage:
     """Pixels near the rod, but behind the clamp."""
 
 
-def tube_image(view: View, points: Floats, radius: float, blur: float, light: Floats, slope: Floats) -> TubeImage:
-    """Draw the tube about samples (n, 3) of a curve, half a pixel apart or less; radius [L], blur [px].
+def tube_image(
+    view: View, points: Floats, radius: float, blur: float, light: Floats, slope: Floats
+) -> TubeImage:
+    """Draw the tube about samples (n, 3) of a curve, half a pixel apart or less.
 
-    `light` is the brightness in the middle at the samples, (n,), and `slope` what it gains from there to the edge.
+    Radius [L], blur [px].
+
+    `light` is the brightness in the middle at the samples, (n,), and `slope` what it gains from
+    there to the edge.
     """
     pixels, depth = view.project(points)
     half = radius * view.focal / depth
     pixel, sample = _passes(pixels, half + BAND * blur, view.coverage.shape)
     tangent = np.gradient(pixels, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    offset = np.stack([pixel % view.coverage.shape[1], pixel // view.coverage.shape[1]], axis=1) - pixels[sample]
+    offset = (
+        np.stack([pixel % view.coverage.shape[1], pixel // view.coverage.shape[1]], axis=1)
+        - pixels[sample]
+    )
     along = np.sum(offset * tangent[sample], axis=1)
     normal = np.stack([-tangent[sample, 1], tangent[sample, 0]], axis=1)
     beyond = (sample == len(points) - 1) & (along > 0.0)
@@ -285,7 +336,9 @@ def tube_image(view: View, points: Floats, radius: float, blur: float, light: Fl
 
 
 def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Integers, Integers]:
-    """Pair each pixel with the nearest sample of every part of the curve that passes it within reach."""
+    """Pair each pixel with the nearest sample of every part of the curve that passes it within
+    reach.
+    """
     span = int(np.ceil(reach.max())) + 1
     x, y = (axis.ravel() for axis in np.mgrid[-span : span + 1, -span : span + 1])
     disc = x**2 + y**2 <= (span + 0.5) ** 2
@@ -293,7 +346,9 @@ def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Inte
     x, y = nearest[:, :1] + x[disc], nearest[:, 1:] + y[disc]
     apart = (x - pixels[:, :1]) ** 2 + (y - pixels[:, 1:]) ** 2
     height, width = shape
-    found = np.flatnonzero((apart <= reach[:, None] ** 2) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+    found = np.flatnonzero(
+        (apart <= reach[:, None] ** 2) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    )
     sample = found // x.shape[1]
     pixel = y.ravel()[found] * width + x.ravel()[found]
     order = np.argsort(pixel * len(pixels) + sample)  # no two are equal
@@ -307,10 +362,16 @@ def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Inte
     return pixel[first], sample[first]
 
 
-def _compose(pixel: Integers, part: Side, value: Floats, depth: Floats, left_out: npt.NDArray[np.bool_]) -> TubeImage:
+def _compose(
+    pixel: Integers, part: Side, value: Floats, depth: Floats, left_out: npt.NDArray[np.bool_]
+) -> TubeImage:
     """Let the nearest part at each pixel cover the next; a third and more are not seen."""
     order = np.lexsort((depth, pixel))
-    first = np.flatnonzero(np.concatenate([[True], np.diff(pixel[order]) != 0])) if len(order) else order
+    first = (
+        np.flatnonzero(np.concatenate([[True], np.diff(pixel[order]) != 0]))
+        if len(order)
+        else order
+    )
     front = order[first]
     last = np.append(first[1:], len(order)) - 1
     has_back = last > first
@@ -319,22 +380,33 @@ def _compose(pixel: Integers, part: Side, value: Floats, depth: Floats, left_out
     hidden = pixel[front[~kept]]
     front, back, seen = front[kept], back[kept], has_back[kept].astype(np.float64)
     through = seen * (1.0 - part.by_light[front])
-    # The front's own derivatives act on I_1 (1 - I_2 c_1 / I_1): its light does not change what it covers.
+    # The front's own derivatives act on I_1 (1 - I_2 c_1 / I_1): its light does not change what it
+    # covers.
     lost = (
         seen
         * value[back]
-        * np.divide(part.by_light[front], value[front], out=np.zeros(len(front)), where=value[front] > 1e-6)
+        * np.divide(
+            part.by_light[front], value[front], out=np.zeros(len(front)), where=value[front] > 1e-6
+        )
     )
     return TubeImage(
         pixel=pixel[front],
         value=value[front] + through * value[back],
-        sides=(_scaled(part, front, np.ones(len(front)), 1.0 - lost), _scaled(part, back, through, through)),
+        sides=(
+            _scaled(part, front, np.ones(len(front)), 1.0 - lost),
+            _scaled(part, back, through, through),
+        ),
         left_out=hidden,
     )
 
 
 def _scaled(part: Side, rows: Integers, by_light: Floats, by_shape: Floats) -> Side:
     factors = {"by_light": by_light, "by_slope": by_light}
-    factors |= {"by_point": by_shape[:, None], "by_normal": by_shape, "by_radius": by_shape, "by_blur": by_shape}
+    factors |= {
+        "by_point": by_shape[:, None],
+        "by_normal": by_shape,
+        "by_radius": by_shape,
+        "by_blur": by_shape,
+    }
     scaled = {name: getattr(part, name)[rows] * factor for name, factor in factors.items()}
     return Side(part.sample[rows], **scaled)

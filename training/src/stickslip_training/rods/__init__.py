@@ -1,1 +1,3 @@
-"""Curvature of hanging rods: networks that estimate it from a centreline, and what needs no learning."""
+"""Curvature of hanging rods: networks that estimate it from a centreline, and what needs no
+learning.
+"""

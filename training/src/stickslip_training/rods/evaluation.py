@@ -1,4 +1,5 @@
-"""Curvature of noisy centrelines without learning, which is what a network has to beat, and errors of all methods.
+"""Curvature of noisy centrelines without learning, which is what a network has to beat, and errors
+of all methods.
 
 The curvature of a curve x(s) in any parametrisation is |x' × x''| / |x'|^3. Points are at uniform arc length, so s is
 known; lengths are over L, and so curvatures come out times L. Every method here takes centrelines (rods, points, 3) and
@@ -24,7 +25,8 @@ _CHUNK = 256  # rods that go through a network at once
 
 
 def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
-    """Add independent normal noise of standard deviation `share` (of L) to every coordinate of every point.
+    """Add independent normal noise of standard deviation `share` (of L) to every coordinate of
+    every point.
 
     The same `seed` gives the same noise. `centerline` is over L, (..., points, 3).
     """
@@ -34,7 +36,10 @@ def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...])
 
 
 def finite_difference_curvature(centerline: AnyFloats) -> Floats:
-    """Take the derivatives from a point and its two neighbours; x'' at an end is that of the point next to it."""
+    """Take the derivatives from a point and its two neighbours.
+
+    X'' at an end is that of the point next to it.
+    """
     x = np.asarray(centerline, dtype=np.float64)
     h = 1.0 / (x.shape[-2] - 1)
     first = np.gradient(x, h, axis=-2, edge_order=2)
@@ -57,48 +62,63 @@ def cubic_spline_curvature(centerline: AnyFloats) -> Floats:
 def quintic_spline_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from quintic smoothing splines, which penalise ∫ |x'''|^2 and may be bent at their ends.
 
-    They halve the error of cubic ones on hanging rods. One order more takes another sixth off, and was not worth it.
+    They halve the error of cubic ones on hanging rods. One order more takes another sixth off, and
+    was not worth it.
     """
     return _spline_curvature(centerline, 3)
 
 
 def _curvature(first: Floats, second: Floats) -> Floats:
     """|x' × x''| / |x'|^3 of x' and x'', (..., points, 3)."""
-    return np.asarray(np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3)
+    return np.asarray(
+        np.linalg.norm(np.cross(first, second), axis=-1) / np.linalg.norm(first, axis=-1) ** 3
+    )
 
 
 @cache
 def _spline_basis(points: int, order: int) -> tuple[Floats, ...]:
-    """Return a basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]: values, first and
-    second derivatives at the points, (points, basis) each, and a, (basis,).
+    """Return a basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]:
+    values, first and second derivatives at the points, (points, basis) each, and a, (basis,).
 
-    It is orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a [Demmler, Reinsch 1975]:
-    smoothing is a division in it, and every lambda can be tried on every curve.
+    It is orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a
+    [Demmler, Reinsch 1975]: smoothing is a division in it, and every lambda can be tried on every
+    curve.
     """
     degree = 2 * order - 1
     s = np.linspace(0.0, 1.0, points)
     knots = np.concatenate([np.zeros(degree), s, np.ones(degree)])
     splines = BSpline(knots, np.eye(points + degree - 1), degree)
     B = splines(s)
-    # The penalised derivative is of degree order - 1 between knots: `order` Gauss points integrate its square exactly.
+    # The penalised derivative is of degree order - 1 between knots: `order` Gauss points integrate
+    # its square exactly.
     nodes, weights = np.polynomial.legendre.leggauss(order)
     h = s[1]
     D = splines.derivative(order)((s[:-1, None] + h * (nodes + 1) / 2).ravel())
     P = D.T @ (np.tile(h * weights / 2, points - 1)[:, None] * D)
-    P *= np.trace(B.T @ B) / np.trace(P)  # the scale of lambda is free, and rounding is least where the two are alike
+    P *= np.trace(B.T @ B) / np.trace(
+        P
+    )  # the scale of lambda is free, and rounding is least where the two are alike
     weight, V = eigh(B.T @ B, B.T @ B + P)
-    return B @ V, splines.derivative(1)(s) @ V, splines.derivative(2)(s) @ V, np.clip(weight, 0.0, 1.0)
+    return (
+        B @ V,
+        splines.derivative(1)(s) @ V,
+        splines.derivative(2)(s) @ V,
+        np.clip(weight, 0.0, 1.0),
+    )
 
 
 _SMOOTHING = np.geomspace(1e-3, 1e16, 400)
 """The values of lambda that are tried, in the scale of `_spline_basis`."""
 
 _MOST_FREEDOM = 0.7
-"""Most degrees of freedom of a spline, as a share of the points: near 1, cross-validation divides 0 by 0."""
+"""Most degrees of freedom of a spline, as a share of the points: near 1, cross-validation divides 0
+by 0.
+"""
 
 
 def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
-    """Smooth each coordinate by itself, with the lambda of least generalised cross-validation [Craven, Wahba 1979]:
+    """Smooth each coordinate by itself, with the lambda of least generalised cross-validation
+    [Craven, Wahba 1979]:
 
     GCV = (|y - f|^2 / n) / (1 - tr(A) / n)^2, f = A y.
     """
@@ -119,10 +139,16 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
         better = score < best
         best[better], smoothing[better] = score[better], candidate
     c = z / (a + smoothing[:, None] * (1.0 - a))
-    return _curvature(*((c @ each.T).reshape(*x.shape[:-2], 3, points).swapaxes(-1, -2) for each in (first, second)))
+    return _curvature(
+        *(
+            (c @ each.T).reshape(*x.shape[:-2], 3, points).swapaxes(-1, -2)
+            for each in (first, second)
+        )
+    )
 
 
-# --- errors ---------------------------------------------------------------------------------------------------
+# --- errors
+# ---------------------------------------------------------------------------------------------------
 
 
 def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFloats:
@@ -136,9 +162,13 @@ def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFl
     return np.concatenate(parts)
 
 
-def evaluate(net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats) -> tuple[list[dict[str, Any]], float]:
-    """Let every method see noisy centrelines of rods of true strains; return how each did, and the network's loss
-    [rad]."""
+def evaluate(
+    net: torch.nn.Module, noisy: SingleFloats, true: SingleFloats
+) -> tuple[list[dict[str, Any]], float]:
+    """Let every method see noisy centrelines of rods of true strains.
+
+    Return how each did, and the network's loss [rad].
+    """
     truth = bending(true)
     net.eval()
     started = time.perf_counter()
@@ -162,7 +192,12 @@ def _method(name: str, estimate: Floats, truth: Floats, started: float) -> dict[
     seconds = (time.perf_counter() - started) / len(truth)
     errors = relative_rms_error(estimate, truth)
     median, p90 = np.quantile(errors, (0.5, 0.9)).tolist()
-    found = {"method": name, "rms": rms(estimate - truth), "relative_median": median, "relative_p90": p90}
+    found = {
+        "method": name,
+        "rms": rms(estimate - truth),
+        "relative_median": median,
+        "relative_p90": p90,
+    }
     return found | {"seconds_per_rod": seconds}
 
 

@@ -1,8 +1,8 @@
 """The object in a render process: render tasks in, results out, both as JSON.
 
-It knows neither Ray nor any kind: the module of the kind renders. A fault of the sample gives a rejection; any other
-error is raised, and the owner of the process handles it. Results are published by renaming whole files, so a crash of
-Blender leaves no partial result.
+It knows neither Ray nor any kind: the module of the kind renders. A fault of the sample gives a
+rejection; any other error is raised, and the owner of the process handles it. Results are published
+by renaming whole files, so a crash of Blender leaves no partial result.
 """
 
 import time
@@ -18,13 +18,19 @@ from stickslip_blender.workshop import Workshop, build_digest, check_rig
 
 
 class RenderActor:
-    """Renders samples from the store into the store. One per process, because Blender holds one scene."""
+    """Renders samples from the store into the store.
+
+    One per process, because Blender holds one scene.
+    """
 
     def __init__(self, store_root: str) -> None:
         self._workshop = Workshop(store_root)
 
     def describe(self) -> dict[str, Any]:
-        """Return the build of each kind, and versions; they are equal in all processes of one installation."""
+        """Return the build of each kind, and versions.
+
+        They are equal in all processes of one installation.
+        """
         return {
             "builds": {kind: build_digest(kind) for kind in KINDS},
             "versions": blender_version() | {"device": " ".join(map(str, described().values()))},
@@ -36,15 +42,21 @@ class RenderActor:
         job = RenderTask.model_validate(task)
         check_rig(job.render)
         result = renders(job.render.kind)(job.render, job, self._workshop)
-        spent = {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
+        spent = {
+            "cpu_seconds": time.process_time() - cpu,
+            "wall_seconds": time.perf_counter() - wall,
+        }
         return result.model_copy(update=spent).model_dump(mode="json")
 
 
 def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
-    """Return the function that renders a kind, from its render document, the task of it and a workshop to a result.
+    """Return the function that renders a kind, from its render document, the task of it and a
+    workshop to a result.
 
     Raises UnknownKindError where the contract does not have the kind.
     """
     kind_named(kind)
-    render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(f"stickslip_blender.scenes.{kind}").render
+    render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(
+        f"stickslip_blender.scenes.{kind}"
+    ).render
     return render

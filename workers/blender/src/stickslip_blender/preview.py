@@ -1,7 +1,9 @@
-"""Drawings of a scene before it is simulated: where everything starts, and how bodies and holders move.
+"""Drawings of a scene before it is simulated: where everything starts, and how bodies and holders
+move.
 
-`python -m stickslip_blender.preview RECORD.npz SCENE.json DIR` writes `CAMERA.png` of the start and `motion.webp`, all
-cameras side by side. The record has the arrays of `cloth_scene` that the cameras and bodies need; no light is traced.
+`python -m stickslip_blender.preview RECORD.npz SCENE.json DIR` writes `CAMERA.png` of the start and
+`motion.webp`, all cameras side by side. The record has the arrays of `cloth_scene` that the cameras
+and bodies need; no light is traced.
 """
 
 import json
@@ -26,7 +28,9 @@ SIDE = 320
 _SHARPNESS = 2  # samples across a pixel
 _LIGHT = np.array([0.35, -0.45, 0.82])
 _DIFFUSE, _SHADOW = 0.6, 0.72
-_SHEET = np.array([[0.93, 0.90, 0.84], [0.20, 0.42, 0.72]])  # sRGB, of the squares of the sheet that has no picture yet
+_SHEET = np.array(
+    [[0.93, 0.90, 0.84], [0.20, 0.42, 0.72]]
+)  # sRGB, of the squares of the sheet that has no picture yet
 _SQUARES = 8
 _GROUND, _LINE, _SKY = 0.62, 0.5, 0.9
 _LINES, _THICK = 0.1, 0.003  # [m], between lines on the floor, and their thickness
@@ -37,11 +41,10 @@ Array = npt.NDArray[Any]
 def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> list[str]:
     """Draw a scene; return the names of the pictures.
 
-    Args:
-        scene: `scene`: `Staged`, as JSON; `sheet`: the sheet that takes the texture; `segments`: names of the codes;
-            `cameras`: those of the scene, as JSON, none where cameras frame what moves. Files are paths.
-        record: Arrays of the scene at the instants of the animation.
-        out: Directory for the pictures.
+    Args: scene: `scene`: `Staged`, as JSON; `sheet`: the sheet that takes the texture; `segments`:
+        names of the codes; `cameras`: those of the scene, as JSON, none where cameras frame what
+        moves. Files are paths. record: Arrays of the scene at the instants of the animation. out:
+        Directory for the pictures.
     """
 
     def picture(name: str) -> npt.NDArray[np.uint8]:
@@ -68,7 +71,9 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
 
 
 def _colors(geometry: Geometry) -> Array:
-    """Return the colour of each triangle (T, 3), sRGB from 0 to 1: of a sheet, that of its picture in its middle."""
+    """Return the colour of each triangle (T, 3), sRGB from 0 to 1: of a sheet, that of its picture
+    in its middle.
+    """
     corners = geometry.uv[geometry.triangles].mean(axis=1)
     squares = np.floor(_SQUARES * corners).astype(int).sum(axis=1) % 2
     parts = [_SHEET[squares[: geometry.cloth_triangles]]]
@@ -77,16 +82,22 @@ def _colors(geometry: Geometry) -> Array:
         count = len(prop.tints)
         if prop.sheet is None:
             linear = np.clip(prop.tints * prop.grey, 0.0, 1.0)
-            parts.append(np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+            parts.append(
+                np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+            )
         else:
-            texels = np.minimum((corners[begin : begin + count] * len(prop.sheet.picture)).astype(int), 10**6)
+            texels = np.minimum(
+                (corners[begin : begin + count] * len(prop.sheet.picture)).astype(int), 10**6
+            )
             u, v = np.clip(texels, 0, len(prop.sheet.picture) - 1).T
             parts.append(prop.sheet.picture[v, u] / 255.0)
         begin += count
     return np.concatenate(parts)
 
 
-def _drawn(geometry: Geometry, points: Array, colors: Array, camera: Camera) -> npt.NDArray[np.uint8]:
+def _drawn(
+    geometry: Geometry, points: Array, colors: Array, camera: Camera
+) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) with flat shading, and with shadows on the floor."""
     window = Window(0, 0, camera.width, camera.height)
     seen = see(projected(camera, points), geometry.triangles, window, _SHARPNESS).triangle
@@ -97,12 +108,18 @@ def _drawn(geometry: Geometry, points: Array, colors: Array, camera: Camera) -> 
     shaded = colors * (1.0 - _DIFFUSE + _DIFFUSE * facing[:, None])
     ground = _floor(geometry, points, camera, seen.shape, light)
     picture = np.where(seen[..., None] < 0, ground[..., None], shaded[seen])
-    small = picture.reshape(camera.height, _SHARPNESS, camera.width, _SHARPNESS, 3).mean(axis=(1, 3))
+    small = picture.reshape(camera.height, _SHARPNESS, camera.width, _SHARPNESS, 3).mean(
+        axis=(1, 3)
+    )
     return np.asarray(np.rint(255.0 * np.clip(small, 0.0, 1.0)).astype(np.uint8))
 
 
-def _floor(geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, ...], light: Array) -> Array:
-    """Return how bright each sample of the background is: the sky, or the floor with its lines and shadows."""
+def _floor(
+    geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, ...], light: Array
+) -> Array:
+    """Return how bright each sample of the background is: the sky, or the floor with its lines and
+    shadows.
+    """
     height = geometry.surroundings.floor
     if height is None:
         return np.full(shape, _SKY)

@@ -1,4 +1,6 @@
-"""Services for the scenes of all kinds: the build, records and pictures in the store, and one renderer at a time."""
+"""Services for the scenes of all kinds: the build, records and pictures in the store, and one
+renderer at a time.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,10 @@ def roots(kind: str) -> tuple[str, ...]:
 
 @cache
 def build_digest(kind: str) -> str:
-    """Return the SHA-256 over the sources that render a kind, and versions; no path, time or machine is part of it."""
+    """Return the SHA-256 over the sources that render a kind, and versions.
+
+    No path, time or machine is part of it.
+    """
     content = {
         "kind": kind,
         "sources": digests(sources(roots(kind), cut=UNCOUNTED)),
@@ -60,7 +65,8 @@ def build_digest(kind: str) -> str:
 class Workshop:
     """Reads records and publishes pictures.
 
-    It keeps the last record and, because Blender holds one scene per process, one renderer: several tasks share them.
+    It keeps the last record and, because Blender holds one scene per process, one renderer: several
+    tasks share them.
     """
 
     def __init__(self, store: str) -> None:
@@ -71,7 +77,10 @@ class Workshop:
         self._records: tuple[str, dict[str, Array]] = ("", {})
 
     def kept_shading(self, key: str) -> bytes | None:
-        """Return a shading that any process kept in the store; None if there is none, or a damaged one."""
+        """Return a shading that any process kept in the store.
+
+        None if there is none, or a damaged one.
+        """
         path = self._shading_path(key)
         if path is None:
             return None
@@ -84,7 +93,9 @@ class Workshop:
         return body if hashlib.sha256(body).digest() == digest else None
 
     def keep_shading(self, key: str, data: bytes) -> None:
-        """Keep a shading in the store for textures to come; the oldest are deleted where all take too much room.
+        """Keep a shading in the store for textures to come.
+
+        The oldest are deleted where all take too much room.
 
         No result depends on it; if it cannot be written, it is rendered again.
         """
@@ -113,7 +124,9 @@ class Workshop:
             self._records = record.digest, arrays
         rows = len(next(iter(arrays.values())))
         if record.row >= rows:
-            raise ValueError(f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}")
+            raise ValueError(
+                f"record.row must be below {rows}, the rows of {record.digest}; got {record.row}"
+            )
         return {name: values[record.row] for name, values in arrays.items()}
 
     def renderer(self, scene: object, build: Callable[[], Any]) -> Any:
@@ -137,12 +150,20 @@ def check_rig(render: Render) -> None:
         )
 
 
-def why_unfit(what: str, points: Array, radius: float, cameras: tuple[Camera, ...]) -> TaskResult | None:
-    """Return the rejection of points (..., 3) that are not finite or leave the frame of a camera, or None."""
+def why_unfit(
+    what: str, points: Array, radius: float, cameras: tuple[Camera, ...]
+) -> TaskResult | None:
+    """Return the rejection of points (..., 3) that are not finite or leave the frame of a camera,
+    or None.
+    """
     if not np.isfinite(points).all():
         return rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
     overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}
-    outside = [f"the {what} leaves view {name} by {excess:.1f} px" for name, excess in overflow.items() if excess > 0.0]
+    outside = [
+        f"the {what} leaves view {name} by {excess:.1f} px"
+        for name, excess in overflow.items()
+        if excess > 0.0
+    ]
     return rejected(Reason.out_of_frame, "; ".join(outside)) if outside else None
 
 

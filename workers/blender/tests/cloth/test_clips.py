@@ -1,4 +1,6 @@
-"""Clips of cloth: the same bytes always, the cloth where the cameras project it, the light as drawn."""
+"""Clips of cloth: the same bytes always, the cloth where the cameras project it, the light as
+drawn.
+"""
 
 import hashlib
 import subprocess
@@ -43,13 +45,22 @@ def _render(renderer: ClothRenderer, sheet: Any, *textures: Texture, **look: Any
     document = ClothDragRender.model_validate(LOOK | look)
     (camera,) = (camera for camera in load_rig("drag") if camera.name == document.viewpoint)
     clip = renderer.clip(document, camera, sheet.track[list(document.instants)])
-    return clip.clips(clip.shading(), [texture_image(texture) for texture in textures or (Texture.gingham,)])[0]
+    return clip.clips(
+        clip.shading(), [texture_image(texture) for texture in textures or (Texture.gingham,)]
+    )[0]
 
 
 def test_a_repeat_has_the_same_bytes(renderer: ClothRenderer, sheet: Any) -> None:
     first = _render(renderer, sheet)
     assert (first.shape, first.dtype) == ((1, 2, 224, 224, 3), np.uint8)
-    _render(renderer, sheet, viewpoint="right", material="11oz-black-denim", substrate="ceramic", creases=0.7)
+    _render(
+        renderer,
+        sheet,
+        viewpoint="right",
+        material="11oz-black-denim",
+        substrate="ceramic",
+        creases=0.7,
+    )
     both = _render(renderer, sheet, Texture.dots, Texture.gingham)
     assert np.array_equal(both[1], first[0])
 
@@ -81,14 +92,19 @@ def test_a_fresh_process_with_two_threads_makes_the_same_bytes(
     np.savez(tmp_path / "sheet.npz", triangles=sheet.triangles, rest=sheet.rest, track=sheet.track)
     look = ClothDragRender.model_validate(LOOK).model_dump_json()
     done = subprocess.run(
-        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _FRESH, str(tmp_path / "sheet.npz"), look],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     _render(renderer, sheet, Texture.dots, viewpoint="right", substrate="ceramic", instants=(0,))
     video = _render(renderer, sheet)
     assert done.stdout.split()[-1] == hashlib.sha256(video.tobytes()).hexdigest()
 
 
-def test_what_stands_still_has_the_same_bytes_in_every_frame(renderer: ClothRenderer, sheet: Any) -> None:
+def test_what_stands_still_has_the_same_bytes_in_every_frame(
+    renderer: ClothRenderer, sheet: Any
+) -> None:
     look, picture = ClothDragRender.model_validate(LOOK), texture_image(Texture.floral)
     clip = renderer.clip(look, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
     (video,), _ = clip.clips(clip.shading(), [picture])
@@ -103,8 +119,12 @@ def test_the_stage_is_dark_and_the_cloth_is_not(renderer: ClothRenderer, sheet: 
     assert (clip.min(axis=3) >= 254).mean() < 0.01
 
 
-def test_the_cloth_is_lit_alike_everywhere_and_the_floor_at_all_times(renderer: ClothRenderer, sheet: Any) -> None:
-    """The first and the last instant show the same cloth 30 cm apart: it is as bright there as here."""
+def test_the_cloth_is_lit_alike_everywhere_and_the_floor_at_all_times(
+    renderer: ClothRenderer, sheet: Any
+) -> None:
+    """The first and the last instant show the same cloth 30 cm apart: it is as bright there as
+    here.
+    """
     (clip,) = _render(renderer, sheet, Texture.floral)
     camera = load_rig("drag")[0]
     brightness, away = [], np.ones((224, 224), dtype=bool)
@@ -120,7 +140,9 @@ def test_the_cloth_is_lit_alike_everywhere_and_the_floor_at_all_times(renderer: 
     assert np.abs(clip[1, away].astype(int) - clip[0, away]).mean() < 1.5
 
 
-def test_noise_is_still_in_a_clip_and_differs_between_clips(renderer: ClothRenderer, sheet: Any) -> None:
+def test_noise_is_still_in_a_clip_and_differs_between_clips(
+    renderer: ClothRenderer, sheet: Any
+) -> None:
     still = ClothDragRender.model_validate(LOOK)
     clip = renderer.clip(still, load_rig("drag")[0], np.repeat(sheet.track[:1], 2, axis=0))
     (first, second), again = clip.shading(), clip.shading()
@@ -138,9 +160,13 @@ def test_what_is_not_the_cloth_is_refused(renderer: ClothRenderer, sheet: Any) -
         renderer.clip(look, camera, sheet.track * np.nan)
 
 
-@pytest.mark.parametrize("view", [0, *(pytest.param(view, marks=pytest.mark.slow) for view in (1, 2))])
+@pytest.mark.parametrize(
+    "view", [0, *(pytest.param(view, marks=pytest.mark.slow) for view in (1, 2))]
+)
 def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: int) -> None:
-    """The cloth shines by itself before black in Cycles: what a pixel then has of its light is its coverage."""
+    """The cloth shines by itself before black in Cycles: what a pixel then has of its light is its
+    coverage.
+    """
     from stickslip_blender.cycles.engine import Sampling
 
     sheet = make_sheet(17)
@@ -151,7 +177,9 @@ def test_the_silhouette_is_that_of_cycles(make_sheet: Callable[..., Any], view: 
     points = geometry.points(sheet.track[2], 2)
     light = _glowing(stage, points, Sampling(samples=256))
     window = window_about(projected(camera, points[: geometry.cloth_vertices]), camera, 2)
-    coverage = see(projected(camera, points), geometry.triangles, window).share_below(geometry.cloth_triangles)
+    coverage = see(projected(camera, points), geometry.triangles, window).share_below(
+        geometry.cloth_triangles
+    )
     error = np.abs(light[window.slices][..., 0] - coverage)
     edge = (coverage > 0.0) & (coverage < 1.0)
     assert edge.sum() > 200
@@ -174,4 +202,6 @@ def _glowing(stage: Any, points: Any, sampling: Any) -> npt.NDArray[np.float32]:
         black = data.materials[prop].node_tree.nodes["Principled BSDF"]
         black.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
         black.inputs["Specular IOR Level"].default_value = 0.0
-    return np.asarray(stage.direct(points, np.full((8, 8, 3), 255, np.uint8), sampling), dtype=np.float32)
+    return np.asarray(
+        stage.direct(points, np.full((8, 8, 3), 255, np.uint8), sampling), dtype=np.float32
+    )

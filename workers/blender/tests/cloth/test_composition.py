@@ -14,7 +14,9 @@ RANDOM = np.random.Generator(np.random.PCG64(0))
 
 def _srgb(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     bounded = np.clip(light, 0.0, 1.0)
-    return 255.0 * np.where(bounded <= 0.0031308, 12.92 * bounded, 1.055 * bounded ** (1.0 / 2.4) - 0.055)
+    return 255.0 * np.where(
+        bounded <= 0.0031308, 12.92 * bounded, 1.055 * bounded ** (1.0 / 2.4) - 0.055
+    )
 
 
 def test_composed_pictures_are_what_the_formula_says() -> None:
@@ -26,7 +28,10 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     covered[window.slices] = chosen = RANDOM.random((6, 6)) < 0.7
     here = np.where(covered, once, 0.0)  # off the cloth nothing is seen of its albedo
     light = np.stack(
-        [gloss + here * a + twice * b * np.where(covered, a, 1.0) for a, b in zip(SHOWN, ELSEWHERE, strict=True)],
+        [
+            gloss + here * a + twice * b * np.where(covered, a, 1.0)
+            for a, b in zip(SHOWN, ELSEWHERE, strict=True)
+        ],
         axis=-1,
     ).astype(np.float16)
     coverage = RANDOM.uniform(0.1, 1.0, (6, 6)).astype(np.float32) * chosen
@@ -36,7 +41,16 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     floor = RANDOM.uniform(0.5, 1.5, (height, width, 3)).astype(np.float32)
     pictures = np.empty((count, 2, height, width, 3), dtype=np.uint8)[:, 1]
     _raster.compose(
-        light.view(np.uint16), ALBEDOS, overall, coverage, seen, window.place, reflected, around.place, floor, pictures
+        light.view(np.uint16),
+        ALBEDOS,
+        overall,
+        coverage,
+        seen,
+        window.place,
+        reflected,
+        around.place,
+        floor,
+        pictures,
     )
 
     at = np.moveaxis(light.astype(np.float64), -1, 0)[..., None]
@@ -49,12 +63,17 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     expected = np.where(cover > 0.0, of_cloth, at[1] + slope * (around_it - ALBEDOS[1]))
     expected = expected.reshape(*gloss.shape, count, 3)
     expected *= (1.0 + (1.0 - cover) * (floor.repeat(FINE, 0).repeat(FINE, 1) - 1.0))[:, :, None]
-    expected = np.moveaxis(expected.reshape(height, FINE, width, FINE, count, 3).mean(axis=(1, 3)), 2, 0)
+    expected = np.moveaxis(
+        expected.reshape(height, FINE, width, FINE, count, 3).mean(axis=(1, 3)), 2, 0
+    )
     np.testing.assert_allclose(pictures, _srgb(expected), atol=1.1)
 
 
 def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
-    """Nearly grey light keeps its hue within a level; colours that differ are rounded; a level that is near stays."""
+    """Nearly grey light keeps its hue within a level.
+
+    Colours that differ are rounded; a level that is near stays.
+    """
     random = np.random.Generator(np.random.PCG64(4))
     overall = np.array([0.5, 0.51, 0.49, 0.9, 0.2, 0.5], dtype=np.float32)
     light = random.uniform(0.0, 0.6, (24, 60)).astype(np.float16)
@@ -63,19 +82,40 @@ def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
     pictures = np.zeros((2, 24, 60, 3), dtype=np.uint8)
     none = np.empty((0, 0, 6), dtype=np.float32)
     floor = np.ones((24, 60, 3), dtype=np.float32)
-    _raster.compose(shading.view(np.uint16), ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, pictures)
+    _raster.compose(
+        shading.view(np.uint16),
+        ALBEDOS,
+        overall,
+        nothing,
+        none,
+        nowhere,
+        none,
+        nowhere,
+        floor,
+        pictures,
+    )
     exact = _srgb(light[..., None].astype(np.float64) * overall)
     grey, colorful = pictures
     assert np.abs(grey - exact[..., :3]).max() <= TOLERANCE + 0.2
     assert np.abs(colorful - exact[..., 3:]).max() <= 0.9
-    hues, rounded = (np.ptp(picture, axis=-1) for picture in (grey.astype(int), np.rint(exact[..., :3])))
+    hues, rounded = (
+        np.ptp(picture, axis=-1) for picture in (grey.astype(int), np.rint(exact[..., :3]))
+    )
     assert (hues == 0).mean() > (rounded == 0).mean() + 0.2
 
-    brighter, fresh, kept = (np.float16(1.01) * shading).view(np.uint16), np.zeros_like(pictures), pictures.copy()
+    brighter, fresh, kept = (
+        (np.float16(1.01) * shading).view(np.uint16),
+        np.zeros_like(pictures),
+        pictures.copy(),
+    )
     for made in (fresh, kept):
-        _raster.compose(brighter, ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, made)
+        _raster.compose(
+            brighter, ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, made
+        )
     stays = (kept == pictures).all(axis=-1)
-    exact = np.stack(np.split(_srgb(1.01 * light[..., None].astype(np.float64) * overall), 2, axis=-1))
+    exact = np.stack(
+        np.split(_srgb(1.01 * light[..., None].astype(np.float64) * overall), 2, axis=-1)
+    )
     assert np.abs(kept - exact).max() <= TOLERANCE + 0.3
     assert np.array_equal(kept[~stays], fresh[~stays])
     assert stays.mean() > (fresh == pictures).all(axis=-1).mean() + 0.2
@@ -85,7 +125,9 @@ def _side(inside: Any, middle: int, radius: float) -> npt.NDArray[np.float64]:
     """Return the shares of cells that a side of a box covers, about the middle of one of them."""
     half = np.sqrt(0.25 + radius**2)
     low, high = middle + 0.5 - half, middle + 0.5 + half
-    covered: npt.NDArray[np.float64] = np.clip(np.minimum(inside + 1, high) - np.maximum(inside, low), 0.0, 1.0)
+    covered: npt.NDArray[np.float64] = np.clip(
+        np.minimum(inside + 1, high) - np.maximum(inside, low), 0.0, 1.0
+    )
     return covered / (2.0 * half)
 
 
@@ -99,7 +141,8 @@ def test_blurring_is_a_box_twice() -> None:
         blurred = np.empty_like(expected)
         for row, column in np.ndindex(height, width):
             box = np.outer(
-                _side(np.arange(height), row, down[row, column]), _side(np.arange(width), column, across[row, column])
+                _side(np.arange(height), row, down[row, column]),
+                _side(np.arange(width), column, across[row, column]),
             )
             blurred[row, column] = np.einsum("hw,hwk->k", box, expected)
         expected = blurred
@@ -117,7 +160,9 @@ def test_normals_point_off_the_surface() -> None:
     triangles = np.concatenate(
         [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([b, d, c], axis=-1).reshape(-1, 3)]
     )
-    normals = _raster.normals(np.concatenate([points, [[9.0, 9.0, 9.0]]]), triangles.astype(np.int32))
+    normals = _raster.normals(
+        np.concatenate([points, [[9.0, 9.0, 9.0]]]), triangles.astype(np.int32)
+    )
     inner = number[1:-1, 1:-1].ravel()
     np.testing.assert_allclose(normals[inner], (points * [1.0, 1.0, 0.0])[inner], atol=1e-3)
     assert not normals[-1].any()

@@ -71,7 +71,11 @@ def _task(record: str, **look: Any) -> dict[str, Any]:
         "crease_seed": 4,
     }
     more = {"textures": look.pop("textures")} if "textures" in look else {}
-    return {"stage": "render", "render": render | look, "record": {"digest": record, "row": 0}} | more
+    return {
+        "stage": "render",
+        "render": render | look,
+        "record": {"digest": record, "row": 0},
+    } | more
 
 
 def _output(actor: RenderActor, task: dict[str, Any]) -> RenderOutput:
@@ -103,7 +107,9 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
     red, blue = _colored(frame)
     assert red.sum() > 300
     assert blue.sum() > 300
-    assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 10  # the cloth hangs from its upper edge
+    assert (
+        np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 10
+    )  # the cloth hangs from its upper edge
     monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
     both = _output(actor, _task(record, textures=["dots", image]))
     assert both.clips[image].output == alone
@@ -114,7 +120,11 @@ def test_a_task_says_which_pictures_it_reads(store: DirectoryStore, record: str)
     digest = store.publish(_png(_flag()))
     own = _task(record, texture="my-flag", image=f"sha256:{digest}")
     together = _task(record, textures=["dots", f"sha256:{digest}"])
-    for task, expected in ((own, (record, digest)), (together, (record, digest)), (_task(record), (record,))):
+    for task, expected in (
+        (own, (record, digest)),
+        (together, (record, digest)),
+        (_task(record), (record,)),
+    ):
         assert input_digests(task_adapter.validate_python(task), store.read) == expected
 
 
@@ -138,7 +148,9 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
 
     R = np.asarray(ours.rotation)
     angle = acos((np.trace(R) - 1.0) / 2.0)
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (2.0 * np.sin(angle))
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (
+        2.0 * np.sin(angle)
+    )
     own = Calibration(
         image_size=(648, 448),
         camera_matrix=(
@@ -152,7 +164,9 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     ).camera("lab")
     for name in ("fx", "fy", "cx", "cy", "rotation", "translation"):
         np.testing.assert_allclose(getattr(own, name), getattr(ours, name), atol=1e-9)
-    seen = _frame(store, _output(actor, _task(record, viewpoint="lab", camera=own.model_dump(mode="json"))))
+    seen = _frame(
+        store, _output(actor, _task(record, viewpoint="lab", camera=own.model_dump(mode="json")))
+    )
     expected = _frame(store, _output(actor, _task(record, viewpoint="left")))
     assert (np.abs(seen.astype(int) - expected) > 2).mean() < 0.002
 
@@ -161,9 +175,14 @@ def test_a_lens_shows_what_the_straight_camera_sees_elsewhere(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
     ours = load_rig("drag")[1]
-    bent = ours.model_copy(update={"distortion": (-2.0, 1.0, 0.01, -0.02, 0.0)})  # of a lens that sees 25 degrees
+    bent = ours.model_copy(
+        update={"distortion": (-2.0, 1.0, 0.01, -0.02, 0.0)}
+    )  # of a lens that sees 25 degrees
     straight, seen = (
-        _frame(store, _output(actor, _task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))))
+        _frame(
+            store,
+            _output(actor, _task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))),
+        )
         for camera in (ours, bent)
     )
     rows, columns = np.mgrid[:224, :224]
@@ -175,14 +194,25 @@ def test_a_lens_shows_what_the_straight_camera_sees_elsewhere(
     assert off < 0.4 * far, "levels"
 
 
-def test_lamps_and_floors_of_the_users_own(actor: RenderActor, store: DirectoryStore, record: str) -> None:
+def test_lamps_and_floors_of_the_users_own(
+    actor: RenderActor, store: DirectoryStore, record: str
+) -> None:
     lamp = LampNumbers(azimuth=(-30.0, -20.0), elevation=(50.0, 50.0), power=(1.0, 1.2))
     floor = FloorNumbers(albedo=(0.5, 0.6), roughness=(0.8, 0.9), grain=0.0, tint=(0.2, 0.5, 1.0))
     light, ground = drawn_light("bench", 9, lamp), drawn_substrate("green-baize", 9, floor)
-    assert (-30.0 <= light.azimuth <= -20.0, light.elevation, 1.0 <= light.power <= 1.2) == (True, 50.0, True)
+    assert (-30.0 <= light.azimuth <= -20.0, light.elevation, 1.0 <= light.power <= 1.2) == (
+        True,
+        50.0,
+        True,
+    )
     assert 0.5 <= ground.albedo <= 0.6
     assert np.mean(ground.tint) == pytest.approx(1.0)
-    look = {"lighting": "bench", "lamp": lamp.model_dump(), "substrate": "green-baize", "finish": floor.model_dump()}
+    look = {
+        "lighting": "bench",
+        "lamp": lamp.model_dump(),
+        "substrate": "green-baize",
+        "finish": floor.model_dump(),
+    }
     output = _output(actor, _task(record, **look))
     labels = output.labels
     assert (labels["lighting"], labels["substrate"]) == ("bench", "green-baize")
@@ -207,8 +237,14 @@ def test_what_is_drawn_from_is_in_the_shading_and_pictures_are_not() -> None:
     lamp = {"azimuth": [0.0, 1.0], "elevation": [40.0, 41.0], "power": [1.0, 1.0]}
     finish = {"albedo": [0.1, 0.2], "roughness": [0.5, 0.6]}
     first = ClothDragRender.model_validate(plain)
-    other = ClothDragRender.model_validate(plain | {"texture": "mine", "image": f"sha256:{'1' * 64}"})
+    other = ClothDragRender.model_validate(
+        plain | {"texture": "mine", "image": f"sha256:{'1' * 64}"}
+    )
     assert first.shading == other.shading
     assert (first.variant, other.variant) == ("plaid", f"sha256:{'1' * 64}")
-    for more in ({"lamp": lamp}, {"finish": finish}, {"camera": load_rig("drag")[1].model_dump(mode="json")}):
+    for more in (
+        {"lamp": lamp},
+        {"finish": finish},
+        {"camera": load_rig("drag")[1].model_dump(mode="json")},
+    ):
         assert ClothDragRender.model_validate(plain | more).shading != first.shading

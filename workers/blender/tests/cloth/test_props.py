@@ -28,7 +28,9 @@ def test_marks_of_the_floor_are_not_on_props(make_sheet: Callable[..., Any]) -> 
     edge = np.abs(marked - 1.5) < 0.4
     assert edge.sum() > 100
     np.testing.assert_allclose(boxes, marked, atol=0.05)
-    assert ((finer == 1.0) | (finer == 2.0)).sum() > 4 * ((marked == 1.0) | (marked == 2.0)).sum()  # less is mixed
+    assert ((finer == 1.0) | (finer == 2.0)).sum() > 4 * (
+        (marked == 1.0) | (marked == 2.0)
+    ).sum()  # less is mixed
 
 
 def _inside(mask: Any) -> Any:

@@ -23,14 +23,24 @@ def test_encoding_is_srgb() -> None:
 
 
 def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
-    """Errors of 3 levels at five brightnesses, whatever the noise; highlights have no level above 255."""
+    """Errors of 3 levels at five brightnesses, whatever the noise.
+
+    Highlights have no level above 255.
+    """
     random = np.random.Generator(np.random.PCG64(1))
     truth = np.repeat(np.array([20, 60, 120, 180, 230], dtype=np.uint8), 40_000).reshape(400, 500)
     clip = (truth + 3 * random.choice([-1, 1], truth.shape)).astype(np.uint8)
     for noise in (0.1, 0.4):
         light = decoded(truth) * (1.0 + noise * random.standard_normal((4, *truth.shape)))
         light[2:, :200] = np.nan
-        found = pooled([(errors(np.dstack([clip] * 3), light[..., None], 0), np.ones((3, 400, 500), dtype=bool))])
+        found = pooled(
+            [
+                (
+                    errors(np.dstack([clip] * 3), light[..., None], 0),
+                    np.ones((3, 400, 500), dtype=bool),
+                )
+            ]
+        )
         exact = 10.0 * np.log10(255.0**2 / 9.0)
         assert abs(found.psnr[0] - exact) < max(0.15, 2.5 * found.deviations[0])
     white, bright = np.full((8, 8, 3), 255, dtype=np.uint8), np.full((2, 8, 8, 3), 1.7)
@@ -38,7 +48,9 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
 
 
 def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
-    """One frame of three is measured, and errors of the others are expected to be four times as large."""
+    """One frame of three is measured, and errors of the others are expected to be four times as
+    large.
+    """
     measured = np.ones((3, 64, 64))
     found = pooled([(np.full((64, 64), 4.0), measured)], usual=(1.0, 3.0, 1.0))
     exact = [10.0 * np.log10(255.0**2 / (4.0 * usual)) for usual in (1.0, 3.0, 1.0)]
@@ -48,12 +60,17 @@ def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
 
 def test_small_cloth_has_more_paths() -> None:
     sampling = ClothSampling(1, 5, (0.0, 0.0, 0.0))
-    assert [sampling.over(area).window for area in (20_000.0, 13_000.0, 10_000.0, 8_000.0, 1.0)] == [5, 5, 6, 8, 8]
+    assert [
+        sampling.over(area).window for area in (20_000.0, 13_000.0, 10_000.0, 8_000.0, 1.0)
+    ] == [5, 5, 6, 8, 8]
 
 
 def test_a_clip_below_its_floor_says_so() -> None:
     measured = Measured((33.0, 30.0, 27.0), (0.1, 2.0, 0.1))
-    assert measured.shortfall((32.0, 33.0, 28.0)) == "psnr_edge must be at least 28 dB; got 27.0 dB (deviation 0.1 dB)"
+    assert (
+        measured.shortfall((32.0, 33.0, 28.0))
+        == "psnr_edge must be at least 28 dB; got 27.0 dB (deviation 0.1 dB)"
+    )
     assert UNMEASURED.shortfall((99.0, 99.0, 99.0)) == ""
     assert UNMEASURED.labels["psnr_landed"] is None
 
@@ -71,7 +88,11 @@ def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
 
 @pytest.mark.parametrize(
     ("material", "substrate"),
-    [("gray-interlock", "matt"), ("gray-interlock", "polyester-mirror"), ("white-swim-solid", "stainless-steel")],
+    [
+        ("gray-interlock", "matt"),
+        ("gray-interlock", "polyester-mirror"),
+        ("white-swim-solid", "stainless-steel"),
+    ],
 )
 def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substrate: str) -> None:
     look = ClothDragRender(
@@ -88,7 +109,9 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
         substrate=substrate,
     )
     renderer = ClothRenderer(sheet.triangles, sheet.rest, Holders)
-    clip = renderer.clip(look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, (0.0, 0.0, 0.0)))
+    clip = renderer.clip(
+        look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, (0.0, 0.0, 0.0))
+    )
     names = trio("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
     shading = clip.shading()
@@ -101,6 +124,10 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
         assert found.psnr[0] > 35.0, names[channel]
 
 
-@pytest.mark.parametrize(("area", "paths"), [(0.0, 8), (5_000.0, 8), (10_833.0, 6), (13_000.0, 5), (50_000.0, 5)])
-def test_small_windows_get_more_paths_and_cloth_out_of_the_frame_too(area: float, paths: int) -> None:
+@pytest.mark.parametrize(
+    ("area", "paths"), [(0.0, 8), (5_000.0, 8), (10_833.0, 6), (13_000.0, 5), (50_000.0, 5)]
+)
+def test_small_windows_get_more_paths_and_cloth_out_of_the_frame_too(
+    area: float, paths: int
+) -> None:
     assert CLOTH_SAMPLING[Quality.standard].over(area).window == paths

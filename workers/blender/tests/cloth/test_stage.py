@@ -1,4 +1,6 @@
-"""The stage of a scene: bodies as they are simulated, sheets with pictures, cameras that frame what moves."""
+"""The stage of a scene: bodies as they are simulated, sheets with pictures, cameras that frame what
+moves.
+"""
 
 import io
 from itertools import pairwise
@@ -29,17 +31,25 @@ def flat(width: float, height: float, cells: int) -> tuple[Any, Any]:
     rest = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     number = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = (number[i : cells + i, j : cells + j].ravel() for i in (0, 1) for j in (0, 1))
-    return rest, np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]).astype(np.int32)
+    return rest, np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)]).astype(
+        np.int32
+    )
 
 
 def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a scene and its record: a sheet that rises over a cloth on the floor, bodies of all kinds, a holder.
+    """Return a scene and its record: a sheet that rises over a cloth on the floor, bodies of all
+    kinds, a holder.
 
     `screen` is the y of a wall before the sheet [m].
     """
     bodies: dict[str, Any] = {
         "ball": {"type": "sphere", "radius": 0.04, "origin": [0.3, 0.0, 0.04]},
-        "block": {"type": "box", "size": [0.1, 0.08, 0.06], "rounding": 0.01, "origin": [-0.3, 0.0, 0.03]},
+        "block": {
+            "type": "box",
+            "size": [0.1, 0.08, 0.06],
+            "rounding": 0.01,
+            "origin": [-0.3, 0.0, 0.03],
+        },
         "floor": {"type": "plane"},
         "peg": {"type": "capsule", "radius": 0.02, "length": 0.1, "origin": [0.0, 0.3, 0.07]},
         "tetrahedron": {"type": "mesh", "file": "tetrahedron.obj"},
@@ -53,8 +63,14 @@ def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
             "frame_rate": INSTANTS - 1,
             "default_friction": 0.4,
             "sheets": {
-                "rug": {"material": "11oz-black-denim", "mesh": {"type": "grid", "size": [0.6, 0.4], "cells": [6, 6]}},
-                "towel": {"material": "gray-interlock", "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [6, 6]}},
+                "rug": {
+                    "material": "11oz-black-denim",
+                    "mesh": {"type": "grid", "size": [0.6, 0.4], "cells": [6, 6]},
+                },
+                "towel": {
+                    "material": "gray-interlock",
+                    "mesh": {"type": "grid", "size": [0.2, 0.1], "cells": [6, 6]},
+                },
             },
             "bodies": bodies,
             "looks": {
@@ -64,9 +80,14 @@ def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         }
     ).model_dump(mode="json")
     record: dict[str, Any] = {}
-    for name, (rest, triangles), rise in (("rug", flat(0.6, 0.4, 6), 0.0), ("towel", flat(0.2, 0.1, 6), 0.1)):
+    for name, (rest, triangles), rise in (
+        ("rug", flat(0.6, 0.4, 6), 0.0),
+        ("towel", flat(0.2, 0.1, 6), 0.1),
+    ):
         heights = 0.05 * (rise > 0.0) + rise * np.arange(INSTANTS)
-        track = np.stack([np.column_stack([rest, np.full(len(rest), height)]) for height in heights])
+        track = np.stack(
+            [np.column_stack([rest, np.full(len(rest), height)]) for height in heights]
+        )
         record |= {f"{name}.positions": track, f"{name}.rest": rest, f"{name}.triangles": triangles}
     poses = np.zeros((INSTANTS, len(bodies), 3, 4))
     poses[..., :3] = np.eye(3)
@@ -97,16 +118,27 @@ def usual() -> tuple[Stage, Geometry, Any]:
     return staged()
 
 
-@pytest.mark.parametrize(("core", "radius"), [((0, 0, 0), 0.05), ((0, 0, 0.1), 0.02), ((0.04, 0.03, 0.02), 0.01)])
-def test_round_bodies_are_their_cores_grown_by_the_radius(core: tuple[float, float, float], radius: float) -> None:
+@pytest.mark.parametrize(
+    ("core", "radius"), [((0, 0, 0), 0.05), ((0, 0, 0.1), 0.02), ((0.04, 0.03, 0.02), 0.01)]
+)
+def test_round_bodies_are_their_cores_grown_by_the_radius(
+    core: tuple[float, float, float], radius: float
+) -> None:
     vertices, faces = rounded(core, radius)
     inside = np.clip(vertices, np.negative(core), core)
     np.testing.assert_allclose(np.linalg.norm(vertices - inside, axis=1), radius)
     np.testing.assert_allclose(vertices.max(axis=0), np.add(core, radius))
-    volume = sum(np.linalg.det(vertices[[face[0], b, c]]) / 6.0 for face in faces for b, c in pairwise(face[1:]))
+    volume = sum(
+        np.linalg.det(vertices[[face[0], b, c]]) / 6.0
+        for face in faces
+        for b, c in pairwise(face[1:])
+    )
     a, b, c = 2.0 * np.array(core)
     exact = (
-        a * b * c + 2 * radius * (a * b + b * c + c * a) + np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
+        a * b * c
+        + 2 * radius * (a * b + b * c + c * a)
+        + np.pi * radius**2 * (a + b + c)
+        + 4 / 3 * np.pi * radius**3
     )
     assert volume == pytest.approx(exact, rel=0.03)  # outward, closed, and a polyhedron
     colors = gores(np.ones((1, 3)), len(faces))
@@ -116,13 +148,20 @@ def test_round_bodies_are_their_cores_grown_by_the_radius(core: tuple[float, flo
 def test_bodies_are_where_the_record_has_them_and_a_little_inside(usual: Any) -> None:
     stage, _, track = usual
     assert stage.floor == FLOOR
-    last = {prop.name: at for prop, at in zip(stage.props, stage.placed(INSTANTS - 1, track[-1]), strict=True)}
+    last = {
+        prop.name: at
+        for prop, at in zip(stage.props, stage.placed(INSTANTS - 1, track[-1]), strict=True)
+    }
     assert [*last] == ["rug", "ball", "block", "peg", "tetrahedron", "holder-0"]
     np.testing.assert_allclose(np.linalg.norm(last["ball"] - [0.3, 0.0, 0.04], axis=1), 0.04 - SUNK)
     turned = stage.placed(0, track[0])[1] - [0.3, 0.0, 0.04]
     now = last["ball"] - [0.3, 0.0, 0.04]
-    np.testing.assert_allclose(now, np.column_stack([-turned[:, 1], turned[:, 0], turned[:, 2]]), atol=1e-12)
-    np.testing.assert_allclose(np.ptp(last["block"], axis=0), np.subtract([0.1, 0.08, 0.06], 2 * SUNK))
+    np.testing.assert_allclose(
+        now, np.column_stack([-turned[:, 1], turned[:, 0], turned[:, 2]]), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.ptp(last["block"], axis=0), np.subtract([0.1, 0.08, 0.06], 2 * SUNK)
+    )
     assert last["peg"][:, 2].max() == pytest.approx(0.07 + 0.05 + 0.02 - SUNK)
     assert last["holder-0"][:, 2].mean() == pytest.approx(0.25)
     assert (np.abs(last["rug"][:, 2]) < 0.002).all()
@@ -147,7 +186,9 @@ def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
     rug = factor[truth["segmentation"] == names.index("rug")]
     assert rug.mean() == pytest.approx(1.0, abs=0.15)
     assert rug[:, 1].std() > 0.5  # red and white stripes
-    np.testing.assert_allclose(factor[truth["segmentation"] == names.index("towel")][:, 0].mean(), 1.0, atol=0.2)
+    np.testing.assert_allclose(
+        factor[truth["segmentation"] == names.index("towel")][:, 0].mean(), 1.0, atol=0.2
+    )
 
 
 @pytest.mark.parametrize("name", FRAMING)
@@ -172,7 +213,9 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
     del scene["bodies"]["floor"]
     stage, geometry = set_up(scene, record)
     points = geometry.points(record["towel.positions"][0], 0)
-    truth = ground_truth(geometry, points, points, framed("front", record["towel.positions"], size=224))
+    truth = ground_truth(
+        geometry, points, points, framed("front", record["towel.positions"], size=224)
+    )
     assert stage.floor is None
     assert np.isinf(truth["depth"][truth["segmentation"] == 0]).all()
     assert (truth["segmentation"] == 0).any()
@@ -196,7 +239,11 @@ def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
         "crease_seed": 2,
     }
     actor = RenderActor(str(store.root))
-    task = {"stage": "render", "render": look, "record": {"digest": store.publish(file.getvalue()), "row": 0}}
+    task = {
+        "stage": "render",
+        "render": look,
+        "record": {"digest": store.publish(file.getvalue()), "row": 0},
+    }
     result = TaskResult.model_validate(actor.render(task))
     assert isinstance(result.output, RenderOutput), result.message
     assert set(result.output.chunks) == {"video", "segmentation"}
@@ -204,20 +251,26 @@ def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
     np.testing.assert_allclose(result.output.labels["camera"], camera.numbers)
 
     chunk = result.output.chunks["segmentation"]
-    codes = np.frombuffer(decode_chunk(store.read(chunk.digest, offset=0, length=chunk.length)), dtype=np.uint8)
+    codes = np.frombuffer(
+        decode_chunk(store.read(chunk.digest, offset=0, length=chunk.length)), dtype=np.uint8
+    )
     names = scene_segments(scene["sheets"], scene["bodies"])
     assert {names[code] for code in np.unique(codes)} >= {"towel", "rug", "floor", "holders"}
 
 
 def corners_about(middle: Any, half: float) -> Any:
     """Return the corners (8, 3) of a cube."""
-    return np.asarray(middle) + half * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return np.asarray(middle) + half * np.array(
+        [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    )
 
 
 def rays(camera: Any) -> Any:
     """Return the rays of depth 1 of all pixels, in camera axes, shape (height, width, 3)."""
     v, u = np.mgrid[: camera.height, : camera.width]
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+    )
 
 
 def degrees_between(one: Any, other: Any) -> Any:
@@ -227,23 +280,33 @@ def degrees_between(one: Any, other: Any) -> Any:
 def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None:
     scene, record = made()
     turn = np.radians(6.0)
-    record["body_pose"][1, 0, :, :3] = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    record["body_pose"][1, 0, :, :3] = [
+        [np.cos(turn), -np.sin(turn), 0],
+        [np.sin(turn), np.cos(turn), 0],
+        [0, 0, 1],
+    ]
     _, geometry = set_up(scene, record)
     now, then = (geometry.points(record["towel.positions"][0], k) for k in (0, 1))
     middle, radius = np.array([0.3, 0.0, 0.04]), 0.04 - SUNK
     camera = framed("high", corners_about(middle, 0.06), size=224)
     truth = ground_truth(geometry, now, then, camera)
-    rows, columns = np.nonzero(truth["segmentation"] == scene_segments(scene["sheets"], scene["bodies"]).index("ball"))
+    rows, columns = np.nonzero(
+        truth["segmentation"] == scene_segments(scene["sheets"], scene["bodies"]).index("ball")
+    )
     rotation, ray = np.asarray(camera.rotation), rays(camera)[rows, columns]
     center = rotation @ middle + camera.translation
     along, square = ray @ center, (ray**2).sum(axis=1)
-    met = along**2 - square * (center @ center - radius**2)  # a ray meets the ball where this is positive
+    met = along**2 - square * (
+        center @ center - radius**2
+    )  # a ray meets the ball where this is positive
     kept = met > 0.1 * square * radius**2  # away from the silhouette
     assert kept.sum() > 4000
     normal = ((along - np.sqrt(np.maximum(met, 0.0))) / square)[:, None] * ray - center
     angle = degrees_between(truth["normals"][rows, columns], normal / radius)[kept]
     moved, _ = camera.project(normal @ rotation @ record["body_pose"][1, 0, :, :3].T + middle)
-    error = np.linalg.norm(truth["flow"][rows, columns] - moved + np.column_stack([columns, rows]), axis=1)[kept]
+    error = np.linalg.norm(
+        truth["flow"][rows, columns] - moved + np.column_stack([columns, rows]), axis=1
+    )[kept]
     print(kept.sum(), np.percentile(angle, [50, 99]), np.percentile(error, [50, 99]))
     assert np.median(angle) < 1.0
     assert np.percentile(angle, 99) < 4.0
@@ -252,9 +315,15 @@ def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None
 
 @pytest.mark.parametrize(
     ("name", "middle", "half"),
-    [("block", (-0.3, 0, 0.03), 0.06), ("holders", (0, 0, 0.05), 0.02), ("tetrahedron", (0.03, -0.27, 0.03), 0.06)],
+    [
+        ("block", (-0.3, 0, 0.03), 0.06),
+        ("holders", (0, 0, 0.05), 0.02),
+        ("tetrahedron", (0.03, -0.27, 0.03), 0.06),
+    ],
 )
-def test_normals_of_bodies_are_those_of_their_depth(usual: Any, name: str, middle: Any, half: float) -> None:
+def test_normals_of_bodies_are_those_of_their_depth(
+    usual: Any, name: str, middle: Any, half: float
+) -> None:
     _, geometry, track = usual
     names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
     camera = framed("high", corners_about(middle, half), size=224)
@@ -264,7 +333,9 @@ def test_normals_of_bodies_are_those_of_their_depth(usual: Any, name: str, middl
     normal = np.cross(np.gradient(place, axis=0), np.gradient(place, axis=1))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     near = np.lib.stride_tricks.sliding_window_view(normal, (7, 7), axis=(0, 1))
-    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (truth["segmentation"] == names.index(name))
+    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (
+        truth["segmentation"] == names.index(name)
+    )
     angle = degrees_between(truth["normals"], normal)[kept]
     print(name, kept.sum(), (truth["segmentation"] == names.index(name)).sum())
     print(name, np.percentile(angle, [50, 99]) if len(angle) else "")

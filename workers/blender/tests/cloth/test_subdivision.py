@@ -32,7 +32,9 @@ def test_nothing_gets_below_the_floor(sheet: Any) -> None:
 
 
 def test_the_inner_rule_is_that_of_loop(sheet: Any) -> None:
-    """A spike on a vertex of valence 6 keeps 1 - 6/16 of its height and gives its neighbours 1/16 each [Loop 1987]."""
+    """A spike on a vertex of valence 6 keeps 1 - 6/16 of its height and gives its neighbours 1/16
+    each [Loop 1987].
+    """
     middle = 4 * 9 + 4
     spike = np.zeros((81, 1))
     spike[middle] = 1.0
@@ -50,5 +52,7 @@ def test_corners_stay(sheet: Any) -> None:
 
 
 def test_a_mesh_that_branches_is_refused() -> None:
-    with pytest.raises(ValueError, match="every edge must belong to one or two triangles; one belongs to 3"):
+    with pytest.raises(
+        ValueError, match="every edge must belong to one or two triangles; one belongs to 3"
+    ):
         subdivide([(0, 1, 2), (0, 1, 3), (0, 1, 4)], np.random.default_rng(0).random((5, 2)))

@@ -42,7 +42,9 @@ def test_a_substrate_is_drawn_by_its_seed(name: str) -> None:
 
 
 def test_held_out_lamps_are_not_among_those_to_train_with() -> None:
-    usual, other = ([drawn_light(name, seed).numbers for seed in range(200)] for name in ("drawn", "held-out"))
+    usual, other = (
+        [drawn_light(name, seed).numbers for seed in range(200)] for name in ("drawn", "held-out")
+    )
     low, high = np.min(usual, axis=0), np.max(usual, axis=0)
     assert not ((low <= other) & (other <= high)).any()
     studio, room, window = (drawn_light(name, 1).source for name in ("drawn", "room", "window"))
@@ -54,7 +56,9 @@ def test_marks_lie_still_on_the_floor() -> None:
     """Two cameras see the same mark at the same place of the floor."""
     substrate = drawn_substrate("matt", 3)
     one, other = load_rig("drag")[:2]
-    place = np.array([[x, y, FLOOR] for x in np.linspace(0.0, 0.3, 12) for y in np.linspace(-0.1, 0.1, 9)])
+    place = np.array(
+        [[x, y, FLOOR] for x in np.linspace(0.0, 0.3, 12) for y in np.linspace(-0.1, 0.1, 9)]
+    )
     seen = []
     for camera in (one, other):
         factor = floor_factor(substrate, camera, FLOOR)
@@ -69,9 +73,16 @@ def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
     white = np.full((256, 256, 3), 200, dtype=np.uint8)
     prints = {material: grained(white, look_of(material), surface) for material in LOOKS}
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
-    inner = {material: picture[20:-20, 20:-20].astype(float) for material, picture in prints.items()}
-    for one, other in combinations(inner.values(), 2):  # prints of one brightness that a pixel of 3 mm still shows
-        coarse = [(p / p.mean())[:216, :216, 0].reshape(54, 4, 54, 4).mean(axis=(1, 3)) for p in (one, other)]
+    inner = {
+        material: picture[20:-20, 20:-20].astype(float) for material, picture in prints.items()
+    }
+    for one, other in combinations(
+        inner.values(), 2
+    ):  # prints of one brightness that a pixel of 3 mm still shows
+        coarse = [
+            (p / p.mean())[:216, :216, 0].reshape(54, 4, 54, 4).mean(axis=(1, 3))
+            for p in (one, other)
+        ]
         assert np.std(coarse[0] - coarse[1]) > 0.035
     for picture in prints.values():
         assert 120 < picture.mean() < 210

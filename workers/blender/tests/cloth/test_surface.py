@@ -1,4 +1,6 @@
-"""The cloth that is seen lies about the solver's, and its hem and creases are as strong as asked for."""
+"""The cloth that is seen lies about the solver's, and its hem and creases are as strong as asked
+for.
+"""
 
 from collections.abc import Callable
 from typing import Any

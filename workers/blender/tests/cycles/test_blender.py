@@ -7,7 +7,14 @@ from contextlib import suppress
 
 import pytest
 from stickslip_blender import workshop
-from stickslip_blender.cycles.engine import CPU, DEVICES, VARIABLE, NoDeviceError, described, new_scene
+from stickslip_blender.cycles.engine import (
+    CPU,
+    DEVICES,
+    VARIABLE,
+    NoDeviceError,
+    described,
+    new_scene,
+)
 
 _RENDER = """
 import hashlib, sys
@@ -31,7 +38,12 @@ def _rendered(name: str) -> str:
     """Return what a process of its own says that renders with a device."""
     environment = os.environ | {VARIABLE: name}
     done = subprocess.run(
-        [sys.executable, "-c", _RENDER], capture_output=True, text=True, check=True, env=environment, timeout=600
+        [sys.executable, "-c", _RENDER],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+        timeout=600,
     )
     return done.stdout.strip().splitlines()[-1]
 
@@ -64,7 +76,9 @@ def test_a_device_that_is_not_there_is_refused(name: str, monkeypatch: pytest.Mo
 
 def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "tpu")
-    with pytest.raises(NoDeviceError, match=r"STICKSLIP_RENDER_DEVICE must be one of cpu, optix.*; got 'tpu'"):
+    with pytest.raises(
+        NoDeviceError, match=r"STICKSLIP_RENDER_DEVICE must be one of cpu, optix.*; got 'tpu'"
+    ):
         new_scene()
 
 

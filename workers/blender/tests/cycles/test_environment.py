@@ -10,18 +10,35 @@ from stickslip_testing.cameras import looking_at
 
 @pytest.mark.parametrize(
     ("azimuth", "elevation", "bright"),
-    [(0.0, 0.0, "right"), (180.0, 0.0, "left"), (90.0, 90.0, "top"), (0.0, -90.0, "bottom"), (270.0, 0.0, "middle")],
+    [
+        (0.0, 0.0, "right"),
+        (180.0, 0.0, "left"),
+        (90.0, 90.0, "top"),
+        (0.0, -90.0, "bottom"),
+        (270.0, 0.0, "middle"),
+    ],
 )
-def test_a_ball_is_lit_from_where_the_soft_box_stands(azimuth: float, elevation: float, bright: str) -> None:
+def test_a_ball_is_lit_from_where_the_soft_box_stands(
+    azimuth: float, elevation: float, bright: str
+) -> None:
     scene = new_scene()
     set_sampling(scene, Sampling(samples=32))
-    set_environment(scene, panorama([SoftBox(azimuth, elevation, radiance=1.0, sharpness=8.0)], 0.0), ground=0.0)
+    set_environment(
+        scene, panorama([SoftBox(azimuth, elevation, radiance=1.0, sharpness=8.0)], 0.0), ground=0.0
+    )
     import_bpy().ops.mesh.primitive_uv_sphere_add(segments=48, ring_count=24, radius=1.0)
     add_view(scene)
     set_view(  # from -y, so that +x is on the right
         scene,
         looking_at(
-            (0.0, 0.0, 0.0), azimuth=270.0, elevation=0.0, distance=10.0, name="a", width=33, height=33, focal=130.0
+            (0.0, 0.0, 0.0),
+            azimuth=270.0,
+            elevation=0.0,
+            distance=10.0,
+            name="a",
+            width=33,
+            height=33,
+            focal=130.0,
         ),
     )
     reader = FrameReader(scene)

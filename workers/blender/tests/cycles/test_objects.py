@@ -13,11 +13,20 @@ from stickslip_testing.cameras import looking_at
 
 _SKEWED = Camera.model_validate(  # rolled, off-centre, not square, pixels not square either
     looking_at(
-        (0.0, 0.0, -0.5), azimuth=25.0, elevation=30.0, distance=3.0, name="skewed", width=200, height=120, focal=300.0
+        (0.0, 0.0, -0.5),
+        azimuth=25.0,
+        elevation=30.0,
+        distance=3.0,
+        name="skewed",
+        width=200,
+        height=120,
+        focal=300.0,
     ).model_dump()
     | {"fx": 310.0, "fy": 260.0, "cx": 83.0, "cy": 71.5}
 )
-_ROLL = np.array([[np.cos(0.3), -np.sin(0.3), 0.0], [np.sin(0.3), np.cos(0.3), 0.0], [0.0, 0.0, 1.0]])
+_ROLL = np.array(
+    [[np.cos(0.3), -np.sin(0.3), 0.0], [np.sin(0.3), np.cos(0.3), 0.0], [0.0, 0.0, 1.0]]
+)
 ROLLED = Camera.model_validate(
     _SKEWED.model_dump()
     | {
@@ -27,7 +36,8 @@ ROLLED = Camera.model_validate(
     }
 )
 TALL = Camera.model_validate(
-    _SKEWED.model_dump() | {"name": "tall", "width": 90, "height": 210, "fy": 400.0, "cx": 50.0, "cy": 101.0}
+    _SKEWED.model_dump()
+    | {"name": "tall", "width": 90, "height": 210, "fy": 400.0, "cx": 50.0, "cy": 101.0}
 )
 CAMERAS = (*load_rig("rod-4"), _SKEWED, ROLLED, TALL)
 POINTS = ((0.0, 0.0, -0.5), (0.1, -0.05, -0.65), (-0.12, 0.08, -0.35))

@@ -24,7 +24,9 @@ for frame in range(3):
 def test_a_process_whose_frame_hangs_is_ended_after_a_time_that_follows_from_its_frames() -> None:
     """Frames of 0.2 s may take 20 times as long, and half a second."""
     start = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", _HANGS], capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", _HANGS], capture_output=True, text=True, check=False, timeout=60
+    )
     assert time.monotonic() - start > 4.5
     assert done.returncode == 1
     assert done.stdout.split() == ["frame", "0", "frame", "1", "frame", "2"]

@@ -22,13 +22,21 @@ from stickslip_testing.cameras import looking_at
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
 
-def _soup(count: int = 40) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Return triangles strewn over and beyond a small picture: projected points, triangles, texture coordinates."""
+def _soup(
+    count: int = 40,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """Return triangles strewn over and beyond a small picture: projected points, triangles, texture
+    coordinates.
+    """
     middle = RANDOM.uniform(-3.0, 19.0, (count, 1, 2))
     corners = middle + RANDOM.uniform(-5.0, 5.0, (count, 3, 2))
     depth = RANDOM.uniform(0.5, 3.0, (count, 3, 1))
     points = np.concatenate([corners, depth], axis=2).reshape(-1, 3)
-    return points, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), RANDOM.uniform(0.0, 1.0, (3 * count, 2))
+    return (
+        points,
+        np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
+        RANDOM.uniform(0.0, 1.0, (3 * count, 2)),
+    )
 
 
 def _places(window: Window, grid: int) -> npt.NDArray[np.float64]:
@@ -61,14 +69,18 @@ def test_what_is_seen_is_what_a_plain_rasteriser_sees(grid: int) -> None:
     seen = see(points, triangles, window, grid)
     expected = _plain(points, triangles, window, grid)
     assert (expected >= 0).mean() > 0.3
-    assert (seen.triangle != expected).mean() < 1e-3  # of samples that lie on an edge, rounding decides
+    assert (
+        seen.triangle != expected
+    ).mean() < 1e-3  # of samples that lie on an edge, rounding decides
 
 
 def _srgb_to_linear(c: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
-def _looked_up(picture: npt.NDArray[np.uint8], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _looked_up(
+    picture: npt.NDArray[np.uint8], uv: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
     """Interpolate between texel centres in sRGB, clamped, and decode."""
     size = len(picture)
     place = np.clip(uv * size - 0.5, 0.0, size - 1.0)
@@ -124,13 +136,22 @@ def test_coverage_of_a_triangle_is_its_area() -> None:
 
 def test_decoding_is_within_its_bound() -> None:
     encoded = np.linspace(0.0, 1.0, 4001)
-    error = np.array([_raster.decoded(float(value)) for value in encoded]) - _srgb_to_linear(encoded)
+    error = np.array([_raster.decoded(float(value)) for value in encoded]) - _srgb_to_linear(
+        encoded
+    )
     assert np.abs(error).max() < 2.2e-5
 
 
 def test_values_at_centers_are_interpolated_in_perspective() -> None:
     camera = looking_at(
-        (0.0, 0.0, 0.0), azimuth=10.0, elevation=25.0, distance=2.0, name="a", width=64, height=48, focal=90.0
+        (0.0, 0.0, 0.0),
+        azimuth=10.0,
+        elevation=25.0,
+        distance=2.0,
+        name="a",
+        width=64,
+        height=48,
+        focal=90.0,
     )
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     points = projected(camera, corners)
@@ -140,8 +161,12 @@ def test_values_at_centers_are_interpolated_in_perspective() -> None:
     rows, columns = np.nonzero(seen.triangle >= 0)
     found = places[rows, columns]
     assert len(found) > 300
-    pixels, depth = camera.project(found[:, :3])  # the place on the square that a pixel sees projects onto the pixel
-    np.testing.assert_allclose(pixels, np.column_stack([columns + window.left, rows + window.top]), atol=1e-9)
+    pixels, depth = camera.project(
+        found[:, :3]
+    )  # the place on the square that a pixel sees projects onto the pixel
+    np.testing.assert_allclose(
+        pixels, np.column_stack([columns + window.left, rows + window.top]), atol=1e-9
+    )
     np.testing.assert_allclose(depth, found[:, 3], atol=1e-9)
 
 

@@ -23,6 +23,8 @@ def test_colors_are_bright_saturated_and_of_every_hue() -> None:
     assert np.histogram(hsv[:, 0], bins=6, range=(0, 1))[0].min() > 50
 
 
-@pytest.mark.parametrize(("encoded", "linear"), [(0.0, 0.0), (0.5, 0.21404), (0.04, 0.0030960), (1.0, 1.0)])
+@pytest.mark.parametrize(
+    ("encoded", "linear"), [(0.0, 0.0), (0.5, 0.21404), (0.04, 0.0030960), (1.0, 1.0)]
+)
 def test_to_linear_is_the_srgb_curve(encoded: float, linear: float) -> None:
     assert to_linear((encoded, encoded, encoded))[0] == pytest.approx(linear, abs=1e-5)

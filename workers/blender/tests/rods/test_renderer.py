@@ -28,9 +28,13 @@ def test_views_are_pictures(views: Views) -> None:
     assert views.dtype == np.uint8
 
 
-def test_a_repeat_has_the_same_bytes(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views) -> None:
+def test_a_repeat_has_the_same_bytes(
+    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views
+) -> None:
     renderer = RodRenderer(quality=Quality.draft)
-    renderer.render(curl * (1, -1, 1), rig[::-1], color=(0.1, 0.2, 0.9), radius=0.02)  # leaves no trace
+    renderer.render(
+        curl * (1, -1, 1), rig[::-1], color=(0.1, 0.2, 0.9), radius=0.02
+    )  # leaves no trace
     again = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(again, views)
 
@@ -47,21 +51,33 @@ print(hashlib.sha256(views.tobytes()).hexdigest())
 """
 
 
-def test_a_fresh_process_makes_the_same_bytes(curl: npt.NDArray[np.float64], views: Views, tmp_path: Path) -> None:
+def test_a_fresh_process_makes_the_same_bytes(
+    curl: npt.NDArray[np.float64], views: Views, tmp_path: Path
+) -> None:
     np.save(tmp_path / "curl.npy", curl)
     done = subprocess.run(
-        [sys.executable, "-c", _FRESH, str(tmp_path / "curl.npy")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _FRESH, str(tmp_path / "curl.npy")],
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert done.stdout.split() == [hashlib.sha256(views.tobytes()).hexdigest()]  # and Blender logs nothing there
+    assert done.stdout.split() == [
+        hashlib.sha256(views.tobytes()).hexdigest()
+    ]  # and Blender logs nothing there
 
 
 def test_the_ground_is_dark_even_and_what_blender_would_render(
-    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch, views: Views
+    curl: npt.NDArray[np.float64],
+    rig: tuple[Camera, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    views: Views,
 ) -> None:
     assert GROUND_LEVEL < 16
     assert np.median(views) == GROUND_LEVEL
     whole = Window(0, 0, 224, 224)
-    monkeypatch.setattr("stickslip_blender.scenes.rod_hang.window_about", lambda vertices, camera: whole)
+    monkeypatch.setattr(
+        "stickslip_blender.scenes.rod_hang.window_about", lambda vertices, camera: whole
+    )
     renderer = RodRenderer(quality=Quality.draft)
     full = renderer.render(curl, rig, color=ORANGE)
     assert np.array_equal(full, views)
@@ -70,7 +86,9 @@ def test_the_ground_is_dark_even_and_what_blender_would_render(
 def test_the_silhouette_is_the_projected_rod(
     curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views
 ) -> None:
-    fine = np.stack([np.interp(np.linspace(0, 149, 600), np.arange(150), curl[:, i]) for i in range(3)], axis=1)
+    fine = np.stack(
+        [np.interp(np.linspace(0, 149, 600), np.arange(150), curl[:, i]) for i in range(3)], axis=1
+    )
     for camera, view in zip(rig, views, strict=True):
         pixels, depth = camera.project(fine)
         left, right = int(pixels[:, 0].min()) - 4, int(pixels[:, 0].max()) + 5
@@ -96,21 +114,29 @@ def test_the_rod_has_its_color_and_is_not_burnt_out(views: Views) -> None:
         assert view.max() > 150  # lit in every view
 
 
-def test_a_thicker_rod_covers_more(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views) -> None:
+def test_a_thicker_rod_covers_more(
+    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...], views: Views
+) -> None:
     renderer = RodRenderer(quality=Quality.draft)
     thick = renderer.render(curl, rig, color=ORANGE, radius=2 * RADIUS)
     assert 1.5 < (thick > GROUND_LEVEL + 2).sum() / (views > GROUND_LEVEL + 2).sum() < 2.1
 
 
-def test_a_rod_that_no_camera_sees_leaves_the_ground(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
+def test_a_rod_that_no_camera_sees_leaves_the_ground(
+    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]
+) -> None:
     renderer = RodRenderer(quality=Quality.draft)
     nothing = renderer.render(curl + np.array([0.0, 0.0, 1.5]), rig[:1], color=ORANGE)
     assert (nothing == GROUND_LEVEL).all()
 
 
-def test_what_is_not_a_rod_is_refused(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
+def test_what_is_not_a_rod_is_refused(
+    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]
+) -> None:
     renderer = RodRenderer(quality=Quality.draft)
-    with pytest.raises(ValueError, match=r"centerline must be finite, of shape \(150, 3\); got shape \(149, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"centerline must be finite, of shape \(150, 3\); got shape \(149, 3\)"
+    ):
         renderer.render(curl[1:], rig, color=ORANGE)
     with pytest.raises(ValueError, match="centerline must be finite"):
         renderer.render(curl * np.nan, rig, color=ORANGE)
@@ -118,7 +144,9 @@ def test_what_is_not_a_rod_is_refused(curl: npt.NDArray[np.float64], rig: tuple[
         renderer.render(curl, rig, color=ORANGE, radius=0.2)
 
 
-def test_a_second_renderer_ends_the_first(curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]) -> None:
+def test_a_second_renderer_ends_the_first(
+    curl: npt.NDArray[np.float64], rig: tuple[Camera, ...]
+) -> None:
     first, second = RodRenderer(quality=Quality.draft), RodRenderer(quality=Quality.draft)
     with pytest.raises(ReferenceError):
         first.render(curl, rig, color=ORANGE)
@@ -126,7 +154,10 @@ def test_a_second_renderer_ends_the_first(curl: npt.NDArray[np.float64], rig: tu
 
 
 def test_an_idle_renderer_takes_no_processor_time() -> None:
-    """Blender's idle worker threads would spin; a process that waits for its next task must leave the core alone."""
+    """Blender's idle worker threads would spin.
+
+    A process that waits for its next task must leave the core alone.
+    """
     script = """
 import time
 import numpy as np
@@ -139,5 +170,7 @@ before = time.process_time()
 time.sleep(1.0)
 print(time.process_time() - before)
 """
-    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    answer = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert float(answer[-1]) < 0.05

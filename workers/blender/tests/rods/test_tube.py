@@ -4,7 +4,13 @@ from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_blender.scenes.rod_hang import CAP_RINGS, SIDES, transport_frames, tube_faces, tube_vertices
+from stickslip_blender.scenes.rod_hang import (
+    CAP_RINGS,
+    SIDES,
+    transport_frames,
+    tube_faces,
+    tube_vertices,
+)
 
 
 def test_every_vertex_of_a_ring_lies_a_radius_from_its_point(curl: npt.NDArray[np.float64]) -> None:
@@ -21,9 +27,14 @@ def test_frames_are_orthonormal_and_do_not_twist(curl: npt.NDArray[np.float64]) 
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     normals = transport_frames(tangents)
     frames = np.concatenate([tangents[:, None], normals], axis=1)
-    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (150, 3, 3)), atol=1e-12)
-    # No twist: the change of one normal has no component along the other, up to third order in the step.
-    twist = np.einsum("ni,ni->n", normals[1:, 0] - normals[:-1, 0], 0.5 * (normals[1:, 1] + normals[:-1, 1]))
+    np.testing.assert_allclose(
+        frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (150, 3, 3)), atol=1e-12
+    )
+    # No twist: the change of one normal has no component along the other, up to third order in the
+    # step.
+    twist = np.einsum(
+        "ni,ni->n", normals[1:, 0] - normals[:-1, 0], 0.5 * (normals[1:, 1] + normals[:-1, 1])
+    )
     assert np.abs(twist).max() < 1e-10
 
 
@@ -33,7 +44,9 @@ def test_a_straight_rod_has_frames_too() -> None:
 
 def test_the_tube_is_closed_and_points_outwards(curl: npt.NDArray[np.float64]) -> None:
     vertices, faces = tube_vertices(curl, 0.008), tube_faces(150)
-    edges = Counter((face[i], face[(i + 1) % len(face)]) for face in faces for i in range(len(face)))
+    edges = Counter(
+        (face[i], face[(i + 1) % len(face)]) for face in faces for i in range(len(face))
+    )
     assert set(edges.values()) == {1}
     assert all((b, a) in edges for a, b in edges)
     triangles = [(face[0], face[i], face[i + 1]) for face in faces for i in range(1, len(face) - 1)]

@@ -1,1 +1,4 @@
-"""What the stages do, as functions from a task and a store to an output. No Ray and no coordinator here."""
+"""What the stages do, as functions from a task and a store to an output.
+
+No Ray and no coordinator here.
+"""

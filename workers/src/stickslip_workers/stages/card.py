@@ -1,4 +1,5 @@
-"""The dataset card, `README.md` of a dataset version, and its preview: some of its samples in one picture.
+"""The dataset card, `README.md` of a dataset version, and its preview: some of its samples in one
+picture.
 
 The card is for people who find only the directory.
 """
@@ -32,7 +33,11 @@ def card(manifest: Manifest) -> bytes:
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
     arrays = layout(spec)
     told = next((array for array in arrays if array.per_sample), arrays[0])
-    where = ", the most of them in its sections, `manifest/0.json` and so on" if manifest.sections else ""
+    where = (
+        ", the most of them in its sections, `manifest/0.json` and so on"
+        if manifest.sections
+        else ""
+    )
     sections = [
         f"# {spec.name or manifest.dataset}",
         f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
@@ -44,13 +49,22 @@ def card(manifest: Manifest) -> bytes:
         ),
         "## Parameters",
         f"The samples are the {_COMBINED[spec.combine]} of these axes.",
-        _table(("axis", "values", "unit and meaning"), [_axis_row(spec, *item) for item in spec.named_axes.items()]),
+        _table(
+            ("axis", "values", "unit and meaning"),
+            [_axis_row(spec, *item) for item in spec.named_axes.items()],
+        ),
         "## Splits",
-        _table(("split", "valid samples"), [(split, str(n)) for split, n in manifest.split_counts.items()]),
+        _table(
+            ("split", "valid samples"),
+            [(split, str(n)) for split, n in manifest.split_counts.items()],
+        ),
         "All renders of one simulation are in the same split.",
         "## Arrays",
         "The first dimension of every array is `sample`; its index is the slot of the sample.",
-        _table(("array", "shape of a sample", "type", "meaning"), [_array_row(array) for array in arrays]),
+        _table(
+            ("array", "shape of a sample", "type", "meaning"),
+            [_array_row(array) for array in arrays],
+        ),
         "## Rejected samples",
         _rejected(manifest),
         "## How it was made",
@@ -92,7 +106,12 @@ def _values(axis: AnyAxis) -> str:
 
 
 def _array_row(array: Any) -> tuple[str, str, str, str]:
-    shape = ", ".join(f"{name} {size}" for name, size in zip(array.dimensions, array.shape, strict=True)) or "one value"
+    shape = (
+        ", ".join(
+            f"{name} {size}" for name, size in zip(array.dimensions, array.shape, strict=True)
+        )
+        or "one value"
+    )
     codes = f"; codes: {', '.join(f'{code} {name}' for code, name in enumerate(array.categories))}"
     meaning = array.description + (codes if array.categories else "")
     return f"`{array.name}`", shape, array.dtype, meaning
@@ -102,7 +121,9 @@ def _rejected(manifest: Manifest) -> str:
     if not manifest.rejection_counts:
         return "None: every sample of the grid is valid."
     reasons = Counter(manifest.rejection_counts)
-    return _table(("reason", "samples"), [(reason, str(count)) for reason, count in reasons.most_common()])
+    return _table(
+        ("reason", "samples"), [(reason, str(count)) for reason, count in reasons.most_common()]
+    )
 
 
 def _certificate(manifest: Manifest) -> str:
@@ -131,18 +152,30 @@ def _pictures(manifest: Manifest) -> list[str]:
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [header, tuple("---" for _ in header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    lines = [
+        header,
+        tuple("---" for _ in header),
+        *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows),
+    ]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def pictured(spec: JobSpec) -> ArrayLayout | None:
     """Return the array that a dataset of `spec` is best seen by; None if it has no pictures."""
-    seen = (array for array in layout(spec) if array.per_sample and array.dimensions[-3:] == ("y", "x", "rgb"))
+    seen = (
+        array
+        for array in layout(spec)
+        if array.per_sample and array.dimensions[-3:] == ("y", "x", "rgb")
+    )
     return next(seen, None)
 
 
-def preview(spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Callable[[int], bytes]) -> bytes | None:
-    """Return a WebP of valid slots, evenly spread, with the values of their axes; None where none is valid.
+def preview(
+    spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Callable[[int], bytes]
+) -> bytes | None:
+    """Return a WebP of valid slots, evenly spread, with the values of their axes.
+
+    None where none is valid.
 
     `chunk` returns the encoded chunk of a slot. A clip moves; of several views, the first is shown.
     """
@@ -155,10 +188,16 @@ def preview(spec: JobSpec, array: ArrayLayout, valid: Sequence[int], chunk: Call
         pictures = np.empty(array.shape, dtype=np.uint8)
         decode_sample(array, chunk(slot), pictures)
         count = min(FRAMES, len(pictures)) if array.is_clip else 1
-        varied = {name: value for name, value in points[slot].items() if spec.named_axes[name].num > 1}
-        tiles.append(labelled(pictures[list(shown_frames(count, len(pictures)))], text_of(varied), _SIDE))
+        varied = {
+            name: value for name, value in points[slot].items() if spec.named_axes[name].num > 1
+        }
+        tiles.append(
+            labelled(pictures[list(shown_frames(count, len(pictures)))], text_of(varied), _SIDE)
+        )
     return moving(sheet(tiles, _COLUMNS), quality=50)
 
 
 def text_of(values: Mapping[str, object]) -> str:
-    return " ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in values.values())
+    return " ".join(
+        f"{value:.3g}" if isinstance(value, float) else str(value) for value in values.values()
+    )

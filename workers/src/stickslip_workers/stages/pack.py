@@ -1,4 +1,5 @@
-"""Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write them.
+"""Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write
+them.
 
 Labels are no files yet: the task that publishes writes those of many shard groups into one file.
 """
@@ -22,7 +23,9 @@ def pack(task: PackTask, store: Store) -> PackOutput:
         shard.fill(row, slot)
     files = []
     arrays = layout(task.spec)
-    labels = store.publish(encode_shard([shard.encode(array) for array in arrays if array.is_label]))
+    labels = store.publish(
+        encode_shard([shard.encode(array) for array in arrays if array.is_label])
+    )
     for array in arrays:
         if array.is_label:
             continue
@@ -51,12 +54,15 @@ class _Shard:
         self._records = Records(store)
         self._arrays = layout(task.spec)
         size = task.spec.samples_per_shard
-        # A sample that is not there has no chunk; in a column, it keeps the fill value, for a chunk is always whole.
+        # A sample that is not there has no chunk; in a column, it keeps the fill value, for a chunk
+        # is always whole.
         self._chunks: dict[str, list[bytes | None]] = {
             array.name: [None] * size for array in self._arrays if array.per_sample
         }
         self._columns: dict[str, Array] = {
-            array.name: np.full((len(task.slots) if array.is_label else size, *array.shape), array.fill, array.dtype)
+            array.name: np.full(
+                (len(task.slots) if array.is_label else size, *array.shape), array.fill, array.dtype
+            )
             for array in self._arrays
             if not array.per_sample
         }
@@ -78,9 +84,13 @@ class _Shard:
 
     def _check_labels(self, slot: PackSlot) -> None:
         """Raise a ValueError for a label without an array: it would be lost silently."""
-        columns = {array.name for array in self._arrays if not array.per_sample and not array.is_recorded}
+        columns = {
+            array.name for array in self._arrays if not array.per_sample and not array.is_recorded
+        }
         if unknown := set(slot.labels) - columns:
-            raise ValueError(f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}")
+            raise ValueError(
+                f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}"
+            )
 
     def encode(self, array: ArrayLayout) -> bytes:
         if array.per_sample:
@@ -90,7 +100,9 @@ class _Shard:
     def _rendered(self, array: ArrayLayout, slot: PackSlot) -> bytes:
         """Return an encoded chunk as the renderer wrote it."""
         if array.name not in slot.chunks:
-            raise ValueError(f"chunks of slot {slot.slot} must have {array.name!r}; got {sorted(slot.chunks)}")
+            raise ValueError(
+                f"chunks of slot {slot.slot} must have {array.name!r}; got {sorted(slot.chunks)}"
+            )
         where = slot.chunks[array.name]
         chunk = self._store.read(where.digest, offset=where.offset, length=where.length)
         check_chunk(chunk)
@@ -105,7 +117,11 @@ class _Shard:
 
     def _recorded(self, array: ArrayLayout, record: RecordRef) -> Array:
         values = self._records(record.digest)[array.name]
-        if values.shape[1:] != array.shape or values.dtype != array.dtype or record.row >= len(values):
+        if (
+            values.shape[1:] != array.shape
+            or values.dtype != array.dtype
+            or record.row >= len(values)
+        ):
             raise ValueError(
                 f"{array.name!r} of artifact {record.digest} must be {array.dtype} of shape (n, *{array.shape}) "
                 f"with n > {record.row}; got {values.dtype} of shape {values.shape}"
@@ -121,7 +137,10 @@ def _record(slot: PackSlot) -> RecordRef:
 
 
 def _label(array: ArrayLayout, slot: PackSlot) -> npt.ArrayLike:
-    """Return the value of a label. A rejected slot has its parameters too; what no stage could add is fill."""
+    """Return the value of a label.
+
+    A rejected slot has its parameters too; what no stage could add is fill.
+    """
     if array.name == "valid":
         return slot.valid
     if array.name == "split":
@@ -131,7 +150,9 @@ def _label(array: ArrayLayout, slot: PackSlot) -> npt.ArrayLike:
     labels = slot.labels if slot.rejection is None else {**slot.rejection.labels, **slot.labels}
     if array.name not in labels:
         if slot.valid:
-            raise ValueError(f"labels of slot {slot.slot} must have {array.name!r}; got {sorted(labels)}")
+            raise ValueError(
+                f"labels of slot {slot.slot} must have {array.name!r}; got {sorted(labels)}"
+            )
         return array.fill
     value: npt.ArrayLike = labels[array.name]
     return array.categories.index(str(value)) if array.categories else value

@@ -1,4 +1,7 @@
-"""Publish: metadata, which zarr-python makes, manifest and directory of a dataset version. The manifest is last."""
+"""Publish: metadata, which zarr-python makes, manifest and directory of a dataset version.
+
+The manifest is last.
+"""
 
 import os
 import warnings
@@ -44,7 +47,9 @@ from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, PREVIEW_NAME, card, pictured, preview
 
 
-def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: int) -> dict[str, bytes]:
+def metadata_files(
+    spec: JobSpec, *, dataset: str, version: int, sample_count: int
+) -> dict[str, bytes]:
     """Return the metadata files of a dataset by path: the group, consolidated, and every array."""
     import zarr
     from zarr.storage import MemoryStore
@@ -57,15 +62,20 @@ def metadata_files(spec: JobSpec, *, dataset: str, version: int, sample_count: i
         attributes=origin | {"kind": spec.kind, "spec_digest": spec.content_digest},
     )
     for array in layout(spec):
-        create_array(group, array, sample_count=sample_count, samples_per_file=spec.samples_per_file(array))
+        create_array(
+            group, array, sample_count=sample_count, samples_per_file=spec.samples_per_file(array)
+        )
     with warnings.catch_warnings():
-        # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs #383].
+        # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs
+        # #383].
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(group.store)
     return {path: buffer.to_bytes() for path, buffer in files.items()}  # type: ignore[attr-defined]
 
 
-def create_array(group: object, array: ArrayLayout, *, sample_count: int, samples_per_file: int) -> object:
+def create_array(
+    group: object, array: ArrayLayout, *, sample_count: int, samples_per_file: int
+) -> object:
     """Create `array` in a zarr group, empty, with the codecs that the packer writes."""
     from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
@@ -73,13 +83,17 @@ def create_array(group: object, array: ArrayLayout, *, sample_count: int, sample
     order = axes_order(array)
     compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
     if (packed := packing(array)) is not None:
-        compressor = BloscCodec(typesize=np.dtype(array.dtype).itemsize, blocksize=0, **packed._asdict())
+        compressor = BloscCodec(
+            typesize=np.dtype(array.dtype).itemsize, blocksize=0, **packed._asdict()
+        )
     return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
         array.name,
         shape=(sample_count, *array.shape),
         dtype=array.dtype,
         chunks=(1, *array.shape) if array.per_sample else group_shape,
-        shards=group_shape if array.per_sample else None,  # the index: crc32c, at the end, as zarr has it
+        shards=group_shape
+        if array.per_sample
+        else None,  # the index: crc32c, at the end, as zarr has it
         filters=() if order is None else (TransposeCodec(order=order),),
         serializer=BytesCodec(endian="little"),
         compressors=(compressor, Crc32cCodec()),
@@ -94,7 +108,9 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     given = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
     _check_complete(task, given, store)
     labels = _Labels(task, given, store)
-    metadata = metadata_files(task.spec, dataset=task.dataset, version=task.version, sample_count=labels.count)
+    metadata = metadata_files(
+        task.spec, dataset=task.dataset, version=task.version, sample_count=labels.count
+    )
     group = metadata.pop(GROUP_NAME)
     files = labels.files()
     for path, data in metadata.items():
@@ -115,10 +131,14 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         valid_count=labels.count - len(rejections),
         pictures=_pictures(task, labels),
         split_counts=_split_counts(labels, rejections),
-        rejection_counts=dict(sorted(Counter(str(rejection.reason) for rejection in rejections).items())),
+        rejection_counts=dict(
+            sorted(Counter(str(rejection.reason) for rejection in rejections).items())
+        ),
         sections=sections,
         rejections=() if sections else tuple(rejections),
-        sample_keys=() if sections else tuple(key for section in given for key in section.sample_keys),
+        sample_keys=()
+        if sections
+        else tuple(key for section in given for key in section.sample_keys),
         files=tuple(files),
     )
     text = card(manifest)
@@ -127,7 +147,9 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     own = files if sections else [*files, *listed]
     manifest = manifest.model_copy(update={"files": tuple(sorted(own, key=lambda file: file.path))})
     version = task.dataset, task.version
-    in_parallel(lambda file: store.show(file.sha256, *version, file.path), [*listed, *files, *sections])
+    in_parallel(
+        lambda file: store.show(file.sha256, *version, file.path), [*listed, *files, *sections]
+    )
     data = canonical_json(manifest.model_dump(mode="json")).encode()
     digest = store.publish(data)
     group = with_manifest_digest(group, digest)
@@ -136,26 +158,38 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     store.show(group_digest, *version, GROUP_NAME)
     store.show(store.publish(seal), *version, SEAL_NAME)
     store.show(digest, *version, MANIFEST_NAME)
-    size = sum(file.size for file in [*listed, *files, *sections]) + len(data) + len(group) + len(seal)
+    size = (
+        sum(file.size for file in [*listed, *files, *sections]) + len(data) + len(group) + len(seal)
+    )
     return PublishOutput(manifest=digest, group=group_digest, bytes=size)
 
 
 def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
     """Raise if the version lacks a file: a Zarr reader would silently return fill values."""
     if task.dataset != task.spec.dataset_id:
-        raise ValueError(f"dataset must be the id of its spec, {task.spec.dataset_id}; got {task.dataset!r}")
+        raise ValueError(
+            f"dataset must be the id of its spec, {task.spec.dataset_id}; got {task.dataset!r}"
+        )
     bounds = [0, *(section.end for section in given)]
     if bounds[:-1] != [section.first for section in given] or bounds[-1] != task.spec.sample_count:
-        raise ValueError(f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at {bounds}")
+        raise ValueError(
+            f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at {bounds}"
+        )
     size = task.spec.samples_per_shard
     arrays = [array for array in layout(task.spec) if not array.is_label]
     for section in given:
         shards = range(section.first // size, -(-section.end // size))
         expected = {array.shard_path(shard) for array in arrays for shard in shards}
         paths = {file.path for file in section.files}
-        if paths != expected or len(section.files) != len(paths) or len(section.labels) != len(shards):
+        if (
+            paths != expected
+            or len(section.files) != len(paths)
+            or len(section.labels) != len(shards)
+        ):
             odd = sorted(paths ^ expected) or ["one path twice, or labels"]
-            raise ValueError(f"files must be those of {len(shards)} shards; missing or unknown are {odd[:3]} and so on")
+            raise ValueError(
+                f"files must be those of {len(shards)} shards; missing or unknown are {odd[:3]} and so on"
+            )
         whole = in_parallel(lambda file: store.holds(file.sha256, size=file.size), section.files)
         for file, is_whole in zip(section.files, whole, strict=True):
             if not is_whole:
@@ -172,7 +206,9 @@ class _Labels:
         self._store = store
         self._spec = task.spec
         self.arrays = [array for array in layout(task.spec) if array.is_label]
-        self._columns = {array.name: np.empty((self.count, *array.shape), array.dtype) for array in self.arrays}
+        self._columns = {
+            array.name: np.empty((self.count, *array.shape), array.dtype) for array in self.arrays
+        }
         size = task.spec.samples_per_shard
         for section in given:
             for number, data in enumerate(in_parallel(store.read, section.labels)):
@@ -200,29 +236,41 @@ class _Labels:
         values = self._columns[array.name][number * size : (number + 1) * size]
         chunk[: len(values)] = values
         data = encode_chunk(chunk)
-        return FileEntry(path=array.shard_path(number), sha256=self._store.publish(data), size=len(data))
+        return FileEntry(
+            path=array.shard_path(number), sha256=self._store.publish(data), size=len(data)
+        )
 
 
-def _sections(task: PublishTask, given: Sequence[PublishSection], store: Store) -> tuple[FileEntry, ...]:
+def _sections(
+    task: PublishTask, given: Sequence[PublishSection], store: Store
+) -> tuple[FileEntry, ...]:
     """Write the sections of the manifest; none where all of it has room in one file."""
     if not has_sections(task.spec):
         return ()
     size = section_samples(task.spec)
 
     def write(section: PublishSection) -> FileEntry:
-        own = ManifestSection(**{name: getattr(section, name) for name in ManifestSection.model_fields})
+        own = ManifestSection(
+            **{name: getattr(section, name) for name in ManifestSection.model_fields}
+        )
         data = canonical_json(own.model_dump(mode="json")).encode()
-        return FileEntry(path=section_path(section.first // size), sha256=store.publish(data), size=len(data))
+        return FileEntry(
+            path=section_path(section.first // size), sha256=store.publish(data), size=len(data)
+        )
 
     return tuple(in_parallel(write, given))
 
 
 def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str, int]:
-    """Count the valid samples of each split from what the shards say, and check it against the rejections."""
+    """Count the valid samples of each split from what the shards say, and check it against the
+    rejections.
+    """
     valid = labels["valid"]
     rejected = sorted(rejection.slot for rejection in rejections)
     if np.flatnonzero(~valid).tolist() != rejected:
-        raise ValueError(f"rejections must be the slots that are not valid; got {rejected[:5]} and so on")
+        raise ValueError(
+            f"rejections must be the slots that are not valid; got {rejected[:5]} and so on"
+        )
     counts = np.bincount(labels["split"][valid], minlength=len(SPLITS))
     return {name: int(number) for name, number in zip(SPLITS, counts, strict=True)}
 
@@ -232,10 +280,16 @@ def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
     if pictured(task.spec) is None:
         return None
     share, psnr = None, {}
-    if any(array.name == "frame_share" for array in labels.arrays) and (valid := labels["valid"]).any():
+    if (
+        any(array.name == "frame_share" for array in labels.arrays)
+        and (valid := labels["valid"]).any()
+    ):
         share = round(float(labels["frame_share"][valid].mean()), 4)
         for number, region in enumerate(REGIONS):
-            values, deviations = labels[f"psnr_{region}"][valid], labels["psnr_deviation"][valid, number]
+            values, deviations = (
+                labels[f"psnr_{region}"][valid],
+                labels["psnr_deviation"][valid, number],
+            )
             if (known := np.isfinite(values)).any():
                 psnr[region] = Psnr(
                     clips=int(known.sum()),
@@ -247,11 +301,14 @@ def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
         quality=task.spec.quality,
         psnr=psnr,
         frame_share=share,
-        device=os.environ.get(RENDER_DEVICE) or CPU,  # all workers of this version's builds have the same
+        device=os.environ.get(RENDER_DEVICE)
+        or CPU,  # all workers of this version's builds have the same
     )
 
 
-def _preview(task: PublishTask, given: Sequence[PublishSection], labels: _Labels, store: Store) -> bytes | None:
+def _preview(
+    task: PublishTask, given: Sequence[PublishSection], labels: _Labels, store: Store
+) -> bytes | None:
     """Return the picture of the version; None where nothing is rendered, or valid."""
     array = pictured(task.spec)
     if array is None:
@@ -263,7 +320,9 @@ def _preview(task: PublishTask, given: Sequence[PublishSection], labels: _Labels
         (section,) = (section for section in given if section.first <= slot < section.end)
         (file,) = (file for file in section.files if file.path == path)
         tail = shard_index_size(size)
-        index = decode_shard_index(store.read(file.sha256, offset=file.size - tail, length=tail), size)
+        index = decode_shard_index(
+            store.read(file.sha256, offset=file.size - tail, length=tail), size
+        )
         offset, length = index[slot % size].tolist()
         return store.read(file.sha256, offset=offset, length=length)
 

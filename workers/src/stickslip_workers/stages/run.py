@@ -1,4 +1,7 @@
-"""Run tasks in this process, simulations first of all. Exceptions become results here, and time is measured here."""
+"""Run tasks in this process, simulations first of all.
+
+Exceptions become results here, and time is measured here.
+"""
 
 import io
 import time
@@ -30,7 +33,9 @@ if TYPE_CHECKING:
     from stickslip_sim_core.scenes.kind import Outcome
 
 frames: tuple[int, int] | None = None
-"""Frames done and frames in all of the simulation that runs in this process; None if none reports progress."""
+"""Frames done and frames in all of the simulation that runs in this process; None if none reports
+progress.
+"""
 MESSAGE_LENGTH = 2000
 """Limit of the message of a result [characters]; the log has all of it."""
 KEPT_BYTES = 256 * 2**20
@@ -40,14 +45,20 @@ Array = npt.NDArray[np.generic]
 
 
 def encode_records(arrays: Mapping[str, Array]) -> bytes:
-    """Return the file of `arrays`. The same arrays give the same bytes: numpy dates every member 1980-01-01."""
+    """Return the file of `arrays`.
+
+    The same arrays give the same bytes: numpy dates every member 1980-01-01.
+    """
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     return file.getvalue()
 
 
 class Records:
-    """Reads records; an artifact that several slots share is read and checked once, while it is among the last ones."""
+    """Reads records.
+
+    An artifact that several slots share is read and checked once, while it is among the last ones.
+    """
 
     def __init__(self, store: Store, *, kept_bytes: int = KEPT_BYTES) -> None:
         self._store = store
@@ -72,7 +83,9 @@ def _size(artifact: Mapping[str, Array]) -> int:
 
 
 class StageActor:
-    """Runs simulate, pack and publish in a process that holds it, with JSON on both sides, as the renderer does."""
+    """Runs simulate, pack and publish in a process that holds it, with JSON on both sides, as the
+    renderer does.
+    """
 
     def __init__(self, store: str) -> None:
         self._store = open_store(store)
@@ -82,18 +95,24 @@ class StageActor:
 
     def run(self, tasks: str) -> str:
         try:
-            return results_adapter.dump_json(run_tasks(tasks_adapter.validate_json(tasks), self._store)).decode()
+            return results_adapter.dump_json(
+                run_tasks(tasks_adapter.validate_json(tasks), self._store)
+            ).decode()
         finally:
             global frames
             frames = None
 
     def frames(self) -> tuple[int, int] | None:
-        """Return the progress of the running simulation, (frames done, frames total); another thread may call it."""
+        """Return the progress of the running simulation, (frames done, frames total).
+
+        Another thread may call it.
+        """
         return frames
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    """Return one result a task: `tasks` are simulations of one kind, or a single task of another stage.
+    """Return one result a task: `tasks` are simulations of one kind, or a single task of another
+    stage.
 
     The cost of simulations that were solved together is divided among them.
     """
@@ -110,7 +129,8 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
 
 
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
-    """Return the result of a failed task with the digests of its damaged inputs, so that they are recomputed at once.
+    """Return the result of a failed task with the digests of its damaged inputs, so that they are
+    recomputed at once.
 
     All inputs are read. While the store is unavailable, they cannot be checked.
     """
@@ -118,7 +138,9 @@ def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> Task
         return result
     digests = input_digests(task, store.read)
     are_whole = in_parallel(store.holds, digests)
-    damaged = tuple(digest for digest, is_whole in zip(digests, are_whole, strict=True) if not is_whole)
+    damaged = tuple(
+        digest for digest, is_whole in zip(digests, are_whole, strict=True) if not is_whole
+    )
     return result.model_copy(update={"damaged_inputs": damaged})
 
 
@@ -137,7 +159,10 @@ def _note(done: int, total: int) -> None:
 
 
 def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
-    """Simulate tasks of one kind together; return one result for each. Raise ValueError for several kinds."""
+    """Simulate tasks of one kind together.
+
+    Return one result for each. Raise ValueError for several kinds.
+    """
     names = sorted({task.simulation.kind for task in tasks})
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
@@ -148,13 +173,19 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     return [
         _rejection(physics, outcome)
         if outcome.reason
-        else TaskResult(outcome="succeeded", output=SimulateOutput(record=records[number], labels=dict(outcome.labels)))
+        else TaskResult(
+            outcome="succeeded",
+            output=SimulateOutput(record=records[number], labels=dict(outcome.labels)),
+        )
         for number, (physics, outcome) in enumerate(zip(simulations, outcomes, strict=True))
     ]
 
 
 def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
-    """Store the records of valid outcomes, at most `batch` of the same shapes in an artifact; return where they are."""
+    """Store the records of valid outcomes, at most `batch` of the same shapes in an artifact.
+
+    Return where they are.
+    """
     alike: dict[Any, list[int]] = {}
     for number, outcome in enumerate(outcomes):
         if not outcome.reason:
@@ -164,16 +195,25 @@ def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int
     for members in alike.values():
         for first in range(0, len(members), batch):
             some = members[first : first + batch]
-            arrays = {name: np.stack([outcomes[n].record[name] for n in some]) for name in outcomes[some[0]].record}
+            arrays = {
+                name: np.stack([outcomes[n].record[name] for n in some])
+                for name in outcomes[some[0]].record
+            }
             digest = store.publish(encode_records(arrays))
             found |= {number: RecordRef(digest=digest, row=row) for row, number in enumerate(some)}
     return found
 
 
 def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
-    shown = {name: f"{value:g}" if isinstance(value, float) else value for name, value in physics.items()}
-    numbers = ", ".join(f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str))
-    return TaskResult(outcome="rejected", reason=Reason(outcome.code), message=f"{outcome.reason} at {numbers}")
+    shown = {
+        name: f"{value:g}" if isinstance(value, float) else value for name, value in physics.items()
+    }
+    numbers = ", ".join(
+        f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str)
+    )
+    return TaskResult(
+        outcome="rejected", reason=Reason(outcome.code), message=f"{outcome.reason} at {numbers}"
+    )
 
 
 def failed(reason: Reason, message: str) -> TaskResult:

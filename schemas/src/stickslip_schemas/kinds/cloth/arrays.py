@@ -1,4 +1,6 @@
-"""Arrays of the datasets of cloth: those of all its kinds, and those of scenes, which follow from the document."""
+"""Arrays of the datasets of cloth: those of all its kinds, and those of scenes, which follow from
+the document.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -11,7 +13,9 @@ from stickslip_schemas.spec.arrays import CLIP_SIZE, REGIONS, ArrayLayout, array
 from stickslip_schemas.spec.names import Material
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
-"""Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at the end."""
+"""Levels of the solver's kernels, in the order of the codes of the label `kernel`: add new ones at
+the end.
+"""
 
 
 def scene_segments(sheets: Iterable[str], bodies: Iterable[str]) -> tuple[str, ...]:
@@ -25,11 +29,26 @@ def codes(name: str, names: tuple[str, ...]) -> ArrayLayout:
 
 
 def over_time(
-    spec: ClipSpec, name: str, text: str, dtype: str = "float32", of: Mapping[str, int] | None = None, **more: Any
+    spec: ClipSpec,
+    name: str,
+    text: str,
+    dtype: str = "float32",
+    of: Mapping[str, int] | None = None,
+    **more: Any,
 ) -> ArrayLayout:
-    """Return an array of the record that has a number, or an array of dimensions `of`, at each instant."""
+    """Return an array of the record that has a number, or an array of dimensions `of`, at each
+    instant.
+    """
     said = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
-    return array(name, text, dtype, {"instant": spec.instants, **(of or {})}, is_recorded=True, attributes=said, **more)
+    return array(
+        name,
+        text,
+        dtype,
+        {"instant": spec.instants, **(of or {})},
+        is_recorded=True,
+        attributes=said,
+        **more,
+    )
 
 
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
@@ -38,33 +57,69 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     light = "azimuth and elevation of the lamp [degree], its power over the nominal"
     floor = "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)"
     return (
-        array("video", "sRGB clip", "uint8", pixels | {"rgb": 3}, per_sample=True, is_clip=True, attributes=instants),
+        array(
+            "video",
+            "sRGB clip",
+            "uint8",
+            pixels | {"rgb": 3},
+            per_sample=True,
+            is_clip=True,
+            attributes=instants,
+        ),
         *_ground_truth_arrays(spec, pixels),
-        *(codes(axis, spec.names(axis)) for axis in ("texture", "viewpoint", "lighting", "substrate")),
+        *(
+            codes(axis, spec.names(axis))
+            for axis in ("texture", "viewpoint", "lighting", "substrate")
+        ),
         array("light_seed", "seed of the lamp, the floor and the noise", "int32"),
         array("light", light, "float32", {"light": 3}),
         array("floor", floor, "float32", {"floor": 8}),
         array("creases", "strength of the creases that the renderer added", "float32"),
         array("frame_share", "share of the frame that is cloth, mean of the clip", "float32"),
         array("visible_share", "share of the cloth in sight, mean of the clip", "float32"),
-        *(array(f"psnr_{name}", f"PSNR over {of} [dB], NaN: not measured", "float32") for name, of in REGIONS.items()),
-        array("psnr_deviation", "standard deviations of the three PSNR [dB]", "float32", {"region": len(REGIONS)}),
+        *(
+            array(f"psnr_{name}", f"PSNR over {of} [dB], NaN: not measured", "float32")
+            for name, of in REGIONS.items()
+        ),
+        array(
+            "psnr_deviation",
+            "standard deviations of the three PSNR [dB]",
+            "float32",
+            {"region": len(REGIONS)},
+        ),
     )
 
 
 def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayLayout, ...]:
-    """Return the arrays per pixel that the spec asks for. Textures share them, and each of their samples has them."""
+    """Return the arrays per pixel that the spec asks for.
+
+    Textures share them, and each of their samples has them.
+    """
     segments = {"categories": list(spec.segments)}
     normals = "normals towards the camera, in its axes (right, down, forward); 0 where nothing is"
     flow = "motion of the visible point until the next frame of the clip [px], 0 in the last"
     arrays = (
-        array("depth", "depth along the optical axis [m], infinite where nothing is", "float32", pixels),
+        array(
+            "depth",
+            "depth along the optical axis [m], infinite where nothing is",
+            "float32",
+            pixels,
+        ),
         array("segmentation", "code of the visible object", "uint8", pixels, attributes=segments),
         array("normals", normals, "float16", pixels | {"xyz": 3}),
-        array("uv", "place on the cloth, 0 to 1 along warp and weft, else NaN", "float16", pixels | {"uv": 2}),
+        array(
+            "uv",
+            "place on the cloth, 0 to 1 along warp and weft, else NaN",
+            "float16",
+            pixels | {"uv": 2},
+        ),
         array("flow", flow, "float16", pixels | {"xy": 2}),
     )
-    return tuple(replace(each, per_sample=True) for each in arrays if GroundTruth(each.name) in spec.ground_truth)
+    return tuple(
+        replace(each, per_sample=True)
+        for each in arrays
+        if GroundTruth(each.name) in spec.ground_truth
+    )
 
 
 def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
@@ -81,20 +136,40 @@ def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
 CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
     {
         "not_finite": ("coordinates that are not finite numbers", 0.0),
-        "jumps": ("distance of bodies and holders from even motion in a step, over the step error", 1.0),
+        "jumps": (
+            "distance of bodies and holders from even motion in a step, over the step error",
+            1.0,
+        ),
         "unconverged": ("steps above the tolerance over those that the preset allows", 1.0),
-        "budget": ("most iterations in a second of the scene over those that the preset allows", 1.0),
-        "missed": ("share of time in shortest steps that are further off than twice the step error", 0.5),
+        "budget": (
+            "most iterations in a second of the scene over those that the preset allows",
+            1.0,
+        ),
+        "missed": (
+            "share of time in shortest steps that are further off than twice the step error",
+            0.5,
+        ),
         "crossings": ("pairs of triangles that cross in a frame, where cloth touches itself", 0.0),
-        "contact_gain": ("work that bodies do on the motion against them, over the flow of energy", 1e-3),
-        "energy_gain": ("largest energy gained beyond the work of all forces, over the flow of energy", None),
+        "contact_gain": (
+            "work that bodies do on the motion against them, over the flow of energy",
+            1e-3,
+        ),
+        "energy_gain": (
+            "largest energy gained beyond the work of all forces, over the flow of energy",
+            None,
+        ),
         "stretch": ("largest principal stretch of a triangle", 1.25),
-        "penetration": ("largest depth in a body beyond the sagitta of flat triangles [cells]", 0.1),
+        "penetration": (
+            "largest depth in a body beyond the sagitta of flat triangles [cells]",
+            0.1,
+        ),
         "passages": ("triangles that passed the core of a body", 0.0),
         "sharpness": ("side of a cell over the radius of the sharpest body that bore cloth", 2.0),
     }
 )
-"""Checks of the solver by name: what is measured, at its worst, and the limit of valid samples; None: not judged."""
+"""Checks of the solver by name: what is measured, at its worst, and the limit of valid samples;
+None: not judged.
+"""
 
 
 def _check(name: str, text: str, limit: float | None) -> ArrayLayout:
@@ -108,7 +183,10 @@ def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),
         array("unconverged_steps", "steps that stopped short of the tolerance", "int32"),
-        array("worst_residual", "largest residual force of a node in any step, over the weight of a node"),
+        array(
+            "worst_residual",
+            "largest residual force of a node in any step, over the weight of a node",
+        ),
         *(_check(name, text, limit) for name, (text, limit) in CHECKS.items()),
         over_time(spec, "self_intersections", "pairs of triangles that cross", "int16"),
     )
@@ -120,22 +198,41 @@ STATES = ("open", "stick", "slip")
 
 def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
     """Return the arrays of a dataset of a scene, without those of clips and parameters."""
-    bias = array("bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2})
+    bias = array(
+        "bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2}
+    )
     rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
     labels: list[ArrayLayout] = []
     for name, sheet in scene.sheets.items():
         labels += fabric_arrays(f"{name}.")
         if sheet.start.type == "hung":
-            labels.append(array(f"{name}.tilt", "lean of gravity along the normal as it came to hang, over gravity"))
+            labels.append(
+                array(
+                    f"{name}.tilt",
+                    "lean of gravity along the normal as it came to hang, over gravity",
+                )
+            )
     return (
-        array("camera", "of the clip: fx, fy, cx, cy [px], rotation (rows), translation [m]", of={"camera": 16}),
+        array(
+            "camera",
+            "of the clip: fx, fy, cx, cy [px], rotation (rows), translation [m]",
+            of={"camera": 16},
+        ),
         *((bias,) if scene.bias else ()),
         *((rest,) if scene.end else ()),
-        array("least_distance", "of vertices and edges of cloth in contact, at the ends of all steps [m]"),
+        array(
+            "least_distance",
+            "of vertices and edges of cloth in contact, at the ends of all steps [m]",
+        ),
         *labels,
         *solver_arrays(spec),
         *_tracks(spec, scene),
-        *(each for name in scene.sheets for each in _mesh(spec, scene, name) if spec.store_positions),
+        *(
+            each
+            for name in scene.sheets
+            for each in _mesh(spec, scene, name)
+            if spec.store_positions
+        ),
     )
 
 
@@ -149,16 +246,31 @@ def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
 
 def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
     """Yield forces and poses, in the order of names that their attributes give."""
-    sheets, bodies, holders = list(scene.sheets), list(scene.bodies), [f"{a}.{b}" for a, b in scene.holders]
+    sheets, bodies, holders = (
+        list(scene.sheets),
+        list(scene.bodies),
+        [f"{a}.{b}" for a, b in scene.holders],
+    )
     on, pose = {"sheets": sheets, "others": [*bodies, *sheets]}, {"row": 3, "column": 4}
     by = {"sheet": len(sheets), "other": len(on["others"]), "xyz": 3}
-    yield over_time(spec, "contact_force", "force of bodies, then sheets, on each sheet [N]", of=by, attributes=on)
+    yield over_time(
+        spec,
+        "contact_force",
+        "force of bodies, then sheets, on each sheet [N]",
+        of=by,
+        attributes=on,
+    )
     if bodies:
         of, names = {"body": len(bodies), **pose}, {"names": bodies}
-        yield over_time(spec, "body_pose", "x -> A x + b from a body's axes [m]", of=of, attributes=names)
+        yield over_time(
+            spec, "body_pose", "x -> A x + b from a body's axes [m]", of=of, attributes=names
+        )
     if holders:
         held, said = {"holder": len(holders)}, {"attributes": {"names": holders}}
-        force, placed = "force of each holder on its sheet [N]", "x -> A x + b from a holder's axes [m]"
+        force, placed = (
+            "force of each holder on its sheet [N]",
+            "x -> A x + b from a holder's axes [m]",
+        )
         yield over_time(spec, "holder_force", force, "float32", {**held, "xyz": 3}, **said)
         yield over_time(spec, "holder_pose", placed, "float32", {**held, **pose}, **said)
         yield over_time(spec, "grasped", "1 while a holder holds", "uint8", held, **said)
@@ -169,8 +281,24 @@ def _mesh(spec: ClipSpec, scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
     vertex, corners = {f"{sheet}.vertex": vertices}, {f"{sheet}.triangle": triangles, "corner": 3}
     states, positions = {"categories": STATES}, dict[str, Any](per_sample=True, is_trajectory=True)
     return (
-        over_time(spec, f"{sheet}.positions", "positions of the vertices [m]", of={**vertex, "xyz": 3}, **positions),
-        over_time(spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes=states),
-        array(f"{sheet}.rest", "the flat sheet (warp, weft) [m]", "float32", {**vertex, "uv": 2}, is_recorded=True),
-        array(f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True),
+        over_time(
+            spec,
+            f"{sheet}.positions",
+            "positions of the vertices [m]",
+            of={**vertex, "xyz": 3},
+            **positions,
+        ),
+        over_time(
+            spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes=states
+        ),
+        array(
+            f"{sheet}.rest",
+            "the flat sheet (warp, weft) [m]",
+            "float32",
+            {**vertex, "uv": 2},
+            is_recorded=True,
+        ),
+        array(
+            f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True
+        ),
     )

@@ -1,4 +1,6 @@
-"""Specs and documents that the kinds of cloth have in common: names that users add to, presets, clips."""
+"""Specs and documents that the kinds of cloth have in common: names that users add to, presets,
+clips.
+"""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -29,13 +31,20 @@ VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoi
 TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
     SHORTHAND,
-    Field(description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"),
+    Field(
+        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
+    ),
 ]
 LampAxis = Annotated[
-    Annotated[ListAxis[Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]], SHORTHAND] | None,
+    Annotated[
+        ListAxis[Annotated[CustomName, quantity("Lighting"), name_schema(Lighting)]], SHORTHAND
+    ]
+    | None,
     Field(description="range of lamps, or a custom one under `lamps`; by default `drawn`"),
 ]
-SubstrateAxis = Annotated[ListAxis[Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]], SHORTHAND]
+SubstrateAxis = Annotated[
+    ListAxis[Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]], SHORTHAND
+]
 
 
 class Custom(NamedTuple):
@@ -69,25 +78,36 @@ class GroundTruth(StrEnum):
 
 
 SEGMENTS = ("background", "floor", "cloth", "prop")
-"""Names of the codes of the array `segmentation` of a scene with one cloth: add new ones at the end."""
+"""Names of the codes of the array `segmentation` of a scene with one cloth: add new ones at the
+end.
+"""
 
 
 class ClipRender(Render):
     """How cloth is seen: all that its clip depends on besides its trajectory and the build.
 
-    Everything but the texture decides on the shading; clips that differ only in their texture share it.
+    Everything but the texture decides on the shading; clips that differ only in their texture share
+    it.
     """
 
     texture: str
-    image: ArtifactRef | None = Field(default=None, description="picture of a custom texture; null: a built-in one")
+    image: ArtifactRef | None = Field(
+        default=None, description="picture of a custom texture; null: a built-in one"
+    )
     viewpoint: str
-    camera: Camera | None = Field(default=None, description="of a custom viewpoint; null: a camera of the rig")
+    camera: Camera | None = Field(
+        default=None, description="of a custom viewpoint; null: a camera of the rig"
+    )
     lighting: str = Lighting.drawn.value
     lamp: LampNumbers | None = Field(default=None, description="custom lighting; null: built-in")
     substrate: str = Substrate.matt.value
-    finish: FloorNumbers | None = Field(default=None, description="custom substrate; null: a built-in one")
+    finish: FloorNumbers | None = Field(
+        default=None, description="custom substrate; null: a built-in one"
+    )
     creases: float = 0.0
-    instants: tuple[int, ...] = Field(description="which instants of the trajectory the frames of the clip show")
+    instants: tuple[int, ...] = Field(
+        description="which instants of the trajectory the frames of the clip show"
+    )
     ground_truth: tuple[GroundTruth, ...] = ()
     measured: float = 0.0
     light_seed: Seed
@@ -100,12 +120,16 @@ class ClipRender(Render):
 
     @property
     def variant(self) -> str:
-        """The texture, which no shading depends on: a name that is built in, or a reference to a picture."""
+        """The texture, which no shading depends on: a name that is built in, or a reference to a
+        picture.
+        """
         return self.image or self.texture
 
 
 class ClipSpec(JobSpec):
-    """What the specs of all kinds of cloth have in common: clips of trajectories, and custom names on axes of names."""
+    """What the specs of all kinds of cloth have in common: clips of trajectories, and custom names
+    on axes of names.
+    """
 
     variant_axis = "texture"
     instants: ClassVar[int]
@@ -161,10 +185,15 @@ class ClipSpec(JobSpec):
         le=10,
         description="cost of measuring how good the clips of eight textures are, over that of rendering them; at "
         "least one frame of each clip is measured, and none at 0",
-        json_schema_extra={"x-cost": "at 0.5, 60 % of the CPU time of rendering 30 frames, and more of fewer frames"},
+        json_schema_extra={
+            "x-cost": "at 0.5, 60 % of the CPU time of rendering 30 frames, and more of fewer frames"
+        },
     )
     creases: Float = Field(
-        default=0.0, ge=0, le=1, description="strength of the fine creases that the renderer adds; 1 is 0.5 mm"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="strength of the fine creases that the renderer adds; 1 is 0.5 mm",
     )
 
     @property
@@ -172,12 +201,19 @@ class ClipSpec(JobSpec):
         return not self.allow_uncertified
 
     def render_settings(self) -> dict[str, Any] | None:
-        own = {name: getattr(self, name) for name in ("quality", "creases", "ground_truth", "measured")}
+        own = {
+            name: getattr(self, name) for name in ("quality", "creases", "ground_truth", "measured")
+        }
         return own | {"instants": self.shown_instants}
 
     def clip_costs(self, simulate: float, unsure: float) -> Costs:
-        """Return usual CPU times; measuring the clips of eight textures costs the share `measured` of their shading."""
-        shade = {"preview": 0.8, "draft": 1.15, "standard": 1.55, "high": 4.0}[self.quality] * self.frames
+        """Return usual CPU times.
+
+        Measuring the clips of eight textures costs the share `measured` of their shading.
+        """
+        shade = {"preview": 0.8, "draft": 1.15, "standard": 1.55, "high": 4.0}[
+            self.quality
+        ] * self.frames
         render = 0.01 * self.frames + self.measured * shade / 8
         return Costs(simulate, render, shade, start=2.0, unsure=unsure)
 
@@ -204,7 +240,9 @@ class ClipSpec(JobSpec):
             given = given.camera(value)
         return {
             axis: value,
-            self.custom[axis].field: given.model_dump(mode="json") if isinstance(given, Document) else given,
+            self.custom[axis].field: given.model_dump(mode="json")
+            if isinstance(given, Document)
+            else given,
         }
 
     def _defined(self, axis: str) -> dict[str, Any]:
@@ -216,16 +254,25 @@ class ClipSpec(JobSpec):
         return tuple(map(str, self.custom[axis].built_in))
 
     def meaning(self, axis: str, name: str) -> Any:
-        """Return what the user has defined a name of an axis to be; None where it needs no definition."""
+        """Return what the user has defined a name of an axis to be.
+
+        None where it needs no definition.
+        """
         return self._defined(axis).get(name)
 
     def names(self, axis: str) -> tuple[str, ...]:
-        """Return the names that an axis may use, the built-in ones first: they are the codes of the label."""
+        """Return the names that an axis may use, the built-in ones first: they are the codes of the
+        label.
+        """
         return (*self.built_in(axis), *self._defined(axis))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        return {f"/textures/{name}": digest for name, image in self.textures.items() if (digest := referred(image))}
+        return {
+            f"/textures/{name}": digest
+            for name, image in self.textures.items()
+            if (digest := referred(image))
+        }
 
     @model_validator(mode="after")
     def _known_names(self) -> Self:
@@ -233,7 +280,9 @@ class ClipSpec(JobSpec):
         for axis in self.custom:
             for name in self._defined(axis):
                 if name in self.built_in(axis):
-                    raise ValueError(f"{self.custom[axis].key} must not redefine what is built in, and {name!r} is")
+                    raise ValueError(
+                        f"{self.custom[axis].key} must not redefine what is built in, and {name!r} is"
+                    )
             known = self.names(axis)
             given = getattr(self.axes, axis)
             unknown += [
@@ -256,11 +305,15 @@ class ClipSpec(JobSpec):
     @model_validator(mode="after")
     def _named_once(self) -> Self:
         if len(set(self.ground_truth)) != len(self.ground_truth):
-            raise ValueError(f"ground_truth must name each array once; got {', '.join(self.ground_truth)}")
+            raise ValueError(
+                f"ground_truth must name each array once; got {', '.join(self.ground_truth)}"
+            )
         return self
 
     @model_validator(mode="after")
     def _frames_there_are(self) -> Self:
         if self.frames > self.instants:
-            raise ValueError(f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}")
+            raise ValueError(
+                f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}"
+            )
         return self

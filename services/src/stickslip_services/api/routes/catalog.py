@@ -1,4 +1,6 @@
-"""Datasets, their versions and their files; certificates; and uploads of textures and of files of scenes.
+"""Datasets, their versions and their files.
+
+Certificates; and uploads of textures and of files of scenes.
 
 `.../versions/N/files/` is the root of a Zarr store: any Zarr reader opens it at its URL.
 """
@@ -76,7 +78,9 @@ def get_version(dataset: str, version: Version, context: ContextDep) -> response
         return find_version(connection, dataset, version)
 
 
-@router.get("/v1/datasets/{dataset}/versions/{version}/manifest", **serves(json_content("Manifest"), 422))
+@router.get(
+    "/v1/datasets/{dataset}/versions/{version}/manifest", **serves(json_content("Manifest"), 422)
+)
 @router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
 def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
     """Return the manifest: every file of the version with its digest, the spec and the builds."""
@@ -84,10 +88,13 @@ def get_manifest(dataset: str, version: Version, request: Request, context: Cont
 
 
 @router.get(
-    "/v1/datasets/{dataset}/versions/{version}/files/{path:path}", **serves({"application/octet-stream": _BINARY}, 422)
+    "/v1/datasets/{dataset}/versions/{version}/files/{path:path}",
+    **serves({"application/octet-stream": _BINARY}, 422),
 )
 @router.head("/v1/datasets/{dataset}/versions/{version}/files/{path:path}", include_in_schema=False)
-def get_file(dataset: str, version: Version, path: str, request: Request, context: ContextDep) -> Response:
+def get_file(
+    dataset: str, version: Version, path: str, request: Request, context: ContextDep
+) -> Response:
     """Return a file of the version, or a range of it."""
     return _serve(request, context, dataset, version, path)
 
@@ -102,7 +109,9 @@ def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     return serve(request, context.store, digest, name=name)
 
 
-def _serve(request: Request, context: ContextDep, dataset: str, version: int, path: str) -> Response:
+def _serve(
+    request: Request, context: ContextDep, dataset: str, version: int, path: str
+) -> Response:
     with context.database.read() as connection:
         found = find_version(connection, dataset, version)
     if path == SIGNATURE_NAME:  # it may be made, and replaced, at any time
@@ -110,23 +119,32 @@ def _serve(request: Request, context: ContextDep, dataset: str, version: int, pa
             signature = context.store.read_shown(dataset, version, path)
         except FileNotFoundError:
             raise NotFoundError(f"version {version} is not signed") from None
-        return Response(signature, headers={"Cache-Control": "no-store"}, media_type="application/octet-stream")
+        return Response(
+            signature, headers={"Cache-Control": "no-store"}, media_type="application/octet-stream"
+        )
     file = find_file(context.store, found, path)
     return serve(request, context.store, file.sha256, name=path, size=file.size)
 
 
 @router.post("/v1/certificates", status_code=201, **reads("Certificate"))
 def post_certificate(
-    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))], context: ContextDep, response: Response
+    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))],
+    context: ContextDep,
+    response: Response,
 ) -> responses.CertificateEntry:
-    """Register a certificate; it may be sent twice. The newest full certificate of a preset and build counts."""
+    """Register a certificate; it may be sent twice.
+
+    The newest full certificate of a preset and build counts.
+    """
     entry = register_certificate(context.database, context.store, certificate, context.clock())
     response.headers["Location"] = entry.href
     return entry
 
 
 @router.get("/v1/certificates", responses=problem_responses(422))
-def get_certificates(page: PageDep, context: ContextDep) -> responses.Page[responses.CertificateEntry]:
+def get_certificates(
+    page: PageDep, context: ContextDep
+) -> responses.Page[responses.CertificateEntry]:
     """List certificates, newest first."""
     with context.database.read() as connection:
         return list_certificates(connection, page)
@@ -140,9 +158,16 @@ def get_certificate(digest: str, request: Request, context: ContextDep) -> Respo
     return serve(request, context.store, artifact, name="certificate.json")
 
 
-@router.post("/v1/textures", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_PICTURE_BODY)
+@router.post(
+    "/v1/textures",
+    status_code=201,
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra=_PICTURE_BODY,
+)
 async def post_texture(request: Request, context: ContextDep) -> responses.TextureEntry:
-    """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side. It may be sent twice.
+    """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side.
+
+    It may be sent twice.
 
     A picture that no job names is deleted by `stickslip gc` after a day.
     """
@@ -152,20 +177,31 @@ async def post_texture(request: Request, context: ContextDep) -> responses.Textu
         raise ProblemError(415, ProblemCode.malformed_body, detail)
     data = await whole_body(request)
     if not data.startswith(_PICTURES[media_type]):
-        raise _refused(f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}", data)
+        raise _refused(
+            f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}",
+            data,
+        )
     return await _stored(store_texture, context, data)
 
 
-@router.post("/v1/files", status_code=201, responses=problem_responses(*BODY_PROBLEMS), openapi_extra=_FILE_BODY)
+@router.post(
+    "/v1/files",
+    status_code=201,
+    responses=problem_responses(*BODY_PROBLEMS),
+    openapi_extra=_FILE_BODY,
+)
 async def post_file(request: Request, context: ContextDep) -> responses.FileUpload:
-    """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ), of at most 16 MiB.
+    """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ),
+    of at most 16 MiB.
 
     A file that no job names is deleted by `stickslip gc` after a day.
     """
     return await _stored(store_file, context, await whole_body(request))
 
 
-async def _stored(store: Callable[[Database, Store, bytes], T], context: ContextDep, data: bytes) -> T:
+async def _stored(
+    store: Callable[[Database, Store, bytes], T], context: ContextDep, data: bytes
+) -> T:
     try:
         return await run_in_threadpool(store, context.database, context.store, data)
     except (UnfitPictureError, UnfitFileError) as error:

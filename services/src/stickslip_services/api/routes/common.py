@@ -1,4 +1,5 @@
-"""Shared by routes: the context, pages of lists, strictly parsed request bodies, files, and their OpenAPI attributes.
+"""Shared by routes: the context, pages of lists, strictly parsed request bodies, files, and their
+OpenAPI attributes.
 
 Artifacts are immutable files with conditional and range requests [RFC 9110, 13 and 14; RFC 9530].
 """
@@ -35,7 +36,9 @@ ContextDep = Annotated[Context, Depends(_context)]
 
 
 def _page(
-    page_size: Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="the most items to return")] = 50,
+    page_size: Annotated[
+        int, Query(ge=1, le=MAX_PAGE_SIZE, description="the most items to return")
+    ] = 50,
     page_token: Annotated[
         str | None, Query(pattern=TOKEN_PATTERN, description="`next_page_token` of the page before")
     ] = None,
@@ -83,7 +86,10 @@ def json_content(name: str) -> dict[str, Any]:
 def reads(name: str, *problems: int, answers: Responses | None = None) -> dict[str, Any]:
     """Return the OpenAPI attributes of a route that reads the document `name`."""
     body = {"requestBody": {"required": True, "content": json_content(name)}}
-    return {"responses": (answers or {}) | problem_responses(*problems, *BODY_PROBLEMS), "openapi_extra": body}
+    return {
+        "responses": (answers or {}) | problem_responses(*problems, *BODY_PROBLEMS),
+        "openapi_extra": body,
+    }
 
 
 _FILE_HEADERS = {
@@ -101,10 +107,17 @@ def serves(content: dict[str, Any], *problems: int) -> dict[str, Any]:
     """Return the OpenAPI attributes of a route that serves an artifact."""
     responses: Responses = {
         200: {"description": "The file", "headers": _FILE_HEADERS, "content": content},
-        206: {"description": "The range that was asked for", "headers": _FILE_HEADERS, "content": content},
+        206: {
+            "description": "The range that was asked for",
+            "headers": _FILE_HEADERS,
+            "content": content,
+        },
         304: {"description": "The client has it already", "headers": _FILE_HEADERS},
     }
-    return {"response_class": Response, "responses": responses | problem_responses(404, 416, *problems)}
+    return {
+        "response_class": Response,
+        "responses": responses | problem_responses(404, 416, *problems),
+    }
 
 
 T = TypeVar("T")
@@ -116,7 +129,10 @@ class JsonBody(Generic[T]):
     """A dependency that reads a request's body as a document."""
 
     def __init__(self, of: Any, *, from_workers: bool = False) -> None:
-        """Read documents of a type: a model or a union of models. Those of workers are mostly written by pydantic."""
+        """Read documents of a type: a model or a union of models.
+
+        Those of workers are mostly written by pydantic.
+        """
         self._of = of
         self._from_workers = from_workers
         self._adapter: TypeAdapter[T] = TypeAdapter(of)
@@ -136,7 +152,9 @@ class JsonBody(Generic[T]):
         return await whole_body(request)
 
     def read(self, body: bytes) -> T:
-        """Return the document in a body, JSON [RFC 8259] in UTF-8 without duplicate keys; raise ProblemError."""
+        """Return the document in a body, JSON [RFC 8259] in UTF-8 without duplicate keys; raise
+        ProblemError.
+        """
         if self._from_workers:
             with suppress(ValidationError):
                 document = self._adapter.validate_json(body)
@@ -152,9 +170,13 @@ class JsonBody(Generic[T]):
 
         try:
             text = body.decode("utf-8")
-            values = json.loads(text, object_pairs_hook=_no_key_twice, parse_float=number, parse_constant=number)
+            values = json.loads(
+                text, object_pairs_hook=_no_key_twice, parse_float=number, parse_constant=number
+            )
             if "\\u" in text:
-                json.dumps(values, ensure_ascii=False).encode("utf-8")  # lone surrogates have no UTF-8 form
+                json.dumps(values, ensure_ascii=False).encode(
+                    "utf-8"
+                )  # lone surrogates have no UTF-8 form
             valid = self._adapter.validate_python(values)
             if strange:  # models refuse NaN with its place; this covers free-form parts
                 raise ValueError(f"{strange[0]} is no number")
@@ -163,10 +185,18 @@ class JsonBody(Generic[T]):
             fields = field_errors(error, values, self._of, at_most=SHOWN_ERRORS)
             count = error.error_count()
         except RecursionError as error:
-            raise ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply") from error
-        except ValueError as error:  # also bytes that are not UTF-8, and integers of more than 4300 digits
-            raise ProblemError(400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]) from error
-        detail = "; ".join(f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3])
+            raise ProblemError(
+                400, ProblemCode.malformed_body, "the document is nested too deeply"
+            ) from error
+        except (
+            ValueError
+        ) as error:  # also bytes that are not UTF-8, and integers of more than 4300 digits
+            raise ProblemError(
+                400, ProblemCode.malformed_body, f"the body is not JSON: {error}"[:500]
+            ) from error
+        detail = "; ".join(
+            f"{field.pointer or 'the document'}: {field.rule}" for field in fields[:3]
+        )
         more = f" (and {count - 3} more)" if count > 3 else ""
         raise ProblemError(422, ProblemCode.validation_failed, detail + more, fields=fields)
 
@@ -175,7 +205,9 @@ async def whole_body(request: Request) -> bytes:
     """Return the raw body; raise ProblemError where it is too large, or ends too soon."""
     limit, body = request.app.state.context.settings.body_limit, bytearray()
     detail = f"a body may have at most {limit} bytes"
-    too_large = ProblemError(413, ProblemCode.body_too_large, detail, headers={"Connection": "close"})
+    too_large = ProblemError(
+        413, ProblemCode.body_too_large, detail, headers={"Connection": "close"}
+    )
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and (len(declared) > 15 or int(declared) > limit):
         raise too_large
@@ -198,11 +230,19 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-_MEDIA_TYPES = {".json": "application/json", ".png": "image/png", ".webp": "image/webp", ".html": "text/html"}
+_MEDIA_TYPES = {
+    ".json": "application/json",
+    ".png": "image/png",
+    ".webp": "image/webp",
+    ".html": "text/html",
+}
 
 
 def picture_format(store: Store, digest: Sha256) -> str:
-    """Return the format of a picture, png or webp, from its first bytes; png for an unreadable file."""
+    """Return the format of a picture, png or webp, from its first bytes.
+
+    Png for an unreadable file.
+    """
     try:
         head = store.read(digest, length=12)
     except OSError:
@@ -210,7 +250,9 @@ def picture_format(store: Store, digest: Sha256) -> str:
     return "webp" if head[:4] == b"RIFF" and head[8:] == b"WEBP" else "png"
 
 
-def serve(request: Request, store: Store, digest: Sha256, *, name: str, size: int | None = None) -> Response:
+def serve(
+    request: Request, store: Store, digest: Sha256, *, name: str, size: int | None = None
+) -> Response:
     """Answer with an artifact, or with the requested range of it; `size` in bytes saves a look-up."""
     etag = f'"{digest}"'
     headers = {
@@ -241,7 +283,9 @@ def matches(header: str | None, etag: str) -> bool:
     """Return whether an entity tag is among those of `If-None-Match` [RFC 9110, 13.1.2]."""
     if header is None:
         return False
-    return header.strip() == "*" or etag in (item.strip().removeprefix("W/") for item in header.split(","))
+    return header.strip() == "*" or etag in (
+        item.strip().removeprefix("W/") for item in header.split(",")
+    )
 
 
 def _span(header: str, size: int, headers: dict[str, str]) -> tuple[int, int] | None:

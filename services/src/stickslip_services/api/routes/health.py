@@ -1,11 +1,20 @@
-"""Health checks, and Prometheus metrics: the queue and the store, read at each scrape, and counters since the start."""
+"""Health checks, and Prometheus metrics: the queue and the store, read at each scrape, and counters
+since the start.
+"""
 
 from collections import Counter as Counts
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Histogram, Info, generate_latest
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    Info,
+    generate_latest,
+)
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select, text
@@ -32,18 +41,29 @@ class _QueueCollector(Collector):
         with self._context.database.read() as connection:
             alive = alive_workers(self._context, connection)
             tasks = connection.execute(select(task_counts)).all()
-            by_state = connection.execute(select(jobs.c.state, func.count()).group_by(jobs.c.state)).all()
+            by_state = connection.execute(
+                select(jobs.c.state, func.count()).group_by(jobs.c.state)
+            ).all()
             held = Counts(connection.scalars(select(tasks_.c.owner).where(IS_LEASED)).all())
-            count, size, bad, read_at = connection.execute(select(*sums).where(own.manifest.is_not(None))).one()
+            count, size, bad, read_at = connection.execute(
+                select(*sums).where(own.manifest.is_not(None))
+            ).one()
         age, room = self._context.clock() - read_at if count else 0.0, self._context.store.room()
         disk = () if room is None else (("free", room.free), ("used", room.used))
         return [
             _gauge("tasks", "Tasks by stage and state", tasks, "stage", "state"),
             _gauge("jobs", "Jobs by state", by_state, "state"),
-            _gauge("leases", "Tasks on lease by worker", [(one.name, held[one.id]) for one in alive], "worker"),
+            _gauge(
+                "leases",
+                "Tasks on lease by worker",
+                [(one.name, held[one.id]) for one in alive],
+                "worker",
+            ),
             _gauge("workers", "Workers with a recent message", [(len(alive),)]),
             _gauge(
-                "worker_slots", "Slots of workers with a recent message", [(sum(w.condition.slots for w in alive),)]
+                "worker_slots",
+                "Slots of workers with a recent message",
+                [(sum(w.condition.slots for w in alive),)],
             ),
             _gauge("dataset_versions", "Dataset versions", [(count,)]),
             _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),

@@ -4,11 +4,26 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from stickslip_schemas.base import JobState, TaskState
-from stickslip_schemas.documents.responses import Job, JobDetail, JobPatch, Page, Preview, SampleState, Validation
+from stickslip_schemas.documents.responses import (
+    Job,
+    JobDetail,
+    JobPatch,
+    Page,
+    Preview,
+    SampleState,
+    Validation,
+)
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.api.routes.common import ContextDep, JsonBody, PageDep, Responses, problem_responses, reads
+from stickslip_services.api.routes.common import (
+    ContextDep,
+    JsonBody,
+    PageDep,
+    Responses,
+    problem_responses,
+    reads,
+)
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
 from stickslip_services.queue import control
@@ -20,7 +35,10 @@ router = APIRouter()
 SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
-_CHANGED: Responses = {202: {"description": "The job after the change"}, **problem_responses(404, 409)}
+_CHANGED: Responses = {
+    202: {"description": "The job after the change"},
+    **problem_responses(404, 409),
+}
 _REPLAYED: dict[str, Any] = {
     "description": "The answer that this Idempotency-Key got the first time",
     "model": JobDetail,
@@ -35,7 +53,10 @@ _REPLAYED: dict[str, Any] = {
     **reads(
         "JobSpec",
         *(409, 429),
-        answers={200: _REPLAYED, 202: {"description": "The job is in the queue", "headers": _LOCATION}},
+        answers={
+            200: _REPLAYED,
+            202: {"description": "The job is in the queue", "headers": _LOCATION},
+        },
     ),
 )
 def post_job(
@@ -50,7 +71,8 @@ def post_job(
         ),
     ] = None,
     priority: Annotated[
-        int, Query(ge=-100, le=100, description="tasks of the job with the highest number come first")
+        int,
+        Query(ge=-100, le=100, description="tasks of the job with the highest number come first"),
     ] = 0,
 ) -> Response:
     """Submit a job. Existing results are reused, and failed tasks are tried again.
@@ -59,8 +81,12 @@ def post_job(
     """
     job = submit_job(context, spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
-        return Response(job.response, 200, {"Location": f"/v1/jobs/{job.job_id}"}, "application/json")
-    return Response(job.model_dump_json(), 202, {"Location": f"/v1/jobs/{job.id}"}, "application/json")
+        return Response(
+            job.response, 200, {"Location": f"/v1/jobs/{job.job_id}"}, "application/json"
+        )
+    return Response(
+        job.model_dump_json(), 202, {"Location": f"/v1/jobs/{job.id}"}, "application/json"
+    )
 
 
 @router.post("/v1/jobs:validate", **reads("JobSpec"))
@@ -73,7 +99,9 @@ def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
 def get_jobs(
     page: PageDep,
     context: ContextDep,
-    search: Annotated[str, Query(max_length=100, description="part of the name, kind, id or dataset")] = "",
+    search: Annotated[
+        str, Query(max_length=100, description="part of the name, kind, id or dataset")
+    ] = "",
     state: Annotated[JobState | None, Query(description="only jobs in this state")] = None,
     project: Annotated[str, Query(max_length=100, description="only jobs of this project")] = "",
 ) -> Page[Job]:
@@ -90,7 +118,9 @@ def get_job(job_id: str, context: ContextDep) -> JobDetail:
 
 
 @router.patch("/v1/jobs/{job_id}", **reads("JobPatch", answers=_CHANGED))
-def patch_job(job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep) -> JobDetail:
+def patch_job(
+    job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep
+) -> JobDetail:
     """Set the priority of a job, from its next task on. 409: it has ended."""
     return control.prioritise_job(context, job_id, patch.priority)
 
@@ -119,7 +149,8 @@ def get_samples(
     page: PageDep,
     context: ContextDep,
     state: Annotated[
-        TaskState | None, Query(description="only samples in this state; `rejected` lists the rejects")
+        TaskState | None,
+        Query(description="only samples in this state; `rejected` lists the rejects"),
     ] = None,
 ) -> Page[SampleState]:
     """List the samples of a job by slot; empty until the job is planned."""
@@ -154,7 +185,8 @@ def get_events(
     request: Request,
     context: ContextDep,
     last_event_id: Annotated[
-        str | None, Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have")
+        str | None,
+        Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have"),
     ] = None,
 ) -> Response:
     """Stream the events of a job."""

@@ -1,4 +1,7 @@
-"""The worker API: dispatchers register, lease tasks, send heartbeats, and report results. Tasks can be read, too."""
+"""The worker API: dispatchers register, lease tasks, send heartbeats, and report results.
+
+Tasks can be read, too.
+"""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -11,7 +14,13 @@ from pydantic import BaseModel
 from stickslip_schemas.documents import worker_api
 from stickslip_schemas.documents.responses import WorkerEntry
 
-from stickslip_services.api.routes.common import ContextDep, JsonBody, json_content, problem_responses, reads
+from stickslip_services.api.routes.common import (
+    ContextDep,
+    JsonBody,
+    json_content,
+    problem_responses,
+    reads,
+)
 from stickslip_services.api.routes.health import Metrics
 from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
@@ -24,17 +33,24 @@ T = TypeVar("T")
 U = TypeVar("U")
 
 MOST_ON_LOOP = 64 * 2**10
-"""Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread."""
+"""Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread.
+"""
 MOST_TOGETHER = 64
 """Heartbeats that are answered with one statement: about 5 ms."""
 
-_LEASE_REQUEST: JsonBody[worker_api.LeaseRequest] = JsonBody(worker_api.LeaseRequest, from_workers=True)
+_LEASE_REQUEST: JsonBody[worker_api.LeaseRequest] = JsonBody(
+    worker_api.LeaseRequest, from_workers=True
+)
 _HEARTBEAT: JsonBody[worker_api.Heartbeat] = JsonBody(worker_api.Heartbeat, from_workers=True)
-_REPORT_BATCH: JsonBody[worker_api.ReportBatch] = JsonBody(worker_api.ReportBatch, from_workers=True)
+_REPORT_BATCH: JsonBody[worker_api.ReportBatch] = JsonBody(
+    worker_api.ReportBatch, from_workers=True
+)
 
 
 class _Plain(APIRoute):
-    """A route for which FastAPI resolves nothing if its function is asynchronous: that takes the request itself."""
+    """A route for which FastAPI resolves nothing if its function is asynchronous: that takes the
+    request itself.
+    """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         return self.endpoint if iscoroutinefunction(self.endpoint) else super().get_route_handler()
@@ -52,20 +68,28 @@ def get_workers(context: ContextDep) -> list[WorkerEntry]:
 
 @router.post("/v1/workers", status_code=201, **reads("WorkerRegistration"))
 def post_worker(
-    registration: Annotated[worker_api.WorkerRegistration, Depends(JsonBody(worker_api.WorkerRegistration))],
+    registration: Annotated[
+        worker_api.WorkerRegistration, Depends(JsonBody(worker_api.WorkerRegistration))
+    ],
     context: ContextDep,
 ) -> worker_api.WorkerSession:
     """Register a worker. An earlier session of the name loses its leases at once."""
     return register_worker(context, registration)
 
 
-@router.post("/v1/worker/lease", response_model=worker_api.LeaseBatch, **reads("LeaseRequest", 404, 409))
+@router.post(
+    "/v1/worker/lease", response_model=worker_api.LeaseBatch, **reads("LeaseRequest", 404, 409)
+)
 async def post_lease(request: Request) -> Response:
-    """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken over."""
+    """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken
+    over.
+    """
     return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
 
-@router.post("/v1/worker/heartbeat", response_model=worker_api.HeartbeatAnswer, **reads("Heartbeat", 404))
+@router.post(
+    "/v1/worker/heartbeat", response_model=worker_api.HeartbeatAnswer, **reads("Heartbeat", 404)
+)
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
     body = await _HEARTBEAT.received(request)
@@ -79,7 +103,9 @@ async def post_heartbeat(request: Request) -> Response:
 
 
 class Gathering(Generic[T, U]):
-    """Calls a function in a thread: once for all items that have come while its last call was running."""
+    """Calls a function in a thread: once for all items that have come while its last call was
+    running.
+    """
 
     def __init__(self, call: Callable[[list[T]], list[U]]) -> None:
         self._call = call
@@ -109,9 +135,14 @@ class Gathering(Generic[T, U]):
         self._task = None
 
 
-@router.post("/v1/worker/report", response_model=worker_api.ReportAnswer, **reads("ReportBatch", 404))
+@router.post(
+    "/v1/worker/report", response_model=worker_api.ReportAnswer, **reads("ReportBatch", 404)
+)
 async def post_report(request: Request) -> Response:
-    """Report how leased tasks ended. Each report is judged by itself; the first result of a lease counts."""
+    """Report how leased tasks ended.
+
+    Each report is judged by itself; the first result of a lease counts.
+    """
     metrics: Metrics = request.app.state.metrics
 
     def report(context: Context, batch: worker_api.ReportBatch) -> worker_api.ReportAnswer:
@@ -125,7 +156,10 @@ async def post_report(request: Request) -> Response:
 @router.get(
     "/v1/tasks/{task_id}",
     response_class=Response,
-    responses={200: {"description": "The task", "content": json_content("Task")}, **problem_responses(404, 409)},
+    responses={
+        200: {"description": "The task", "content": json_content("Task")},
+        **problem_responses(404, 409),
+    },
 )
 def get_task(task_id: str, context: ContextDep) -> Response:
     """Return a task as a worker gets it. 409: one of its dependencies has not ended yet."""
@@ -134,10 +168,14 @@ def get_task(task_id: str, context: ContextDep) -> Response:
     return Response(task.model_dump_json(), media_type="application/json")
 
 
-async def _answer(request: Request, document: JsonBody[T], verb: Callable[[Context, T], BaseModel]) -> Response:
-    """Read a document, call a verb with it, and serialise the answer, all in one call of one thread.
+async def _answer(
+    request: Request, document: JsonBody[T], verb: Callable[[Context, T], BaseModel]
+) -> Response:
+    """Read a document, call a verb with it, and serialise the answer, all in one call of one
+    thread.
 
-    Workers ask many times a second. The answer, which may have megabytes, is not validated a second time.
+    Workers ask many times a second. The answer, which may have megabytes, is not validated a second
+    time.
     """
     context: Context = request.app.state.context
     body = await document.received(request)

@@ -1,7 +1,9 @@
-"""The triangles of a scene of cloth: the refined cloth, and props, which may be further sheets of cloth.
+"""The triangles of a scene of cloth: the refined cloth, and props, which may be further sheets of
+cloth.
 
-The scene in Blender and the rasteriser are built from the same triangles. Cycles sees all props grey, so that the light
-of the cloth stays a function of its albedo alone; the composer lays their colours on top, as it does with the floor's.
+The scene in Blender and the rasteriser are built from the same triangles. Cycles sees all props
+grey, so that the light of the cloth stays a function of its albedo alone; the composer lays their
+colours on top, as it does with the floor's.
 """
 
 from dataclasses import dataclass
@@ -21,7 +23,9 @@ BACKGROUND, GROUND, CLOTH, PROP = range(4)
 """Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.spec.SEGMENTS`."""
 
 FLOOR = -0.0005
-"""Height at which the floor is seen [m]: half a thickness below the middle surface of a cloth that lies on it."""
+"""Height at which the floor is seen [m]: half a thickness below the middle surface of a cloth that
+lies on it.
+"""
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
@@ -38,13 +42,16 @@ DARK = 0.15
 def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
     """Return the vertices (n, 3) [m] of a round body about its middle, and its convex faces.
 
-    A round body is a core, a box of half sizes (3,) [m] that may be 0, grown by a radius [m]: a ball's core is a point,
-    a capsule's a segment, a rounded box's a box. Its mesh is that of a ball, pulled apart between its eight octants.
+    A round body is a core, a box of half sizes (3,) [m] that may be 0, grown by a radius [m]: a
+    ball's core is a point, a capsule's a segment, a rounded box's a box. Its mesh is that of a
+    ball, pulled apart between its eight octants.
     """
     quarter = np.linspace(0.0, 0.5 * np.pi, ARC + 1)
     polar = np.concatenate([quarter, quarter + 0.5 * np.pi])
     azimuth = np.concatenate([quarter + side * 0.5 * np.pi for side in range(4)])
-    middle = np.repeat(0.25 * np.pi + 0.5 * np.pi * np.arange(4), ARC + 1)  # of the octant, to be pulled to
+    middle = np.repeat(
+        0.25 * np.pi + 0.5 * np.pi * np.arange(4), ARC + 1
+    )  # of the octant, to be pulled to
     p, a = np.meshgrid(polar, azimuth, indexing="ij")
     direction = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
     octant = np.empty_like(direction)
@@ -58,11 +65,17 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
             left, right = ring * around + place, ring * around + (place + 1) % around
             faces.append((left, left + around, right + around, right))
     corners = [side * (ARC + 1) for side in range(4)]
-    return vertices, [*faces, tuple(corners), tuple((rings - 1) * around + corner for corner in reversed(corners))]
+    return vertices, [
+        *faces,
+        tuple(corners),
+        tuple((rings - 1) * around + corner for corner in reversed(corners)),
+    ]
 
 
 def gores(color: Array, count: int) -> Array:
-    """Return a colour for each of the faces of a round body, (count, 3): gores are bright and dark by turns."""
+    """Return a colour for each of the faces of a round body, (count, 3): gores are bright and dark
+    by turns.
+    """
     around = 4 * (ARC + 1)
     place = np.arange(count) % around
     within = place % (ARC + 1) // GORE  # the face between two octants goes with the gore before it
@@ -70,9 +83,18 @@ def gores(color: Array, count: int) -> Array:
     return np.where(dark[:, None], DARK * color, color)
 
 
-def box(size: tuple[float, float, float], center: tuple[float, float, float]) -> tuple[Array, Faces]:
+def box(
+    size: tuple[float, float, float], center: tuple[float, float, float]
+) -> tuple[Array, Faces]:
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    faces: Faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces: Faces = [
+        (0, 1, 3, 2),
+        (4, 6, 7, 5),
+        (0, 4, 5, 1),
+        (2, 3, 7, 6),
+        (0, 2, 6, 4),
+        (1, 5, 7, 3),
+    ]
     return np.asarray(center) + 0.5 * np.asarray(size) * signs, faces
 
 
@@ -86,10 +108,12 @@ def square(normal: npt.ArrayLike, side: float) -> tuple[Array, Faces]:
 
 
 def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt.NDArray[np.int64]]:
-    """Cut quadrilaterals into tiles of at most a side [m]; return also the face that each tile is of.
+    """Cut quadrilaterals into tiles of at most a side [m].
 
-    Vertices in one place are joined, so that a skin has no seams. The rasteriser leaves out what reaches behind the
-    camera: a large face would vanish as a whole.
+    Return also the face that each tile is of.
+
+    Vertices in one place are joined, so that a skin has no seams. The rasteriser leaves out what
+    reaches behind the camera: a large face would vanish as a whole.
     """
     points = [vertices]
     pieces: Faces = []
@@ -103,7 +127,10 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
             pieces.append(face)
             owners.append(number)
             continue
-        u, v = (line[..., None] for line in np.mgrid[0 : across + 1, 0 : along + 1] / np.array([[[across]], [[along]]]))
+        u, v = (
+            line[..., None]
+            for line in np.mgrid[0 : across + 1, 0 : along + 1] / np.array([[[across]], [[along]]])
+        )
         points.append((((1 - u) * a + u * b) * (1 - v) + ((1 - u) * d + u * c) * v).reshape(-1, 3))
         row = along + 1
         corners = [count + i * row + j for i in range(across) for j in range(along)]
@@ -111,7 +138,9 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
         owners += [number] * len(corners)
         count += len(points[-1])
     given = np.concatenate(points)
-    _, first, joint = np.unique(np.round(given / _JOINT), axis=0, return_index=True, return_inverse=True)
+    _, first, joint = np.unique(
+        np.round(given / _JOINT), axis=0, return_index=True, return_inverse=True
+    )
     rings = [tuple(dict.fromkeys(joint.ravel()[list(piece)].tolist())) for piece in pieces]
     kept = [number for number, ring in enumerate(rings) if len(ring) > 2]
     return given[first], [rings[number] for number in kept], np.array(owners)[kept]
@@ -152,7 +181,10 @@ class Prop:
 
     @property
     def tints(self) -> npt.NDArray[np.float32]:
-        """Colours over `grey` of each triangle (T, 3); 0 of a sheet, whose colour is in its picture."""
+        """Colours over `grey` of each triangle (T, 3).
+
+        0 of a sheet, whose colour is in its picture.
+        """
         corners = [len(face) - 2 for face in self.faces]
         if self.sheet is not None:
             return np.zeros((sum(corners), 3), dtype=np.float32)
@@ -173,7 +205,9 @@ class Surroundings(Protocol):
     """Code of the cloth in the segmentation."""
 
     def placed(self, instant: int, vertices: Array) -> list[Array]:
-        """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V, 3) [m]."""
+        """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V,
+        3) [m].
+        """
 
 
 @dataclass(frozen=True)
@@ -202,35 +236,54 @@ class Geometry:
     shaded: Indices
     """The vertices, shape (S,): those of props once for each smooth skin that meets there."""
     shaded_triangles: Indices
-    """The triangles by their places in `shaded`, shape (T, 3): only triangles of one skin share a corner."""
+    """The triangles by their places in `shaded`, shape (T, 3): only triangles of one skin share a
+    corner.
+    """
     tints: npt.NDArray[np.float32]
     """Of each triangle of the props, and a row of zeros at the end, shape (T' + 1, 3)."""
     printed: tuple[Printed, ...]
     """The sheets among the props."""
 
-    def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike, surroundings: Surroundings) -> None:
+    def __init__(
+        self, triangles: npt.ArrayLike, rest: npt.ArrayLike, surroundings: Surroundings
+    ) -> None:
         """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
         self.vertices = len(np.asarray(rest))
         self.surroundings = surroundings
         self.surface = surface(triangles, rest)
-        self.cloth_vertices, self.cloth_triangles = len(self.surface.uv), len(self.surface.triangles)
+        self.cloth_vertices, self.cloth_triangles = (
+            len(self.surface.uv),
+            len(self.surface.triangles),
+        )
         props = surroundings.props
         sizes = np.cumsum([self.cloth_vertices, *(len(prop.vertices) for prop in props)])
-        parts = [self.surface.triangles, *(fans(p.faces) + first for p, first in zip(props, sizes[:-1], strict=True))]
+        parts = [
+            self.surface.triangles,
+            *(fans(p.faces) + first for p, first in zip(props, sizes[:-1], strict=True)),
+        ]
         self.triangles = np.ascontiguousarray(np.concatenate(parts), dtype=np.int32)
         counts = [len(part) for part in parts]
         self.uv = np.concatenate(
-            [self.surface.uv, *(np.zeros((len(p.vertices), 2)) if p.sheet is None else p.sheet.uv for p in props)]
+            [
+                self.surface.uv,
+                *(np.zeros((len(p.vertices), 2)) if p.sheet is None else p.sheet.uv for p in props),
+            ]
         )
-        self.segments = np.repeat([surroundings.segment, *(p.segment for p in props)], counts).astype(np.uint8)
+        self.segments = np.repeat(
+            [surroundings.segment, *(p.segment for p in props)], counts
+        ).astype(np.uint8)
         self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
         skins: list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]] = [
             (np.arange(self.cloth_vertices), parts[0])
         ]
         skins += [skin(p.vertices, fans(p.faces)) for p in props]
         ends = np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
-        self.shaded = np.concatenate([v + first for (v, _), first in zip(skins, [0, *sizes[:-1]], strict=True)])
-        self.shaded_triangles = np.concatenate([t + first for (_, t), first in zip(skins, ends[:-1], strict=True)])
+        self.shaded = np.concatenate(
+            [v + first for (v, _), first in zip(skins, [0, *sizes[:-1]], strict=True)]
+        )
+        self.shaded_triangles = np.concatenate(
+            [t + first for (_, t), first in zip(skins, ends[:-1], strict=True)]
+        )
         self.tints = np.concatenate([*(p.tints for p in props), np.zeros((1, 3), dtype=np.float32)])
         ends = np.cumsum([0, *counts[1:]])
         self.printed = tuple(
@@ -240,17 +293,23 @@ class Geometry:
         )
 
     def points(self, positions: npt.ArrayLike, instant: int) -> Array:
-        """Return all vertices, shape (V, 3) [m], of the solver's positions (V', 3) [m] at an instant."""
+        """Return all vertices, shape (V, 3) [m], of the solver's positions (V', 3) [m] at an
+        instant.
+        """
         given = np.asarray(positions, dtype=np.float64)
         return np.concatenate([self.surface(given), *self.surroundings.placed(instant, given)])
 
     def parts(self, points: Array) -> list[Array]:
         """Split all vertices (V, 3) into those of the cloth and of each prop, (n, 3) each."""
-        ends = np.cumsum([0, self.cloth_vertices, *(len(prop.vertices) for prop in self.surroundings.props)])
+        ends = np.cumsum(
+            [0, self.cloth_vertices, *(len(prop.vertices) for prop in self.surroundings.props)]
+        )
         return [points[begin:end] for begin, end in pairwise(ends)]
 
     def checked(self, positions: npt.ArrayLike) -> Array:
-        """Return positions (frames, V', 3) [m], or raise a ValueError where they do not fit this cloth."""
+        """Return positions (frames, V', 3) [m], or raise a ValueError where they do not fit this
+        cloth.
+        """
         track = np.asarray(positions, dtype=np.float64)
         if track.ndim != 3 or track.shape[1:] != (self.vertices, 3) or not np.isfinite(track).all():
             raise ValueError(
@@ -260,9 +319,11 @@ class Geometry:
 
 
 def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
-    """Split the vertices (V, 3) of triangles (T, 3) where edges are sharper than `SHARP`, as Blender shades them.
+    """Split the vertices (V, 3) of triangles (T, 3) where edges are sharper than `SHARP`, as
+    Blender shades them.
 
-    Returns the vertices (S,), once for each smooth skin that meets there, and the triangles (T, 3) of those.
+    Returns the vertices (S,), once for each smooth skin that meets there, and the triangles (T, 3)
+    of those.
     """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -288,7 +349,11 @@ def mirrored(points: Array, floor: float) -> Array:
     return image
 
 
-HOLDER = (0.004, 0.01, 0.01)  # of the clip at a corner [m]: across the cloth, and in its plane as in the simulation
+HOLDER = (
+    0.004,
+    0.01,
+    0.01,
+)  # of the clip at a corner [m]: across the cloth, and in its plane as in the simulation
 ROD = (0.003, 0.003, 0.5)  # of what the clip hangs on [m]
 HOLDER_COLOR, HOLDER_ROUGHNESS = np.array([[0.05, 0.05, 0.05]]), 0.45
 
@@ -306,11 +371,25 @@ class Holders:
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
-        self._grips = np.pad(inward, ((0, 0), (1, 0)))  # from a corner to the middle of its holder (x, y, z) [m]
-        boxes = [box(HOLDER, (0.0, 0.0, 0.0)), box(ROD, (0.0, 0.0, ROD[2] / 2))]  # a clip and the rod it hangs on
+        self._grips = np.pad(
+            inward, ((0, 0), (1, 0))
+        )  # from a corner to the middle of its holder (x, y, z) [m]
+        boxes = [
+            box(HOLDER, (0.0, 0.0, 0.0)),
+            box(ROD, (0.0, 0.0, ROD[2] / 2)),
+        ]  # a clip and the rod it hangs on
         vertices = np.concatenate([corners for corners, _ in boxes])
-        faces = [tuple(8 * part + index for index in face) for part, (_, sides) in enumerate(boxes) for face in sides]
-        self.props = tuple(Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2))
+        faces = [
+            tuple(8 * part + index for index in face)
+            for part, (_, sides) in enumerate(boxes)
+            for face in sides
+        ]
+        self.props = tuple(
+            Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2)
+        )
 
     def placed(self, _instant: int, vertices: Array) -> list[Array]:
-        return [prop.vertices + at for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)]
+        return [
+            prop.vertices + at
+            for prop, at in zip(self.props, vertices[self._held] + self._grips, strict=True)
+        ]

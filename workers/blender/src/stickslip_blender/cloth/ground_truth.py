@@ -1,6 +1,7 @@
 """Ground truth of every pixel: depth, segmentation, normals, texture coordinates, optical flow.
 
-All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the floor.
+All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the
+floor.
 """
 
 from dataclasses import replace
@@ -17,7 +18,8 @@ from stickslip_blender.raster import Window, _raster, decoded, projected, see
 
 
 def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
-    """Return what a camera shows of a video (frames, height, width, 3) that its `pinhole` took, 8-bit sRGB.
+    """Return what a camera shows of a video (frames, height, width, 3) that its `pinhole` took,
+    8-bit sRGB.
 
     A pixel is interpolated between four, in linear light.
     """
@@ -38,21 +40,29 @@ def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
 
 @lru_cache(maxsize=4)  # every frame and every texture asks
 def traced(camera: Camera) -> tuple[Camera, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return a camera's pinhole, its rays (height, width, 3), and where in the pinhole's frame they land [px]."""
+    """Return a camera's pinhole, its rays (height, width, 3), and where in the pinhole's frame they
+    land [px].
+    """
     pinhole, rays = camera.pinhole(), camera.rays()
     return pinhole, rays, rays[..., :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
 def ground_truth(
-    geometry: Geometry, points: npt.NDArray[np.float64], following: npt.NDArray[np.float64], camera: Camera
+    geometry: Geometry,
+    points: npt.NDArray[np.float64],
+    following: npt.NDArray[np.float64],
+    camera: Camera,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the ground truth of an instant by name: all vertices (V, 3) [m] then, and at the next frame.
+    """Return the ground truth of an instant by name: all vertices (V, 3) [m] then, and at the next
+    frame.
 
     - `depth` (height, width): along the optical axis [m], infinite where there is nothing
     - `segmentation` (height, width): codes
-    - `normals` (height, width, 3): of length 1, towards the camera, in its axes (right, down, forward); 0 for nothing
+    - `normals` (height, width, 3): of length 1, towards the camera, in its axes (right, down,
+      forward); 0 for nothing
     - `uv` (height, width, 2): texture coordinates of the cloth, NaN elsewhere
-    - `flow` (height, width, 2): motion of the visible points until the next frame [px], columns and rows
+    - `flow` (height, width, 2): motion of the visible points until the next frame [px], columns and
+      rows
     """
     pinhole, rays, places = traced(camera)
     here = projected(pinhole, points)
@@ -84,7 +94,9 @@ def ground_truth(
     }
 
 
-def _floor_depth(camera: Camera, rays: npt.NDArray[np.float64], height: float | None) -> npt.NDArray[np.float64]:
+def _floor_depth(
+    camera: Camera, rays: npt.NDArray[np.float64], height: float | None
+) -> npt.NDArray[np.float64]:
     """Return the depth at which rays (height, width, 3) meet the floor."""
     down = (rays @ np.asarray(camera.rotation))[..., 2]
     with np.errstate(divide="ignore"):

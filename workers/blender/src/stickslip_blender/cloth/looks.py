@@ -1,4 +1,6 @@
-"""Looks of fabrics (shader, hem and grain of each material), of lamps and of floors, drawn from a seed."""
+"""Looks of fabrics (shader, hem and grain of each material), of lamps and of floors, drawn from a
+seed.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from stickslip_schemas.spec.names import FloorNumbers, LampNumbers
 
 Field = npt.NDArray[np.float64]
-Grain = Literal["plain", "twill", "check", "melange", "rib", "sparkle", "ribbon", "target", "waves", "pin-dots"]
+Grain = Literal[
+    "plain", "twill", "check", "melange", "rib", "sparkle", "ribbon", "target", "waves", "pin-dots"
+]
 
 WHITE = 0.85  # largest albedo: no fabric scatters more, and grain shows on a white print
 
@@ -46,11 +50,21 @@ class Look:
 
 
 def _table(name: str) -> dict[str, Any]:
-    return tomllib.loads(files("stickslip_blender.cloth").joinpath(name).read_text(encoding="utf-8"))
+    return tomllib.loads(
+        files("stickslip_blender.cloth").joinpath(name).read_text(encoding="utf-8")
+    )
 
 
 LOOKS = {material: Look(**numbers) for material, numbers in _table("fabrics.toml").items()}
-PLAIN = Look(roughness=0.85, specular=0.2, sheen=0.15, translucency=0.05, hem=0.6, grain="plain", contrast=0.1)
+PLAIN = Look(
+    roughness=0.85,
+    specular=0.2,
+    sheen=0.15,
+    translucency=0.05,
+    hem=0.6,
+    grain="plain",
+    contrast=0.1,
+)
 """Of a fabric that is not in fabrics.toml: a user's own."""
 
 
@@ -60,9 +74,11 @@ def look_of(material: str) -> Look:
 
 
 def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
-    """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its fabric and a hem.
+    """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its
+    fabric and a hem.
 
-    Row 0 is the lower edge of the sheet; the picture covers the longer side. White has at most the albedo WHITE.
+    Row 0 is the lower edge of the sheet; the picture covers the longer side. White has at most the
+    albedo WHITE.
     """
     wide, high = (1e3 * side for side in surface.size)
     across = (np.arange(len(picture)) + 0.5) / len(picture) * max(wide, high)
@@ -76,7 +92,9 @@ def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt
 
 
 def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
-    """Return 1 on the stitches of the hem, 4.5 mm from the edge and 3 mm long, at (u, v) [mm]; 0 elsewhere."""
+    """Return 1 on the stitches of the hem, 4.5 mm from the edge and 3 mm long, at (u, v) [mm]; 0
+    elsewhere.
+    """
     from_side, from_end = np.minimum(u, wide - u), np.minimum(v, high - v)
     seam = np.abs(np.minimum(from_side, from_end) - 4.5) < 0.45
     along = np.where(from_side < from_end, v, u)
@@ -84,26 +102,36 @@ def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
 
 
 def _noise(shape: tuple[int, ...], blur: tuple[int, int], seed: int) -> Field:
-    """Return smooth noise of unit deviation that wraps around; `blur` is its extent down and across [texels]."""
+    """Return smooth noise of unit deviation that wraps around.
+
+    `blur` is its extent down and across [texels].
+    """
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
     for axis, extent in enumerate(blur):
         noise = sum((np.roll(noise, shift, axis) for shift in range(extent)), np.zeros(shape))
     return np.asarray((noise - noise.mean()) / noise.std())
 
 
-# Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of 224 is 1.5 to 3 mm, so
-# threads are drawn too coarse: a period of 5 mm and more is seen, a finer one would be moire.
+# Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of
+# 224 is 1.5 to 3 mm, so threads are drawn too coarse: a period of 5 mm and more is seen, a finer
+# one would be moire.
 _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
     "plain": lambda u, v: 0.5 * _noise(u.shape, (6, 6), 1),
-    "twill": lambda u, v: 0.8 * np.sin(2.0 * np.pi * (u + v) / 9.0) + 0.2 * _noise(u.shape, (24, 6), 2),
+    "twill": lambda u, v: (
+        0.8 * np.sin(2.0 * np.pi * (u + v) / 9.0) + 0.2 * _noise(u.shape, (24, 6), 2)
+    ),
     "check": lambda u, v: np.where(np.minimum(np.mod(u, 12.5), np.mod(v, 12.5)) < 3.0, -1.0, 0.3),
     "melange": lambda u, v: 0.6 * _noise(u.shape, (8, 40), 3),
     "rib": lambda u, v: np.cos(2.0 * np.pi * u / 7.0),
     "sparkle": lambda u, v: np.where(_noise(u.shape, (6, 6), 4) > 2.0, 2.0, -0.35),
     "ribbon": lambda u, v: np.where(np.mod(v, 20.0) < 10.0, 0.7, -0.7),
-    "target": lambda u, v: np.cos(np.pi * np.hypot(np.mod(u, 50.0) - 25.0, np.mod(v, 50.0) - 25.0) / 5.0),
+    "target": lambda u, v: np.cos(
+        np.pi * np.hypot(np.mod(u, 50.0) - 25.0, np.mod(v, 50.0) - 25.0) / 5.0
+    ),
     "waves": lambda u, v: np.sin(2.0 * np.pi * (u + 4.0 * np.sin(2.0 * np.pi * v / 40.0)) / 20.0),
-    "pin-dots": lambda u, v: np.where(np.hypot(np.mod(u, 10.0) - 5.0, np.mod(v, 10.0) - 5.0) < 2.2, 0.95, -0.35),
+    "pin-dots": lambda u, v: np.where(
+        np.hypot(np.mod(u, 10.0) - 5.0, np.mod(v, 10.0) - 5.0) < 2.2, 0.95, -0.35
+    ),
 }
 
 
@@ -129,7 +157,10 @@ SOURCES = {
 
 @dataclass(frozen=True)
 class Light:
-    """The lamp of one clip. It stands still, so far away that the cloth is lit alike everywhere [thesis, 4.2.3]."""
+    """The lamp of one clip.
+
+    It stands still, so far away that the cloth is lit alike everywhere [thesis, 4.2.3].
+    """
 
     azimuth: float
     """Seen from the middle of the cloth's way, from +x towards +y [degree]."""
@@ -156,7 +187,15 @@ def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Ligh
 GRAIN_SIZE = 512  # side of the picture of a floor's grain [texels]
 GRAIN_EXTENT = 0.5  # what the picture covers; it repeats [m]
 _SUBSAMPLES = 3
-HARD = ("aluminium", "aluminium-pet", "ceramic", "rough-glass", "smooth-glass", "polyester-mirror", "stainless-steel")
+HARD = (
+    "aluminium",
+    "aluminium-pet",
+    "ceramic",
+    "rough-glass",
+    "smooth-glass",
+    "polyester-mirror",
+    "stainless-steel",
+)
 """The substrates of the thesis, 4.2.2."""
 
 
@@ -182,7 +221,10 @@ class Substrate:
 
     @property
     def mirrors(self) -> bool:
-        """Whether it mirrors shapes; a rough floor that is no metal shows only the mean colour of the cloth."""
+        """Whether it mirrors shapes.
+
+        A rough floor that is no metal shows only the mean colour of the cloth.
+        """
         return self.metallic > 0.5 or self.roughness < 0.25
 
     @property
@@ -206,19 +248,26 @@ def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) ->
     r, g, b = (color / color.mean()).tolist()
     drawn = {number: float(random.uniform(*ranges[number])) for number in ("albedo", "roughness")}
     fixed = {number: ranges[number] for number in ("metallic", "specular", "grain")}
-    return Substrate(name=finish, **drawn, **fixed, seed=int(random.integers(2**31)), tint=(r, g, b))
+    return Substrate(
+        name=finish, **drawn, **fixed, seed=int(random.integers(2**31)), tint=(r, g, b)
+    )
 
 
-def floor_factor(substrate: Substrate, camera: Camera, height: float | None) -> npt.NDArray[np.float32]:
-    """Return what the floor's marks and colour do to its light in each pixel, shape (height, width, 3).
+def floor_factor(
+    substrate: Substrate, camera: Camera, height: float | None
+) -> npt.NDArray[np.float32]:
+    """Return what the floor's marks and colour do to its light in each pixel, shape (height, width,
+    3).
 
-    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is at a height [m];
-    None: there is none, and the factor is 1.
+    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is
+    at a height [m]; None: there is none, and the factor is 1.
     """
     if height is None:
         return np.ones((camera.height, camera.width, 3), dtype=np.float32)
     step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
-    rows, columns = ((np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width))
+    rows, columns = (
+        (np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width)
+    )
     across, down = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
     ray = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.asarray(camera.rotation)
     reach = (height - camera.position[2]) / np.minimum(ray[..., 2:], -1e-3)
@@ -229,7 +278,9 @@ def floor_factor(substrate: Substrate, camera: Camera, height: float | None) -> 
     upper_row = marks[j, i] + right * (marks[j, k] - marks[j, i])
     lower_row = marks[m, i] + right * (marks[m, k] - marks[m, i])
     samples = upper_row + lower * (lower_row - upper_row)
-    factor = samples.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(axis=(1, 3))
+    factor = samples.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(
+        axis=(1, 3)
+    )
     return np.asarray(factor[..., None] * substrate.tint, dtype=np.float32)
 
 
@@ -241,7 +292,9 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
         over = (thread[:, None] + thread[None, :]) % 2
         marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
     else:
-        marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(random, 30.0)  # finer ones would be noise far away
+        marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(
+            random, 30.0
+        )  # finer ones would be noise far away
     return np.asarray(np.clip(1.0 + substrate.grain * marks, 0.2, 1.8))
 
 

@@ -1,19 +1,21 @@
 """How good a clip is: its squared error against direct renderings of its own, without their noise.
 
-At seeded instants, Cycles renders the cloth directly, with several seeds and no denoiser. At a pixel, let P be the
-clip's linear light, X and Y that of two renderings, and f the sRGB encoding in 8-bit levels. The noises of X and Y are
-independent, so that in
+At seeded instants, Cycles renders the cloth directly, with several seeds and no denoiser. At a
+pixel, let P be the clip's linear light, X and Y that of two renderings, and f the sRGB encoding in
+8-bit levels. The noises of X and Y are independent, so that in
 
     e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
-nothing of the noise of the references is left, however few samples they have; e is the mean over all pairs. Landed
-cloth in a penumbra has paths that rarely meet the lamp, and more renderings. Frames with cloth in the shade, where a
-level is little light, or lit by other cloth, are worst, and may be missed. So the sum of e over that of weights,
-1 / sqrt(L) + BOUNCED B^2 / L, times the mean of these over all frames, is the mean squared error; L: light on the
-cloth, B: what an albedo of 0.25 elsewhere adds to it. Blocks of pixels, and instants, tell the deviation.
+nothing of the noise of the references is left, however few samples they have; e is the mean over
+all pairs. Landed cloth in a penumbra has paths that rarely meet the lamp, and more renderings.
+Frames with cloth in the shade, where a level is little light, or lit by other cloth, are worst, and
+may be missed. So the sum of e over that of weights, 1 / sqrt(L) + BOUNCED B^2 / L, times the mean
+of these over all frames, is the mean squared error; L: light on the cloth, B: what an albedo of
+0.25 elsewhere adds to it. Blocks of pixels, and instants, tell the deviation.
 
-One rendering serves three textures: red, green and blue of its print are the green of the three. Trios are fixed: a
-clip gets the same numbers alone or with others. A user's picture is measured by itself.
+One rendering serves three textures: red, green and blue of its print are the green of the three.
+Trios are fixed: a clip gets the same numbers alone or with others. A user's picture is measured by
+itself.
 """
 
 from collections.abc import Sequence
@@ -30,9 +32,17 @@ from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
-PATHS = 2  # per pixel of a shading of a direct rendering, after as many: the first is through the middle of the pixel
-WHOLE, OF_LANDED = 3, 3  # direct renderings of all cloth, and of its landed part, usually half of it in area
-_FIXED, _SET_UP = 22, 1  # what else a frame of a shading costs, and a rendering [paths per pixel of its window]
+# per pixel of a shading of a direct rendering, after as many: the first is through the middle of
+# the pixel
+PATHS = 2
+WHOLE, OF_LANDED = (
+    3,
+    3,
+)  # direct renderings of all cloth, and of its landed part, usually half of it in area
+_FIXED, _SET_UP = (
+    22,
+    1,
+)  # what else a frame of a shading costs, and a rendering [paths per pixel of its window]
 _TRIO = 3  # textures that are measured together; eight make as many
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
@@ -42,14 +52,18 @@ _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a c
 _TRUST = 4  # instants that it counts for
 DARK = 0.003  # light on the cloth below which errors do not grow
 BOUNCED = 40.0  # fitted: the composition errs where much light comes from other cloth
-_BLOCK = 8  # side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
+# side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
+_BLOCK = 8
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """PSNR of a clip by region, in the order of `REGIONS`, and their deviations [dB]; NaN where none is in sight."""
+    """PSNR of a clip by region, in the order of `REGIONS`, and their deviations [dB].
+
+    NaN where none is in sight.
+    """
 
     psnr: tuple[float, ...]
     deviations: tuple[float, ...]
@@ -65,8 +79,12 @@ class Measured:
 
     @property
     def labels(self) -> dict[str, object]:
-        psnr, deviations = ([None if np.isnan(x) else x for x in values] for values in (self.psnr, self.deviations))
-        return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {"psnr_deviation": deviations}
+        psnr, deviations = (
+            [None if np.isnan(x) else x for x in values] for values in (self.psnr, self.deviations)
+        )
+        return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {
+            "psnr_deviation": deviations
+        }
 
 
 UNMEASURED = Measured((np.nan,) * 3, (np.nan,) * 3)
@@ -82,11 +100,15 @@ def trio(texture: str) -> tuple[str, ...]:
 
 
 def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
-    """Draw which frames are measured, each from one of as many equal parts of the clip, at least one.
+    """Draw which frames are measured, each from one of as many equal parts of the clip, at least
+    one.
 
-    To measure eight textures costs a share of their shading, which has so many paths in each part of a pixel.
+    To measure eight textures costs a share of their shading, which has so many paths in each part
+    of a pixel.
     """
-    cost = _TRIO * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP) / (FINE**2 * paths + _FIXED)
+    cost = (
+        _TRIO * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP) / (FINE**2 * paths + _FIXED)
+    )
     count = min(max(1, round(share * frames / cost)), frames)
     draws = np.random.Generator(np.random.PCG64(seed)).random(count)
     return [int((k + draw) / count * frames) for k, draw in enumerate(draws)]
@@ -99,8 +121,15 @@ def landed_top(geometry: Geometry) -> float:
 
 
 def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[np.bool_]:
-    """Return where the cloth is, where landed cloth is, and the band along its edge, (3, height, width)."""
-    seen = see(projected(camera, points), geometry.triangles, Window(0, 0, camera.width, camera.height), grid=1)
+    """Return where the cloth is, where landed cloth is, and the band along its edge, (3, height,
+    width).
+    """
+    seen = see(
+        projected(camera, points),
+        geometry.triangles,
+        Window(0, 0, camera.width, camera.height),
+        grid=1,
+    )
     cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
     low = seen.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
     return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
@@ -114,10 +143,14 @@ def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
 
 
 def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel: int) -> Floats:
-    """Return e: a picture's green against a channel of linear light (renderings, height, width, 3), NaN if not seen."""
+    """Return e: a picture's green against a channel of linear light (renderings, height, width, 3),
+    NaN if not seen.
+    """
     levels, others = picture[..., 1], references[..., channel]
     light = decoded(levels).astype(np.float64)
-    slope = 255.0 * np.where(light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0))
+    slope = 255.0 * np.where(
+        light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0)
+    )
     top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
     known = np.isfinite(others).sum(axis=0)
     off = np.nan_to_num(light - np.minimum(others, top))
@@ -125,17 +158,27 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
     return np.asarray(slope**2 * pairs / np.maximum(known * (known - 1), 1))
 
 
-def pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3) -> Measured:
-    """Return the PSNR from errors (height, width) of instants, and weights by region, (3, height, width), 0 outside.
+def pooled(
+    measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3
+) -> Measured:
+    """Return the PSNR from errors (height, width) of instants, and weights by region, (3, height,
+    width), 0 outside.
 
     `usual`: means of weights over the regions in all frames.
     """
-    found = [_pooled([(error, weights[k]) for error, weights in measured], usual[k]) for k in range(len(REGIONS))]
+    found = [
+        _pooled([(error, weights[k]) for error, weights in measured], usual[k])
+        for k in range(len(REGIONS))
+    ]
     return Measured(*zip(*found, strict=True))
 
 
-def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: float) -> tuple[float, float]:
-    sums = np.concatenate([_blocks(np.where(weights > 0, error, 0.0)) for error, weights in measured])
+def _pooled(
+    measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: float
+) -> tuple[float, float]:
+    sums = np.concatenate(
+        [_blocks(np.where(weights > 0, error, 0.0)) for error, weights in measured]
+    )
     sizes = np.concatenate([_blocks(weights.astype(np.float64)) for _, weights in measured])
     if sum(np.count_nonzero(weights) for _, weights in measured) < FEWEST:
         return np.nan, np.nan
@@ -143,8 +186,17 @@ def _pooled(measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: float) -
     spread = float(np.sqrt(((sums - mean * sizes) ** 2).sum())) / size
     bounded = max(mean, spread)  # chance can make the mean of products negative
     count = len(measured)
-    parts = np.array([np.sum(np.where(weights > 0, error - bounded * weights, 0.0)) for error, weights in measured])
-    between = (np.sum((parts * count / size / bounded) ** 2) + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
+    parts = np.array(
+        [
+            np.sum(np.where(weights > 0, error - bounded * weights, 0.0))
+            for error, weights in measured
+        ]
+    )
+    between = (
+        (np.sum((parts * count / size / bounded) ** 2) + _TRUST * _SPREAD**2)
+        / (count - 1 + _TRUST)
+        / count
+    )
     deviation = float(np.sqrt((spread / bounded) ** 2 + between))
     return float(10.0 * np.log10(255.0**2 / (bounded * usual))), 10.0 / np.log(10.0) * deviation
 

@@ -1,7 +1,7 @@
 """The Blender scene of every kind of cloth: a cloth over a floor, under one lamp, before black.
 
-The cloth is the solver's mesh, refined so that no facet shows. The lamp stands still. The module of a kind in
-`stickslip_blender.scenes` adds the props.
+The cloth is the solver's mesh, refined so that no facet shows. The lamp stands still. The module of
+a kind in `stickslip_blender.scenes` adds the props.
 """
 
 import numpy as np
@@ -29,26 +29,43 @@ from stickslip_blender.raster import Points, Window, projected, window_about
 
 _LAMP_DISTANCE = 7.2  # [m]
 _LAMP_POWER = 940.0  # [W]
-_FLOOR_RADIUS, _FLOOR_RIM = 8.0, 0.6  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
+_FLOOR_RADIUS, _FLOOR_RIM = (
+    8.0,
+    0.6,
+)  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED, _RAMP = 2, 4  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
+_DISCARDED, _RAMP = (
+    2,
+    4,
+)  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
 _MIRROR_PATHS = 2  # times as many paths for the frame then
 
 
 class ClothScene:
-    """A scene with one cloth, built once; vertices change between frames, camera, lamp and looks between clips."""
+    """A scene with one cloth, built once.
+
+    Vertices change between frames, camera, lamp and looks between clips.
+    """
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.composer = Composer(geometry)
-        self._scene = new_scene(max_bounces=3, diffuse_bounces=2, light_tree=False)  # one lamp: nothing to choose
+        self._scene = new_scene(
+            max_bounces=3, diffuse_bounces=2, light_tree=False
+        )  # one lamp: nothing to choose
         cycles = self._scene.cycles  # what else meets gloss is soft: set_roughness
-        cycles.caustics_reflective, cycles.blur_glossy, cycles.sample_clamp_indirect = True, 0.0, 0.0
+        cycles.caustics_reflective, cycles.blur_glossy, cycles.sample_clamp_indirect = (
+            True,
+            0.0,
+            0.0,
+        )
         self._lamp = Lamp(self._scene)
         self._floor = None
         if geometry.surroundings.floor is not None:
-            self._floor = add_material(add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor")
+            self._floor = add_material(
+                add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor"
+            )
         faces, uv = geometry.surface.triangles, geometry.surface.uv
         flat = np.column_stack([uv, np.zeros(len(uv))])
         cloth = add_mesh(self._scene, "cloth", flat, faces.tolist())
@@ -57,7 +74,10 @@ class ClothScene:
         for prop in geometry.surroundings.props:
             mesh = add_mesh(self._scene, prop.name, prop.vertices, prop.faces)
             if prop.sheet is None:
-                set_roughness(add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0)), prop.roughness)
+                set_roughness(
+                    add_material(mesh, prop.name, Base_Color=(*(prop.grey,) * 3, 1.0)),
+                    prop.roughness,
+                )
             else:
                 fabric = Fabric(mesh, prop.sheet.uv, np.concatenate(prop.faces).astype(np.int32))
                 fabric.set_look(**_shader(prop.sheet.look))
@@ -66,10 +86,13 @@ class ClothScene:
         add_view(self._scene)
         self._reader = FrameReader(self._scene)
 
-    def set_up(self, camera: Camera, light: Light, substrate: Substrate, look: Look, track: Points) -> None:
+    def set_up(
+        self, camera: Camera, light: Light, substrate: Substrate, look: Look, track: Points
+    ) -> None:
         """Set the camera, the lamp, the floor and the fabric of the next clips.
 
-        The lamp is turned to the middle of all that the solver's vertices pass in the track (frames, V', 3) [m].
+        The lamp is turned to the middle of all that the solver's vertices pass in the track
+        (frames, V', 3) [m].
         """
         set_view(self._scene, camera)
         self._camera, self.substrate = camera, substrate
@@ -77,17 +100,25 @@ class ClothScene:
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
         a, e = np.radians(light.azimuth), np.radians(light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        self._lamp.aim(0.5 * (track.min(axis=(0, 1)) + track.max(axis=(0, 1))), outward, _LAMP_DISTANCE)
+        self._lamp.aim(
+            0.5 * (track.min(axis=(0, 1)) + track.max(axis=(0, 1))), outward, _LAMP_DISTANCE
+        )
         set_curtains(self._scene, light.source.surround)
         if self._floor is not None:
             set_roughness(self._floor, substrate.roughness)
-            set_inputs(self._floor, Metallic=substrate.metallic, Specular_IOR_Level=substrate.specular)
+            set_inputs(
+                self._floor, Metallic=substrate.metallic, Specular_IOR_Level=substrate.specular
+            )
             set_inputs(self._floor, Base_Color=(*(substrate.albedo,) * 3, 1.0))
 
-    def shading(self, points: Points, sampling: ClothSampling, seed: int) -> npt.NDArray[np.float16]:
-        """Render one instant for all textures: linear light at three albedos, shape (FINE height, FINE width, 3).
+    def shading(
+        self, points: Points, sampling: ClothSampling, seed: int
+    ) -> npt.NDArray[np.float16]:
+        """Render one instant for all textures: linear light at three albedos, shape (FINE height,
+        FINE width, 3).
 
-        Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not flicker.
+        Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not
+        flicker.
         """
         self._fabric.set_color(SHOWN, ELSEWHERE)
         self._place(points)
@@ -111,7 +142,9 @@ class ClothScene:
         window: Window | None = None,
         fine: int = 1,
     ) -> npt.NDArray[np.float16]:
-        """Render an instant, or a window of it, with a texture on the cloth: linear light (fine h, fine w, 3)."""
+        """Render an instant, or a window of it, with a texture on the cloth: linear light (fine h,
+        fine w, 3).
+        """
         self._fabric.set_picture(image)
         self._place(points)
         set_sampling(self._scene, sampling)
@@ -128,7 +161,9 @@ class ClothScene:
 
 
 def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
-    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels: smooth at its ends."""
+    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels: smooth
+    at its ends.
+    """
     inside = low + (np.arange(FINE * (high - low)) + 0.5) / FINE
     ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside
     step = np.clip((np.minimum(*ends) - _DISCARDED) / _RAMP, 0.0, 1.0)
@@ -137,7 +172,9 @@ def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
 
 def _shader(look: Look) -> dict[str, float]:
     """Return what of a look the shader of a fabric takes."""
-    return {name: getattr(look, name) for name in ("roughness", "specular", "sheen", "translucency")}
+    return {
+        name: getattr(look, name) for name in ("roughness", "specular", "sheen", "translucency")
+    }
 
 
 def _floor(height: float) -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:

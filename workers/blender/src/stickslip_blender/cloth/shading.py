@@ -1,21 +1,23 @@
 """One shading for many textures.
 
-The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and floor are grey, so red, green and blue
-are three samples of the light that a pixel sends to the camera, as a function of the cloth's albedo there, a, and
-elsewhere, m:
+The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and floor are grey, so
+red, green and blue are three samples of the light that a pixel sends to the camera, as a function
+of the cloth's albedo there, a, and elsewhere, m:
 
     L(a, m) = S + (D + I m) a        S: gloss, also of light from other cloth; D: light scattered once; I: twice
 
-A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is L(A(p), m) with the mean albedo m of
-the cloth in sight, in linear light, for each of the texture's colours. The cloth is rendered with FINE x FINE pixels
-in each of a picture: where light and print change within one, the mean of their products is not that of their means.
+A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is L(A(p), m) with
+the mean albedo m of the cloth in sight, in linear light, for each of the texture's colours. The
+cloth is rendered with FINE x FINE pixels in each of a picture: where light and print change within
+one, the mean of their products is not that of their means.
 
-Off the cloth L is linear in the albedo of light that the cloth threw there: m, or what a floor that mirrors shows of
-the cloth, blurred as much as its roughness does. Marks of the floor and colours of props lie on top, as factors of
-their light: whatever is not the cloth is grey in Cycles.
+Off the cloth L is linear in the albedo of light that the cloth threw there: m, or what a floor that
+mirrors shows of the cloth, blurred as much as its roughness does. Marks of the floor and colours of
+props lie on top, as factors of their light: whatever is not the cloth is grey in Cycles.
 
-Each level of a picture is within TOLERANCE of the exact value, and chosen so that pixels stay as they are in the frame
-before (clips are 6 % smaller for it), and that the colours of grey are equal (a tenth smaller).
+Each level of a picture is within TOLERANCE of the exact value, and chosen so that pixels stay as
+they are in the frame before (clips are 6 % smaller for it), and that the colours of grey are equal
+(a tenth smaller).
 """
 
 from dataclasses import replace
@@ -44,11 +46,15 @@ SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
 
 FINE = 2  # pixels of a shading across one of a picture, and down
 TOLERANCE: int = _raster.TOLERANCE
-"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/raster.hpp sets it."""
+"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/raster.hpp
+sets it.
+"""
 
 _MIRROR_GRID = 8
 _PROP_GRID = 3
-_LOBE = 1.9  # radius of a box, twice applied, over the width of the lobe that it stands for; compared with Cycles
+# radius of a box, twice applied, over the width of the lobe that it stands for; compared with
+# Cycles
+_LOBE = 1.9
 _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
 
 Floats = npt.NDArray[np.float32]
@@ -70,11 +76,13 @@ class Composer:
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
     ) -> tuple[float, float]:
-        """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into `pictures`.
+        """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into
+        `pictures`.
 
-        Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor` returns it; pictures:
-        those of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3). Returns the share of the
-        frame that is cloth, and of the cloth that nothing hides, its area taken as it is turned to the camera.
+        Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor`
+        returns it; pictures: those of the frame before, or zeros, 8-bit sRGB, shape (textures,
+        height, width, 3). Returns the share of the frame that is cloth, and of the cloth that
+        nothing hides, its area taken as it is turned to the camera.
         """
         window, parts = self._window(points, camera).times(FINE), scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
@@ -99,17 +107,25 @@ class Composer:
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return float(sight.coverage.sum()) / frame, float(min(visible, 1.0))
 
-    def floor_factor(self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1) -> Floats:
-        """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is rendered directly."""
+    def floor_factor(
+        self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1
+    ) -> Floats:
+        """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is
+        rendered directly.
+        """
         window, parts = self._window(points, camera).times(fine), scaled(camera, fine)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
-        marks = (self._tinted(floor, points, camera) - 1.0).repeat(fine, axis=0).repeat(fine, axis=1)
+        marks = (
+            (self._tinted(floor, points, camera) - 1.0).repeat(fine, axis=0).repeat(fine, axis=1)
+        )
         return np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
 
     def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
-        """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the prop before it."""
+        """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the
+        prop before it.
+        """
         geometry = self._geometry
         if not geometry.surroundings.props:
             return floor
@@ -119,25 +135,42 @@ class Composer:
             return floor
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
         seen = see(projections, props, window, _PROP_GRID)
-        samples = [seen.triangle[r::_PROP_GRID, c::_PROP_GRID] for r in range(_PROP_GRID) for c in range(_PROP_GRID)]
-        shown = sum((geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)) / len(samples)
+        samples = [
+            seen.triangle[r::_PROP_GRID, c::_PROP_GRID]
+            for r in range(_PROP_GRID)
+            for c in range(_PROP_GRID)
+        ]
+        shown = sum(
+            (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
+        ) / len(samples)
         for sheet in geometry.printed:  # see_albedo looks at the first triangles
             count, first = sheet.triangles.stop - sheet.triangles.start, sheet.triangles.start
-            turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(np.int32)
+            turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(
+                np.int32
+            )
             rolled = replace(seen, triangles=np.roll(props, -first, axis=0), triangle=turned)
             sight = see_albedo(rolled, geometry.uv, sheet.textures, count)
             shown = shown + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
         factor = floor.copy()
-        factor[window.slices] = shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
+        factor[window.slices] = (
+            shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
+        )
         return factor
 
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
 
     def _mirror(
-        self, overall: Floats, points: npt.NDArray[np.float64], camera: Camera, substrate: Substrate, textures: Textures
+        self,
+        overall: Floats,
+        points: npt.NDArray[np.float64],
+        camera: Camera,
+        substrate: Substrate,
+        textures: Textures,
     ) -> tuple[Floats, Window]:
-        """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width, 3 textures)."""
+        """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width,
+        3 textures).
+        """
         cloth, floor = self._geometry.cloth_triangles, self._geometry.surroundings.floor
         assert floor is not None
         below = projected(camera, mirrored(points, floor))
@@ -152,11 +185,16 @@ class Composer:
         beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
         shown = sight.coverage[..., None]
         wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
-        around = _raster.blurred(np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide)
+        around = _raster.blurred(
+            np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide
+        )
         path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
-        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width roughness^2 is narrower
-        # across the plane of incidence than in it, by the sine of the angle at which the camera looks down.
-        down = np.asarray(path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32)
+        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width
+        # roughness^2 is narrower across the plane of incidence than in it, by the sine of the angle
+        # at which the camera looks down.
+        down = np.asarray(
+            path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32
+        )
         across = np.asarray(down * np.float32(-np.asarray(camera.rotation)[2, 2]), dtype=np.float32)
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
         blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
@@ -168,11 +206,16 @@ class Composer:
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
-    """Return how far behind the floor a mirrored thing appears, over its depth, (height, width); 0 where none is."""
+    """Return how far behind the floor a mirrored thing appears, over its depth, (height, width); 0
+    where none is.
+    """
     depth = seen.at_centers(seen.points[:, 2:])[..., 0]
     window = seen.window
     rows, columns = np.mgrid[window.top : window.bottom, window.left : window.right]
-    ray = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
+    ray = np.stack(
+        [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)],
+        axis=-1,
+    )
     down = (ray @ np.asarray(camera.rotation))[..., 2]
     floor = (height - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
     share = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)

@@ -1,6 +1,8 @@
-"""What a scene shows besides one sheet: further sheets, bodies and holders, from its document and a record.
+"""What a scene shows besides one sheet: further sheets, bodies and holders, from its document and a
+record.
 
-Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of its names.
+Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of
+its names.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +31,8 @@ from stickslip_blender.cloth.looks import grained, look_of
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
-SUNK = -FLOOR  # of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it
+# of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it
+SUNK = -FLOOR
 ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane that is no floor [m]
 TILE = 0.1  # side of the tiles of bodies [m]
 JAWS = 0.004  # by how much a holder is larger than what it holds, along each axis [m]
@@ -38,8 +41,22 @@ MOVING = 0.005  # a vertex that goes farther than this moves [m]: cameras frame 
 PLAIN = (168, 164, 156)  # sRGB, of a sheet that neither a scene nor an axis gives a texture
 
 _USUAL_COLOR, _USUAL_ROUGHNESS = (0.2, 0.2, 0.2), 0.5  # as the document has them
-_TURNS = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0, 180.0)  # [degree]
-_ENOUGH = 0.6  # of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
+_TURNS = (
+    0.0,
+    30.0,
+    -30.0,
+    60.0,
+    -60.0,
+    90.0,
+    -90.0,
+    120.0,
+    -120.0,
+    150.0,
+    -150.0,
+    180.0,
+)  # [degree]
+# of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
+_ENOUGH = 0.6
 _WATCHED = 60  # instants at which it is found out what moves
 _LOOKS, _THUMB = 5, 56  # instants that are looked at, and the side of their pictures [px]
 
@@ -74,19 +91,30 @@ class Stage:
         props: list[Prop] = []
         for name, other in scene["sheets"].items():
             if name != sheet:
-                props.append(self._printed(name, other, scene["looks"]["sheets"].get(name), picture, codes[name]))
+                props.append(
+                    self._printed(
+                        name, other, scene["looks"]["sheets"].get(name), picture, codes[name]
+                    )
+                )
         for number, (name, body) in enumerate(scene["bodies"].items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor, self.ground = body["origin"][2] + FLOOR, codes[name]
                 continue
-            look = scene["looks"]["bodies"].get(name) or {"color": _USUAL_COLOR, "roughness": _USUAL_ROUGHNESS}
+            look = scene["looks"]["bodies"].get(name) or {
+                "color": _USUAL_COLOR,
+                "roughness": _USUAL_ROUGHNESS,
+            }
             props.append(self._body(name, number, body, look, codes[name]))
-        for number, sides in enumerate(record["holder_box"].tolist() if "holder_box" in record else ()):
+        for number, sides in enumerate(
+            record["holder_box"].tolist() if "holder_box" in record else ()
+        ):
             if not np.isnan(sides).any():
                 vertices, faces = box(tuple(side + JAWS for side in sides), (0.0, 0.0, 0.0))
                 self._placers.append(self._posed("holder_pose", number, vertices))
                 look = HOLDER_COLOR, HOLDER_ROUGHNESS
-                props.append(Prop(f"holder-{number}", vertices, faces, *look, segment=codes["holders"]))
+                props.append(
+                    Prop(f"holder-{number}", vertices, faces, *look, segment=codes["holders"])
+                )
         self.props = tuple(props)
 
     def placed(self, instant: int, _vertices: Array) -> list[Array]:
@@ -104,34 +132,66 @@ class Stage:
         return np.concatenate(parts)
 
     def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
-        """Return the camera that frames all that moves, turned about it until enough of the sheet is in sight."""
+        """Return the camera that frames all that moves, turned about it until enough of the sheet
+        is in sight.
+        """
         points, track = self.moving(), self._record[f"{self._sheet}.positions"]
         instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
-        shown = [_shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes) for turn in _TURNS]
-        turn = next(turn for turn, seen in zip(_TURNS, shown, strict=True) if seen >= _ENOUGH * max(shown))
+        shown = [
+            _shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes)
+            for turn in _TURNS
+        ]
+        turn = next(
+            turn for turn, seen in zip(_TURNS, shown, strict=True) if seen >= _ENOUGH * max(shown)
+        )
         return framed(name, points, size=size, turn=turn)
 
     def _printed(
-        self, name: str, sheet: Mapping[str, Any], own: Mapping[str, Any] | None, picture: Any, segment: int
+        self,
+        name: str,
+        sheet: Mapping[str, Any],
+        own: Mapping[str, Any] | None,
+        picture: Any,
+        segment: int,
     ) -> Prop:
         positions = self._record[f"{name}.positions"]
         skin = surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"])
         look = look_of(sheet["material"])
         skin.dress(hem=1e-3 * look.hem)
-        texture = np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
+        texture = (
+            np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
+        )
         self._placers.append(lambda instant: skin(positions[instant]))
         faces = list(map(tuple, skin.triangles.tolist()))
         printed = Print(skin.uv, grained(texture, look, skin), look)
-        return Prop(name, skin(positions[0]), faces, np.zeros((1, 3)), look.roughness, segment=segment, sheet=printed)
+        return Prop(
+            name,
+            skin(positions[0]),
+            faces,
+            np.zeros((1, 3)),
+            look.roughness,
+            segment=segment,
+            sheet=printed,
+        )
 
-    def _body(self, name: str, number: int, body: Mapping[str, Any], look: Mapping[str, Any], segment: int) -> Prop:
+    def _body(
+        self, name: str, number: int, body: Mapping[str, Any], look: Mapping[str, Any], segment: int
+    ) -> Prop:
         color = np.asarray(look["color"], dtype=np.float64).reshape(1, 3)
         if body["type"] == "mesh":
-            triangles, moved = self._record[f"{name}.triangles"], self._record.get(f"{name}.vertices")
-            vertices, faces = _sunk(self._record[f"{name}.rest"], triangles), list(map(tuple, triangles.tolist()))
+            triangles, moved = (
+                self._record[f"{name}.triangles"],
+                self._record.get(f"{name}.vertices"),
+            )
+            vertices, faces = (
+                _sunk(self._record[f"{name}.rest"], triangles),
+                list(map(tuple, triangles.tolist())),
+            )
             posed = self._posed("body_pose", number, vertices)
-            self._placers.append(posed if moved is None else lambda instant: _sunk(moved[instant], triangles))
+            self._placers.append(
+                posed if moved is None else lambda instant: _sunk(moved[instant], triangles)
+            )
             return Prop(name, vertices, faces, color, look["roughness"], segment=segment)
         vertices, shape = _shape(body)
         vertices, faces, owners = tiled(vertices, shape, TILE)
@@ -152,7 +212,9 @@ class Stage:
 def _sunk(points: Array, triangles: Array) -> Array:
     """Return the vertices (n, 3) of a mesh, moved inwards by `SUNK`."""
     given = np.asarray(points, dtype=np.float64)
-    return np.asarray(given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32)))
+    return np.asarray(
+        given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32))
+    )
 
 
 def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:

@@ -1,7 +1,8 @@
 """The visible cloth: the solver's mesh, refined, with weak creases and a thick hem.
 
-The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at most; a label says
-how strong they are, for wrinkles are what friction is seen by. The hem is a second skin about the outer 6 mm.
+The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at
+most; a label says how strong they are, for wrinkles are what friction is seen by. The hem is a
+second skin about the outer 6 mm.
 """
 
 from copy import copy
@@ -34,25 +35,36 @@ class Subdivision:
 
     def __call__(self, values: npt.ArrayLike) -> Array:
         """Refine values (V, k) to (V', k)."""
-        return np.asarray(np.einsum("vn,vnk->vk", self._weights, np.asarray(values, dtype=np.float64)[self._sources]))
+        return np.asarray(
+            np.einsum(
+                "vn,vnk->vk", self._weights, np.asarray(values, dtype=np.float64)[self._sources]
+            )
+        )
 
 
 def subdivide(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Subdivision:
-    """Make the Loop subdivision of triangles (T, 3); the rest shape (V, 2) says where corners of the boundary are.
+    """Make the Loop subdivision of triangles (T, 3).
 
-    New vertices are the old ones, moved, and then one on each edge. Each is a mean of old ones with weights that are
-    not negative, so a cloth that lies on the floor does not get below it, and everything that is given by vertex,
-    texture coordinates too, is refined by the same rule [Loop 1987; Hoppe et al. 1994, boundary and corner rules].
+    The rest shape (V, 2) says where corners of the boundary are.
+
+    New vertices are the old ones, moved, and then one on each edge. Each is a mean of old ones with
+    weights that are not negative, so a cloth that lies on the floor does not get below it, and
+    everything that is given by vertex, texture coordinates too, is refined by the same rule [Loop
+    1987; Hoppe et al. 1994, boundary and corner rules].
     """
     old = np.asarray(triangles, dtype=np.int64)
     flat = np.asarray(rest, dtype=np.float64)
     count = len(flat)
     sides = np.concatenate([old[:, [0, 1]], old[:, [1, 2]], old[:, [2, 0]]])
     opposite = np.concatenate([old[:, 2], old[:, 0], old[:, 1]])
-    edges, side_edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    edges, side_edge, uses = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     side_edge = side_edge.reshape(-1)
     if uses.max() > 2:
-        raise ValueError(f"every edge must belong to one or two triangles; one belongs to {uses.max()}")
+        raise ValueError(
+            f"every edge must belong to one or two triangles; one belongs to {uses.max()}"
+        )
     rows: list[dict[int, float]] = []
     ring: list[set[int]] = [set() for _ in range(count)]
     rim: list[list[int]] = [[] for _ in range(count)]
@@ -80,14 +92,19 @@ def subdivide(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Subdivision:
         weights[number, : len(row)] = list(row.values())
     ab, bc, ca = (count + side_edge).reshape(3, -1)
     a, b, c = old.T
-    fine = np.concatenate([np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    fine = np.concatenate(
+        [np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    )
     return Subdivision(fine.astype(np.int32), sources, weights)
 
 
 def _moved(vertex: int, ring: list[int], rim: list[int], rest: Array) -> dict[int, float]:
     """Return the weights of an old vertex's new place."""
     if rim:
-        if len(rim) != 2 or _angle(rest[rim[0]] - rest[vertex], rest[rim[1]] - rest[vertex]) < SHARPEST:
+        if (
+            len(rim) != 2
+            or _angle(rest[rim[0]] - rest[vertex], rest[rim[1]] - rest[vertex]) < SHARPEST
+        ):
             return {vertex: 1.0}
         return {vertex: 0.75, rim[0]: 0.125, rim[1]: 0.125}
     n = len(ring)
@@ -104,15 +121,26 @@ FINE_VERTICES = 6000  # a mesh is subdivided until it has so many: a facet is th
 CREASE = 0.0005  # height of the strongest crease at strength 1 [m]
 _CREASES = 14
 
-# Of the hem, from its inner edge over the upper side to the outer edge and back below: how far inside the edge of the
-# sheet [m], and how high over its middle surface, in units of half the hem's thickness.
+# Of the hem, from its inner edge over the upper side to the outer edge and back below: how far
+# inside the edge of the sheet [m], and how high over its middle surface, in units of half the hem's
+# thickness.
 _PROFILE = np.array(
-    [(6.5e-3, 0.0), (6.0e-3, 1.0), (0.7e-3, 1.0), (-0.3e-3, 0.0), (0.7e-3, -1.0), (6.0e-3, -1.0), (6.5e-3, 0.0)]
+    [
+        (6.5e-3, 0.0),
+        (6.0e-3, 1.0),
+        (0.7e-3, 1.0),
+        (-0.3e-3, 0.0),
+        (0.7e-3, -1.0),
+        (6.0e-3, -1.0),
+        (6.5e-3, 0.0),
+    ]
 )
 
 
 def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
-    """Return the surface of a mesh, see `Surface`: the last ones are kept, for making one takes a second."""
+    """Return the surface of a mesh, see `Surface`: the last ones are kept, for making one takes a
+    second.
+    """
     faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
     return copy(_made(faces.tobytes(), flat.tobytes()))
 
@@ -146,9 +174,13 @@ class Surface:
         self._count = len(flat)
         rim = _rim(faces)
         self._profile = np.repeat(_PROFILE[:, 1], len(rim))[:, None]
-        inside = np.concatenate([flat[rim] + offset * _inward(flat[rim]) for offset in _PROFILE[:, 0]])
+        inside = np.concatenate(
+            [flat[rim] + offset * _inward(flat[rim]) for offset in _PROFILE[:, 0]]
+        )
         self._corners, self._weights = _located(inside, flat, faces)
-        self.triangles = np.ascontiguousarray(np.concatenate([faces, _ring_faces(len(rim), self._count)]))
+        self.triangles = np.ascontiguousarray(
+            np.concatenate([faces, _ring_faces(len(rim), self._count)])
+        )
         uv = (np.concatenate([flat, inside]) - low) / max(self.size)
         self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
         self.dress(hem=0.0)
@@ -156,7 +188,9 @@ class Surface:
     def dress(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
         """Set half the thickness of the hem [m], and the strength (0 to 1) and seed of the creases."""
         self._hem = hem * self._profile
-        self._height = creases * CREASE * _creases(self.uv[: self._count], seed) if creases > 0.0 else None
+        self._height = (
+            creases * CREASE * _creases(self.uv[: self._count], seed) if creases > 0.0 else None
+        )
 
     def __call__(self, positions: npt.ArrayLike) -> Array:
         """Return the vertices (V, 3) that are seen of the solver's positions (V', 3) [m]."""
@@ -166,7 +200,9 @@ class Surface:
         normals = _raster.normals(sheet, self._sheet)
         if self._height is not None:
             lifted = sheet + self._height[:, None] * normals
-            lifted[:, 2] = np.maximum(lifted[:, 2], np.minimum(sheet[:, 2], 0.0))  # not into the floor
+            lifted[:, 2] = np.maximum(
+                lifted[:, 2], np.minimum(sheet[:, 2], 0.0)
+            )  # not into the floor
             sheet = lifted
         middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
         upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
@@ -175,11 +211,15 @@ class Surface:
 
 @lru_cache(maxsize=16)
 def _made(triangles: bytes, rest: bytes) -> Surface:
-    return Surface(np.frombuffer(triangles, dtype=np.int32).reshape(-1, 3), np.frombuffer(rest).reshape(-1, 2))
+    return Surface(
+        np.frombuffer(triangles, dtype=np.int32).reshape(-1, 3), np.frombuffer(rest).reshape(-1, 2)
+    )
 
 
 def _creases(uv: Array, seed: int) -> Array:
-    """Return the height of creases in [-1, 1] at (n, 2): straight ridges and furrows that fade along their length."""
+    """Return the height of creases in [-1, 1] at (n, 2): straight ridges and furrows that fade
+    along their length.
+    """
     random = np.random.Generator(np.random.PCG64([seed, 2]))
     height = np.zeros(len(uv))
     for _ in range(_CREASES):
@@ -195,7 +235,9 @@ def _creases(uv: Array, seed: int) -> Array:
 def _rim(faces: Indices) -> npt.NDArray[np.int64]:
     """Return the vertices of the boundary in order, the sheet on their left."""
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, index, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    _, index, uses = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
     after = dict(sides[uses[index.reshape(-1)] == 1].tolist())
     start = vertex = min(after)
     loop = [start]
@@ -207,7 +249,9 @@ def _rim(faces: Indices) -> npt.NDArray[np.int64]:
 
 
 def _inward(rim: Array) -> Array:
-    """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides there by 1."""
+    """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides
+    there by 1.
+    """
 
     def unit(v: Array) -> Array:
         return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
@@ -221,7 +265,9 @@ def _inward(rim: Array) -> Array:
 
 
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
-    """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they are most inside."""
+    """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they
+    are most inside.
+    """
     a, b, c = (flat[faces[:, k]] for k in range(3))
     inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
     middle, reach = (a + b + c) / 3.0, 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()

@@ -1,6 +1,7 @@
 """The cloth textures, drawn by formula: a square of cloth seen flat.
 
-Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread would be noise, a pattern is not.
+Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread would be noise, a
+pattern is not.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,10 @@ Rgb = tuple[int, int, int]  # sRGB
 
 @cache
 def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
-    """Return the picture of a texture, 8-bit sRGB, shape (SIZE, SIZE, 3); row 0 is the lower edge of the cloth."""
+    """Return the picture of a texture, 8-bit sRGB, shape (SIZE, SIZE, 3).
+
+    Row 0 is the lower edge of the cloth.
+    """
     fine = SIZE * _OVERSAMPLING
     across = (np.arange(fine) + 0.5) / fine
     u, v = np.meshgrid(across, across)
@@ -34,18 +38,24 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
 
 
 def custom_texture(data: bytes) -> npt.NDArray[np.uint8]:
-    """Return the picture in a file of a user, as `texture_image` does; its upper edge is the held one.
+    """Return the picture in a file of a user, as `texture_image` does.
+
+    Its upper edge is the held one.
 
     Raises:
         UnfitPictureError: It is no picture that a cloth can be printed with.
     """
-    picture = Image.fromarray(np.flipud(read_picture(data))).resize((SIZE, SIZE), Image.Resampling.BILINEAR)
+    picture = Image.fromarray(np.flipud(read_picture(data))).resize(
+        (SIZE, SIZE), Image.Resampling.BILINEAR
+    )
     return np.asarray(picture, dtype=np.uint8)
 
 
 def _mix(where: npt.NDArray[np.bool_] | Field, there: Rgb | Field, elsewhere: Rgb | Field) -> Field:
     share = np.asarray(where, dtype=np.float64)[..., None]
-    return share * np.asarray(there, dtype=np.float64) + (1.0 - share) * np.asarray(elsewhere, dtype=np.float64)
+    return share * np.asarray(there, dtype=np.float64) + (1.0 - share) * np.asarray(
+        elsewhere, dtype=np.float64
+    )
 
 
 def _phase(x: Field, count: float) -> Field:
@@ -84,11 +94,18 @@ def _houndstooth(u: Field, v: Field) -> Field:
     """Weave four dark and four light threads, over two and under two."""
     warp, weft = np.floor(u * 48), np.floor(v * 48)
     warp_on_top = np.mod(warp + weft, 4) < 2
-    return _mix(np.where(warp_on_top, np.mod(warp, 8) < 4, np.mod(weft, 8) < 4), (28, 28, 32), (236, 232, 224))
+    return _mix(
+        np.where(warp_on_top, np.mod(warp, 8) < 4, np.mod(weft, 8) < 4),
+        (28, 28, 32),
+        (236, 232, 224),
+    )
 
 
 def _floral(u: Field, v: Field) -> Field:
-    """Strew five-petalled flowers of three colours and leaves over cream, seeded; the pattern repeats at the edges."""
+    """Strew five-petalled flowers of three colours and leaves over cream, seeded.
+
+    The pattern repeats at the edges.
+    """
     picture = np.broadcast_to(np.asarray((240, 230, 208), dtype=np.float64), (*u.shape, 3))
     random = np.random.Generator(np.random.PCG64(7))
     petals: tuple[Rgb, ...] = ((200, 52, 76), (232, 140, 60), (110, 78, 168))
@@ -119,7 +136,10 @@ def _argyle(u: Field, v: Field) -> Field:
 
 
 def _camouflage(u: Field, v: Field) -> Field:
-    """Draw blots of three colours where sums of waves are high, seeded; the pattern repeats at the edges."""
+    """Draw blots of three colours where sums of waves are high, seeded.
+
+    The pattern repeats at the edges.
+    """
     random = np.random.Generator(np.random.PCG64(11))
     picture = np.broadcast_to(np.asarray((108, 112, 76), dtype=np.float64), (*u.shape, 3))
     for color in ((58, 64, 44), (150, 136, 96), (34, 34, 30)):
@@ -135,9 +155,20 @@ def _terrazzo(u: Field, v: Field) -> Field:
     """Strew chips of five colours over off-white, seeded; the pattern repeats at the edges."""
     picture = np.broadcast_to(np.asarray((226, 222, 214), dtype=np.float64), (*u.shape, 3))
     random = np.random.Generator(np.random.PCG64(13))
-    chips: tuple[Rgb, ...] = ((188, 92, 70), (70, 104, 110), (222, 172, 96), (54, 56, 62), (150, 160, 130))
+    chips: tuple[Rgb, ...] = (
+        (188, 92, 70),
+        (70, 104, 110),
+        (222, 172, 96),
+        (54, 56, 62),
+        (150, 160, 130),
+    )
     for number in range(90):
-        x, y, turn, size = random.random(), random.random(), random.uniform(0.0, np.pi), random.uniform(0.02, 0.05)
+        x, y, turn, size = (
+            random.random(),
+            random.random(),
+            random.uniform(0.0, np.pi),
+            random.uniform(0.02, 0.05),
+        )
         du, dv = np.mod(u - x + 0.5, 1.0) - 0.5, np.mod(v - y + 0.5, 1.0) - 0.5
         along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
         chip = np.abs(along) + 1.8 * np.abs(across + 0.3 * along) < size
@@ -146,12 +177,16 @@ def _terrazzo(u: Field, v: Field) -> Field:
 
 
 _DRAWN_BY: dict[Texture, Callable[[Field, Field], Field]] = {
-    Texture.checker: lambda u, v: _mix((_phase(u, 4) < 0.5) == (_phase(v, 4) < 0.5), (34, 37, 46), (236, 230, 214)),
+    Texture.checker: lambda u, v: _mix(
+        (_phase(u, 4) < 0.5) == (_phase(v, 4) < 0.5), (34, 37, 46), (236, 230, 214)
+    ),
     Texture.dots: _dots,
     Texture.stripes: lambda u, _: _mix(_phase(u, 8) < 0.5, (176, 38, 44), (238, 230, 216)),
     Texture.plaid: _plaid,
     Texture.gingham: lambda u, v: _mix(
-        0.5 * ((_phase(u, 6) < 0.5).astype(float) + (_phase(v, 6) < 0.5)), (46, 104, 176), (244, 242, 236)
+        0.5 * ((_phase(u, 6) < 0.5).astype(float) + (_phase(v, 6) < 0.5)),
+        (46, 104, 176),
+        (244, 242, 236),
     ),
     Texture.herringbone: _herringbone,
     Texture.houndstooth: _houndstooth,

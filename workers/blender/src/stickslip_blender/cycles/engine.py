@@ -1,8 +1,10 @@
-"""Blender: its import, the device that Cycles computes on, and settings of the engine that all scenes share.
+"""Blender: its import, the device that Cycles computes on, and settings of the engine that all
+scenes share.
 
-The environment variable STICKSLIP_RENDER_DEVICE names the device; the default is the CPU. Noise differs between the CPU
-and a GPU, and it may differ between GPUs and drivers. The device is therefore part of the renderer's build, and workers
-with different devices share no results. All scenes have one thread and a fixed seed.
+The environment variable STICKSLIP_RENDER_DEVICE names the device; the default is the CPU. Noise
+differs between the CPU and a GPU, and it may differ between GPUs and drivers. The device is
+therefore part of the renderer's build, and workers with different devices share no results. All
+scenes have one thread and a fixed seed.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from typing import Any, Literal
 
 from stickslip_schemas.spec.jobs import Quality
 
+# Debian's names
 SYSTEM_LIBRARIES = (
-    "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libxext6 libxcb1 libgl1"  # Debian's names
+    "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libxext6 libxcb1 libgl1"
 )
 VARIABLE = "STICKSLIP_RENDER_DEVICE"
 CPU = "cpu"
@@ -43,15 +46,19 @@ def import_bpy() -> Any:
             "bpy is missing: stickslip_blender runs in an environment of its own (pip install stickslip-blender)"
         ) from error
     except ImportError as error:
-        raise ImportError(f"{error}; on a bare Debian bpy needs: apt-get install {SYSTEM_LIBRARIES}") from error
+        raise ImportError(
+            f"{error}; on a bare Debian bpy needs: apt-get install {SYSTEM_LIBRARIES}"
+        ) from error
     return bpy
 
 
 @contextmanager
 def _one_processor() -> Iterator[None]:
-    """Show one processor to Blender's task scheduler while it starts, so that it makes no worker threads.
+    """Show one processor to Blender's task scheduler while it starts, so that it makes no worker
+    threads.
 
-    Each process renders with one thread. Idle TBB workers spin: each used half a core while nothing was rendered.
+    Each process renders with one thread. Idle TBB workers spin: each used half a core while nothing
+    was rendered.
     """
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
@@ -86,10 +93,16 @@ def use_device(scene: Any) -> None:
 
 
 def described() -> dict[str, Any]:
-    """Return what the pixels depend on: the device and, for GPUs, their names and the driver's major version."""
+    """Return what the pixels depend on: the device and, for GPUs, their names and the driver's
+    major version.
+    """
     if device() == CPU:
         return {"device": CPU}
-    return {"device": device(), "names": sorted({found.name for found in _find_devices()}), "driver": _driver()}
+    return {
+        "device": device(),
+        "names": sorted({found.name for found in _find_devices()}),
+        "driver": _driver(),
+    }
 
 
 def _find_devices() -> list[Any]:
@@ -99,7 +112,9 @@ def _find_devices() -> list[Any]:
     try:
         preferences.compute_device_type = sort
     except TypeError as error:  # the enumeration lacks it
-        raise NoDeviceError(f"{VARIABLE} is {device()!r}, and this Blender cannot use such devices: {error}") from error
+        raise NoDeviceError(
+            f"{VARIABLE} is {device()!r}, and this Blender cannot use such devices: {error}"
+        ) from error
     preferences.refresh_devices()
     for each in preferences.devices:
         each.use = each.type == sort
@@ -127,14 +142,20 @@ class Sampling:
     samples: int
     """Paths per pixel."""
     denoiser: Literal["none", "quick", "plain", "guided"] = "none"
-    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges; `quick`: its smallest network.
+    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges; `quick`: its
+    smallest network.
 
-    Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even cloth is `plain`.
+    Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even
+    cloth is `plain`.
     """
     seed: int = 0
-    """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and clips compress."""
+    """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and
+    clips compress.
+    """
     skipped: int = 0
-    """Paths per pixel that are left out first. Cycles sends the very first one through the middle of the pixel."""
+    """Paths per pixel that are left out first. Cycles sends the very first one through the middle
+    of the pixel.
+    """
 
 
 @dataclass(frozen=True)
@@ -144,13 +165,20 @@ class ClothSampling:
     frame: int
     """Paths per pixel in the whole frame."""
     window: int
-    """Paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a picture."""
+    """Paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a
+    picture.
+    """
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     def over(self, area: float) -> ClothSampling:
-        """Where the window has a smaller area than usual [px^2], trace more paths for the same cost."""
-        return replace(self, window=round(self.window * min(max(_USUAL_AREA / max(area, 1.0), 1.0), _MORE_PATHS)))
+        """Where the window has a smaller area than usual [px^2], trace more paths for the same
+        cost.
+        """
+        return replace(
+            self,
+            window=round(self.window * min(max(_USUAL_AREA / max(area, 1.0), 1.0), _MORE_PATHS)),
+        )
 
     @property
     def finer(self) -> ClothSampling:
@@ -158,9 +186,13 @@ class ClothSampling:
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
-_USUAL_AREA, _MORE_PATHS = 13_000.0, 1.6  # of a window that needs no more paths [px^2], and the most times as many
+_USUAL_AREA, _MORE_PATHS = (
+    13_000.0,
+    1.6,
+)  # of a window that needs no more paths [px^2], and the most times as many
 
-# Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures them.
+# Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures
+# them.
 SAMPLING = {
     Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),
@@ -184,7 +216,9 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     bpy = import_bpy()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with suppress(OSError):
-        Path(bpy.app.tempdir).rmdir()  # never used, empty, and left behind by a process that is killed
+        Path(
+            bpy.app.tempdir
+        ).rmdir()  # never used, empty, and left behind by a process that is killed
     scene = bpy.context.scene
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
@@ -205,7 +239,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     cycles.diffuse_bounces = diffuse_bounces
     cycles.glossy_bounces = 1
     cycles.use_light_tree = light_tree
-    # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither: colors keep meaning.
+    # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither: colors
+    # keep meaning.
     scene.display_settings.display_device = "sRGB"
     view = scene.view_settings
     view.view_transform = "Standard"
@@ -228,5 +263,7 @@ def set_sampling(scene: Any, sampling: Sampling) -> None:
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.denoising_quality = "FAST" if sampling.denoiser == "quick" else "HIGH"
         cycles.denoising_prefilter = "NONE"
-        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL" if sampling.denoiser == "guided" else "RGB"
+        cycles.denoising_input_passes = (
+            "RGB_ALBEDO_NORMAL" if sampling.denoiser == "guided" else "RGB"
+        )
         cycles.denoising_use_gpu = device() != CPU

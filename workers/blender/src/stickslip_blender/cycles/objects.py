@@ -15,15 +15,23 @@ _CLIP = (1e-3, 1e3)  # [scene units]
 SHARP = np.radians(40.0)
 """Angle between faces above which an edge is no part of a smooth skin [rad]."""
 
-SOFT = 0.6  # least roughness that other rays than a camera's meet: at 0.4, light of a steel floor was twice as noisy
+# least roughness that other rays than a camera's meet: at 0.4, light of a steel floor was twice as
+# noisy
+SOFT = 0.6
 
-_MIX_INPUTS = ("Factor_Float", "A_Color", "B_Color")  # the node's sockets share their names, one set per data type
+_MIX_INPUTS = (
+    "Factor_Float",
+    "A_Color",
+    "B_Color",
+)  # the node's sockets share their names, one set per data type
 
 Array = npt.NDArray[np.float64]
 
 
 def add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]]) -> Any:
-    """Add a mesh of vertices (n, 3) and polygons, smooth but for edges above `SHARP`, and return its data."""
+    """Add a mesh of vertices (n, 3) and polygons, smooth but for edges above `SHARP`, and return
+    its data.
+    """
     bpy = import_bpy()
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(np.asarray(vertices).tolist(), [], [list(face) for face in faces])
@@ -35,12 +43,16 @@ def add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Seq
 
 def move_mesh(mesh: Any, points: npt.ArrayLike) -> None:
     """Move the vertices of a mesh to points (n, 3)."""
-    mesh.attributes["position"].data.foreach_set("vector", np.asarray(points, dtype=np.float32).ravel())
+    mesh.attributes["position"].data.foreach_set(
+        "vector", np.asarray(points, dtype=np.float32).ravel()
+    )
     mesh.update()
 
 
 def add_material(mesh: Any, name: str, **inputs: Any) -> Any:
-    """Give a mesh a material of the Principled shader with inputs, as for `set_inputs`, and return the shader."""
+    """Give a mesh a material of the Principled shader with inputs, as for `set_inputs`, and return
+    the shader.
+    """
     material = import_bpy().data.materials.new(name)
     shader = material.node_tree.nodes["Principled BSDF"]
     set_inputs(shader, **inputs)
@@ -55,10 +67,13 @@ def set_inputs(shader: Any, **inputs: Any) -> None:
 
 
 def set_roughness(shader: Any, roughness: float) -> None:
-    """Set the roughness of a shader as cameras see it; every other ray meets one of at least `SOFT`.
+    """Set the roughness of a shader as cameras see it.
 
-    Else a lamp that a mirror shows in the gloss of cloth is noise that no number of paths cures. Cycles' own remedies
-    (no caustics, filtered gloss, clamped light) act on paths by the albedos that they meet: dark prints shine more.
+    Every other ray meets one of at least `SOFT`.
+
+    Else a lamp that a mirror shows in the gloss of cloth is noise that no number of paths cures.
+    Cycles' own remedies (no caustics, filtered gloss, clamped light) act on paths by the albedos
+    that they meet: dark prints shine more.
     """
     tree = shader.id_data
     softened = tree.nodes.get("softened")
@@ -86,7 +101,9 @@ class Lamp:
         self._lamp.data.energy, self._lamp.data.size = watts, diameter
 
     def aim(self, at: Array, outward: Array, distance: float) -> None:
-        """Place the lamp at a distance from a point, in the direction `outward`, and turn it to the point."""
+        """Place the lamp at a distance from a point, in the direction `outward`, and turn it to the
+        point.
+        """
         from mathutils import Vector
 
         self._lamp.location = at + distance * outward
@@ -94,16 +111,24 @@ class Lamp:
 
 
 class Fabric:
-    """The material of a cloth, with one colour or a picture: the Principled shader, mixed with translucency."""
+    """The material of a cloth, with one colour or a picture: the Principled shader, mixed with
+    translucency.
+    """
 
     def __init__(self, mesh: Any, uv: Array, corners: npt.NDArray[np.int32]) -> None:
-        """Give a mesh texture coordinates (V, 2), by its corners in the order of its faces, and the material."""
-        mesh.uv_layers.new(name="rest").uv.foreach_set("vector", uv[corners].astype(np.float32).ravel())
+        """Give a mesh texture coordinates (V, 2), by its corners in the order of its faces, and the
+        material.
+        """
+        mesh.uv_layers.new(name="rest").uv.foreach_set(
+            "vector", uv[corners].astype(np.float32).ravel()
+        )
         self._shader = add_material(mesh, "fabric", Sheen_Roughness=0.5)
         self._tree = tree = mesh.materials[0].node_tree
         self._picture = tree.nodes.new("ShaderNodeTexImage")
         self._picture.extension = "EXTEND"
-        self._shown, self._other = (tree.nodes.new("ShaderNodeRGB").outputs["Color"] for _ in range(2))
+        self._shown, self._other = (
+            tree.nodes.new("ShaderNodeRGB").outputs["Color"] for _ in range(2)
+        )
         self._even = mix_by_ray(tree, self._other, self._shown)
         self._color = tree.nodes.new("NodeReroute")
         through = tree.nodes.new("ShaderNodeBsdfTranslucent")
@@ -112,23 +137,34 @@ class Fabric:
         tree.links.new(self._color.outputs[0], through.inputs["Color"])
         tree.links.new(self._shader.outputs["BSDF"], self._both.inputs[1])
         tree.links.new(through.outputs["BSDF"], self._both.inputs[2])
-        tree.links.new(self._both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
+        tree.links.new(
+            self._both.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"]
+        )
         self._from: Any = None
 
-    def set_look(self, *, roughness: float, specular: float, sheen: float, translucency: float) -> None:
+    def set_look(
+        self, *, roughness: float, specular: float, sheen: float, translucency: float
+    ) -> None:
         set_roughness(self._shader, roughness)
         set_inputs(self._shader, Specular_IOR_Level=specular, Sheen_Weight=sheen)
         set_inputs(self._both, Fac=translucency)
 
     def set_color(self, color: Sequence[float], other: Sequence[float] | None = None) -> None:
-        """Give the cloth one linear colour, or another one for all rays that do not come from the camera."""
-        self._shown.default_value, self._other.default_value = (*color, 1.0), (*(other or color), 1.0)
+        """Give the cloth one linear colour, or another one for all rays that do not come from the
+        camera.
+        """
+        self._shown.default_value, self._other.default_value = (
+            (*color, 1.0),
+            (*(other or color), 1.0),
+        )
         self._connect(self._even)
 
     def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
         """Print a picture on the cloth, (size, size, 3), 8-bit sRGB, row 0 at its lower edge."""
         images, old = import_bpy().data.images, self._picture.image
-        image = images.new("print", *picture.shape[:2])  # a new one: Cycles does not read a changed image again
+        image = images.new(
+            "print", *picture.shape[:2]
+        )  # a new one: Cycles does not read a changed image again
         set_pixels(image, picture / np.float32(255))
         image.update()
         self._picture.image = image
@@ -176,13 +212,15 @@ def add_view(scene: Any) -> Any:
 def set_view(scene: Any, camera: Camera) -> None:
     """Make the scene's camera project as `camera` does.
 
-    Blender's camera looks along -z with y up, and its shifts are in units of the image's width, in square pixels.
+    Blender's camera looks along -z with y up, and its shifts are in units of the image's width, in
+    square pixels.
     """
     from mathutils import Matrix
 
     render, view = scene.render, scene.camera
     render.resolution_x, render.resolution_y = camera.width, camera.height
-    # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the two.
+    # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the
+    # two.
     ratio = camera.fx / camera.fy  # a pixel's height over its width
     render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, 1.0 / ratio), max(1.0, ratio)
     view.data.lens = camera.fx / camera.width * SENSOR_WIDTH
@@ -199,10 +237,11 @@ HEIGHT = 64  # rows of the panorama: its light is smooth
 
 @dataclass(frozen=True)
 class SoftBox:
-    """A soft light at infinity, without an edge: its radiance falls off from its middle as cos^sharpness of the angle.
+    """A soft light at infinity, without an edge: its radiance falls off from its middle as
+    cos^sharpness of the angle.
 
-    Area lights would cost more: Cycles picks one of them at random at each sample, and on a thin rod that was 6 dB
-    noisier at equal samples.
+    Area lights would cost more: Cycles picks one of them at random at each sample, and on a thin
+    rod that was 6 dB noisier at equal samples.
     """
 
     azimuth: float
@@ -216,9 +255,11 @@ class SoftBox:
 
 
 def panorama(boxes: Sequence[SoftBox], ambient: float) -> npt.NDArray[np.float32]:
-    """Return the radiance of soft boxes and an even ambient light, shape (HEIGHT, 2 HEIGHT), row 0 lowest.
+    """Return the radiance of soft boxes and an even ambient light, shape (HEIGHT, 2 HEIGHT), row 0
+    lowest.
 
-    Column c of n looks to azimuth 180 - 360 (c + 1/2) / n degrees, as Blender's equirectangular mapping does.
+    Column c of n looks to azimuth 180 - 360 (c + 1/2) / n degrees, as Blender's equirectangular
+    mapping does.
     """
     elevation = np.pi * ((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5)[:, None]
     azimuth = np.pi * (1.0 - (np.arange(2 * HEIGHT) + 0.5) / HEIGHT)[None, :]
@@ -258,11 +299,15 @@ def set_curtains(scene: Any, ambient: float) -> None:
     faint = tree.nodes.new("ShaderNodeBackground")
     set_inputs(faint, Color=(ambient, ambient, ambient, 1.0))
     mix = tree.nodes.new("ShaderNodeMixShader")
-    tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], mix.inputs["Fac"])
+    tree.links.new(
+        tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], mix.inputs["Fac"]
+    )
     tree.links.new(faint.outputs["Background"], mix.inputs[1])
     tree.links.new(dark.outputs["Background"], mix.inputs[2])
     tree.links.new(mix.outputs["Shader"], surface)
-    scene.world.cycles.sampling_method = "NONE"  # paths that leave find it: the lamp gets all shadow rays
+    scene.world.cycles.sampling_method = (
+        "NONE"  # paths that leave find it: the lamp gets all shadow rays
+    )
 
 
 def _emptied(scene: Any) -> tuple[Any, Any]:

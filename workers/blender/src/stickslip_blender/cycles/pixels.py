@@ -1,7 +1,7 @@
 """Read rendered frames from Blender as linear light, and encode light as sRGB.
 
-Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed file: an anonymous one
-in memory, of which a killed process leaves nothing behind.
+Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed
+file: an anonymous one in memory, of which a killed process leaves nothing behind.
 """
 
 import faulthandler
@@ -27,11 +27,13 @@ _HALF = 1
 
 
 def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
-    """Return the wanted channels of a frame, linear light, shape (height, width, channels), row 0 on top.
+    """Return the wanted channels of a frame, linear light, shape (height, width, channels), row 0
+    on top.
 
-    It reads the one kind of OpenEXR file that we have Blender write: scan lines of half floats, not compressed.
-    [OpenEXR, File Layout]: a magic number and version; attributes (name, type, size, value) up to an empty name;
-    offsets of the lines; and the lines, each with its row, its size in bytes and its channels in alphabetical order.
+    It reads the one kind of OpenEXR file that we have Blender write: scan lines of half floats, not
+    compressed. [OpenEXR, File Layout]: a magic number and version; attributes (name, type, size,
+    value) up to an empty name; offsets of the lines; and the lines, each with its row, its size in
+    bytes and its channels in alphabetical order.
     """
     magic, version = struct.unpack_from("<ii", data)
     if magic != _MAGIC or version & _MULTI_PART_OR_DEEP_OR_TILED:
@@ -43,10 +45,14 @@ def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
         raise ValueError("the frame must be of half floats that are not compressed")
     width, height = right - left + 1, bottom - top + 1
     line = np.dtype([("row", "<i4"), ("size", "<i4"), ("values", "<f2", (len(channels), width))])
-    first = int(struct.unpack_from("<Q", data, at)[0])  # lines follow one another in increasing order
+    first = int(
+        struct.unpack_from("<Q", data, at)[0]
+    )  # lines follow one another in increasing order
     lines = np.frombuffer(data, dtype=line, count=height, offset=first)
     names = [name for name, _ in channels]
-    return np.stack([lines["values"][:, names.index(name)] for name in wanted], axis=-1).astype(np.float16, copy=False)
+    return np.stack([lines["values"][:, names.index(name)] for name in wanted], axis=-1).astype(
+        np.float16, copy=False
+    )
 
 
 def _attributes(data: bytes) -> tuple[dict[str, bytes], int]:
@@ -79,7 +85,9 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
 
 
 FIRST_SECONDS = 300.0  # besides its paths, for a first frame: a GPU may load its kernels
-LEAST_SECONDS = 60.0  # besides their paths, for later frames, on a machine that has a lot else to do
+LEAST_SECONDS = (
+    60.0  # besides their paths, for later frames, on a machine that has a lot else to do
+)
 _PATH_SECONDS = 5e-6  # of a path before one is measured: a slow core
 _SLOWER = 20.0  # times as long as its paths took before, and a frame hangs
 
@@ -113,17 +121,23 @@ class FrameReader:
         self._besides, self._path_seconds = FIRST_SECONDS, _PATH_SECONDS
 
     def read_light(self, window: Window | None = None, fine: int = 1) -> npt.NDArray[np.float16]:
-        """Render the scene as it stands, or a window of it: linear light, not clipped, shape (height, width, 3).
+        """Render the scene as it stands, or a window of it: linear light, not clipped, shape
+        (height, width, 3).
 
-        A window has the very values that it would have in the whole frame. Each pixel is rendered as fine x fine ones.
+        A window has the very values that it would have in the whole frame. Each pixel is rendered
+        as fine x fine ones.
         """
         return read_exr(self._rendered("RGB", window, fine), "RGB")
 
     def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
-        """Render as `read_light` does, before nothing: light times coverage, and coverage, shape (height, width, 4)."""
+        """Render as `read_light` does, before nothing: light times coverage, and coverage, shape
+        (height, width, 4).
+        """
         return read_exr(self._rendered("RGBA", window), "RGBA")
 
-    def _rendered(self, channels: Literal["RGB", "RGBA"], window: Window | None, fine: int = 1) -> bytes:
+    def _rendered(
+        self, channels: Literal["RGB", "RGBA"], window: Window | None, fine: int = 1
+    ) -> bytes:
         self._scene.render.resolution_percentage = 100 * fine
         self._scene.render.film_transparent = channels == "RGBA"
         self._scene.render.image_settings.color_mode = channels
@@ -140,13 +154,17 @@ class FrameReader:
         here = window or Window(0, 0, render.resolution_x, render.resolution_y)
         paths, start = fine**2 * max(here.area, 1) * self._scene.cycles.samples, time.monotonic()
         limit = self._besides + _SLOWER * self._path_seconds * paths
-        faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__ or 2)  # Blender keeps Python's lock
+        faulthandler.dump_traceback_later(
+            limit, exit=True, file=sys.__stderr__ or 2
+        )  # Blender keeps Python's lock
         try:
             yield
         finally:
             faulthandler.cancel_dump_traceback_later()
         took = (time.monotonic() - start) / paths
-        self._path_seconds = took if self._besides == FIRST_SECONDS else max(took, self._path_seconds)
+        self._path_seconds = (
+            took if self._besides == FIRST_SECONDS else max(took, self._path_seconds)
+        )
         self._besides = LEAST_SECONDS
 
 
@@ -154,7 +172,8 @@ def _set_window(render: Any, window: Window | None, fine: int) -> None:
     render.use_border = render.use_crop_to_border = window is not None
     if window is not None:
         width, height = render.resolution_x, render.resolution_y
-        # Blender truncates to whole pixels: half of one keeps rounding out of it. It counts rows from below.
+        # Blender truncates to whole pixels: half of one keeps rounding out of it. It counts rows
+        # from below.
         half = 0.5 / fine
         render.border_min_x = (window.left + half) / width
         render.border_max_x = (window.right + half) / width
@@ -164,7 +183,9 @@ def _set_window(render: Any, window: Window | None, fine: int) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Send file descriptor 1 nowhere: Blender logs every saved frame there and, as a module, has no switch for it."""
+    """Send file descriptor 1 nowhere: Blender logs every saved frame there and, as a module, has no
+    switch for it.
+    """
     sys.stdout.flush()
     stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,8 +1,9 @@
 """A rasteriser: what a camera sees of a mesh, without light.
 
-Cycles gives the light. Albedo at texture edges, silhouettes, depth and other ground truth are geometry, and cost far
-less here: which triangle each sample of an image sees, what is interpolated there, and the albedo of many textures. The
-compiled part is `_raster`; raster/raster.hpp says where samples lie and how textures are looked up.
+Cycles gives the light. Albedo at texture edges, silhouettes, depth and other ground truth are
+geometry, and cost far less here: which triangle each sample of an image sees, what is interpolated
+there, and the albedo of many textures. The compiled part is `_raster`; raster/raster.hpp says where
+samples lie and how textures are looked up.
 """
 
 from collections.abc import Sequence
@@ -69,10 +70,14 @@ class Seen:
     triangle: Indices
     """By sample, -1 if there is none; shape (grid height, grid width)."""
     places: Points | None = None
-    """Columns and rows of the samples [px], (height, width, 2); none: the middles of the pixels of the window."""
+    """Columns and rows of the samples [px], (height, width, 2); none: the middles of the pixels of
+    the window.
+    """
 
     def share_below(self, end: int) -> npt.NDArray[np.float32]:
-        """Return the share of each pixel's samples that see one of the first `end` triangles, (height, width)."""
+        """Return the share of each pixel's samples that see one of the first `end` triangles,
+        (height, width).
+        """
         hit = (self.triangle >= 0) & (self.triangle < end)
         rows, columns = self.triangle.shape[0] // self.grid, self.triangle.shape[1] // self.grid
         share: npt.NDArray[np.float32] = hit.reshape(rows, self.grid, columns, self.grid).mean(
@@ -81,17 +86,22 @@ class Seen:
         return share
 
     def looked_up(self, places: Points) -> "Seen":
-        """Return what places (height, width, 2) [px] of the frame see, by the nearest sample, with a grid of 1."""
+        """Return what places (height, width, 2) [px] of the frame see, by the nearest sample, with
+        a grid of 1.
+        """
         near = np.rint(places).astype(int) - (self.window.left, self.window.top)
         return replace(self, triangle=self.triangle[near[..., 1], near[..., 0]], places=places)
 
     def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
-        """Interpolate values of vertices (V, k) in perspective at the samples, `fill` where nothing is seen.
+        """Interpolate values of vertices (V, k) in perspective at the samples, `fill` where nothing
+        is seen.
 
         For a grid of one sample a pixel. Returns shape (height, width, k).
         """
         if self.grid != 1:
-            raise ValueError(f"grid must be 1, a sample in the middle of each pixel; got {self.grid}")
+            raise ValueError(
+                f"grid must be 1, a sample in the middle of each pixel; got {self.grid}"
+            )
         given = np.asarray(values, dtype=np.float64)
         result = np.full((*self.triangle.shape, given.shape[1]), fill)
         rows, columns = np.nonzero(self.triangle >= 0)
@@ -105,7 +115,9 @@ class Seen:
 
 
 def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
-    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at places (n, 2), in the image."""
+    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at places (n, 2), in the
+    image.
+    """
     a, b, c = (corners[:, k] for k in range(3))
 
     def area(p: npt.NDArray[Any], q: npt.NDArray[Any], r: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -123,7 +135,9 @@ def projected(camera: Camera, points: npt.ArrayLike) -> Points:
 
 
 def scaled(camera: Camera, factor: float) -> Camera:
-    """Return a camera whose frame has `factor` times as many pixels along each side, rounded to whole ones."""
+    """Return a camera whose frame has `factor` times as many pixels along each side, rounded to
+    whole ones.
+    """
     size = {name: round(factor * getattr(camera, name)) for name in ("width", "height")}
     focal = {name: factor * getattr(camera, name) for name in ("fx", "fy")}
     centre = {name: factor * (getattr(camera, name) + 0.5) - 0.5 for name in ("cx", "cy")}
@@ -148,7 +162,9 @@ def decoded(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 
 def fans(faces: Sequence[Sequence[int]]) -> Indices:
     """Return convex polygons as fans of triangles, shape (T, 3)."""
-    return np.array([(face[0], b, c) for face in faces for b, c in pairwise(face[1:])], dtype=np.int32)
+    return np.array(
+        [(face[0], b, c) for face in faces for b, c in pairwise(face[1:])], dtype=np.int32
+    )
 
 
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
@@ -159,8 +175,12 @@ def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) ->
     behind = ~(points[:, 2] > 0.0)
     if behind.any():
         points = np.where(behind[:, None], (0.0, 0.0, 1.0), points)
-        triangles = np.where(behind[triangles].any(axis=1, keepdims=True), triangles[:1, :1], triangles)
-    return Seen(points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid))
+        triangles = np.where(
+            behind[triangles].any(axis=1, keepdims=True), triangles[:1, :1], triangles
+        )
+    return Seen(
+        points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid)
+    )
 
 
 class Textures:
@@ -170,7 +190,9 @@ class Textures:
         """Pack pictures (size, size, 3), 8-bit sRGB, row 0 at v = 0."""
         shapes = {picture.shape for picture in pictures}
         if len(shapes) != 1 or (shape := shapes.pop()) != (shape[0], shape[0], 3):
-            raise ValueError(f"textures must be pictures of one shape (size, size, 3); got {sorted(shapes)}")
+            raise ValueError(
+                f"textures must be pictures of one shape (size, size, 3); got {sorted(shapes)}"
+            )
         self.count = len(pictures)
         channels = -(-3 * self.count // _LANES) * _LANES
         self.texels = np.zeros((shape[0], shape[0], channels), dtype=np.float32)
@@ -195,6 +217,9 @@ class Albedo:
 
 
 def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
-    """Mean textures over the visible part of the first `cloth` triangles; uv: texture coordinates (V, 2) in [0, 1]."""
+    """Mean textures over the visible part of the first `cloth` triangles.
+
+    Uv: texture coordinates (V, 2) in [0, 1].
+    """
     packed = textures.texels, textures.count, seen.window.place, seen.grid
     return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))

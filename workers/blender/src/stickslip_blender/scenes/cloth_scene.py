@@ -23,6 +23,10 @@ def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> Task
     stage = Stage(scene, sheet, look.segments, record, lambda name: picture(name, workshop))
 
     def frame(geometry: Geometry) -> Camera:
-        return stage.camera(look.viewpoint, geometry, CLIP_SIZE) if look.rig is None else rig_camera(look)
+        return (
+            stage.camera(look.viewpoint, geometry, CLIP_SIZE)
+            if look.rig is None
+            else rig_camera(look)
+        )
 
     return render_clips(look, task, workshop, lambda _rest: stage, sheet=f"{sheet}.", frame=frame)

@@ -1,7 +1,7 @@
 """A hanging silicone rod, seen by all cameras of its rig before a dark ground, under soft lights.
 
-No clamp is in the picture: the rod begins at its first point. To recover the centreline from an image (thesis 5.3.1),
-threshold against the ground; every bright pixel is rod.
+No clamp is in the picture: the rod begins at its first point. To recover the centreline from an
+image (thesis 5.3.1), threshold against the ground; every bright pixel is rod.
 """
 
 from __future__ import annotations
@@ -44,10 +44,12 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def transport_frames(tangents: FloatArray) -> FloatArray:
-    """Carry a normal along unit tangents (n, 3) without twist; return (n, 2, 3), two unit normals at each point.
+    """Carry a normal along unit tangents (n, 3) without twist.
 
-    From point to point the frame turns by the least rotation that takes the tangent t to t', which for a normal n is
-    n' = n - (n . t') (t + t') / (1 + t . t').
+    Return (n, 2, 3), two unit normals at each point.
+
+    From point to point the frame turns by the least rotation that takes the tangent t to t', which
+    for a normal n is n' = n - (n . t') (t + t') / (1 + t . t').
     """
     normals = np.empty_like(tangents)
     axis = np.eye(3)[np.argmin(np.abs(tangents[0]))]
@@ -62,9 +64,11 @@ def transport_frames(tangents: FloatArray) -> FloatArray:
 
 
 def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
-    """Return the vertices of the tube about a centreline (n, 3), shape (n SIDES + CAP_RINGS SIDES + 2, 3).
+    """Return the vertices of the tube about a centreline (n, 3), shape (n SIDES + CAP_RINGS SIDES +
+    2, 3).
 
-    In order: n rings, the rings of the round end, its pole, the middle of the flat end in the clamp.
+    In order: n rings, the rings of the round end, its pole, the middle of the flat end in the
+    clamp.
     """
     tangents = np.gradient(centerline, axis=0, edge_order=2)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -73,13 +77,17 @@ def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (SIDES, 2)
     rings = centerline[:, None] + radius * circle @ normals  # (n, SIDES, 3)
     rise = np.pi / 2.0 / (CAP_RINGS + 1) * np.arange(1, CAP_RINGS + 1)[:, None, None]
-    cap = centerline[-1] + radius * (np.cos(rise) * (circle @ normals[-1]) + np.sin(rise) * tangents[-1])
+    cap = centerline[-1] + radius * (
+        np.cos(rise) * (circle @ normals[-1]) + np.sin(rise) * tangents[-1]
+    )
     pole = centerline[-1] + radius * tangents[-1]
     return np.concatenate([rings.reshape(-1, 3), cap.reshape(-1, 3), pole[None], centerline[:1]])
 
 
 def tube_faces(points: int) -> list[tuple[int, ...]]:
-    """Return the faces of the tube about a centreline of so many points, outward normals, as vertex indices."""
+    """Return the faces of the tube about a centreline of so many points, outward normals, as vertex
+    indices.
+    """
     rings = points + CAP_RINGS
     pole, middle = rings * SIDES, rings * SIDES + 1
     faces: list[tuple[int, ...]] = []
@@ -139,7 +147,9 @@ class RodRenderer:
         faces = tube_faces(POINTS)
         self._mesh = add_mesh(self._scene, "rod", tube_vertices(straight, RADIUS), faces)
         self._triangles = fans(faces)
-        self._shader = add_material(self._mesh, "silicone", Roughness=0.3, IOR=1.41)  # vinyl polysiloxane
+        self._shader = add_material(
+            self._mesh, "silicone", Roughness=0.3, IOR=1.41
+        )  # vinyl polysiloxane
         add_view(self._scene)
         self._reader = FrameReader(self._scene)
 
@@ -152,13 +162,16 @@ class RodRenderer:
         radius: float = RADIUS,
         seed: int = 0,
     ) -> npt.NDArray[np.uint8]:
-        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB, shape (cameras, height, width, 3).
+        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB, shape (cameras, height,
+        width, 3).
 
         Seed: added to that of the sampling, so that pictures of a dataset differ in their noise.
         """
         line = np.asarray(centerline, dtype=np.float64)
         if line.shape != (POINTS, 3) or not np.isfinite(line).all():
-            raise ValueError(f"centerline must be finite, of shape ({POINTS}, 3); got shape {line.shape}")
+            raise ValueError(
+                f"centerline must be finite, of shape ({POINTS}, 3); got shape {line.shape}"
+            )
         if not 0.0 < radius < 0.1:
             raise ValueError(f"radius must be in (0, 0.1) L; got {radius}")
         vertices = tube_vertices(line, radius).astype(np.float32)
@@ -176,20 +189,26 @@ class RodRenderer:
         if window.area:
             seen = see(points, self._triangles, window)
             light = self._reader.read_matte(window).astype(np.float32)
-            frame[window.slices] = encode(self._before_ground(light, seen.share_below(len(self._triangles))))
+            frame[window.slices] = encode(
+                self._before_ground(light, seen.share_below(len(self._triangles)))
+            )
         return frame
 
     def _before_ground(
         self, light: npt.NDArray[np.float32], coverage: npt.NDArray[np.float32]
     ) -> npt.NDArray[np.float32]:
-        """Put the light of the rod, (h, w, 4) with the share of samples that hit it, before the ground.
+        """Put the light of the rod, (h, w, 4) with the share of samples that hit it, before the
+        ground.
 
-        Most noise on a thin rod is in how many samples hit it. So the mean light of the hits, together with one
-        sample's worth of the pixels around, gets the coverage (h, w) that the rasteriser computes.
+        Most noise on a thin rod is in how many samples hit it. So the mean light of the hits,
+        together with one sample's worth of the pixels around, gets the coverage (h, w) that the
+        rasteriser computes.
         """
         padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
         rows, columns = coverage.shape
-        around = np.sum([padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0)
+        around = np.sum(
+            [padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0
+        )
         hit = around[..., 3:] > 0.0
         help_ = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
         mean = (light + help_)[..., :3] / np.where(hit, (light + help_)[..., 3:], 1.0)
@@ -203,8 +222,14 @@ def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskRes
     if rejected := why_unfit("rod", line, look.radius, cameras):
         return rejected
     color = silicone_color(look.color_seed)
-    renderer = workshop.renderer(("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality))
+    renderer = workshop.renderer(
+        ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality)
+    )
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
-    preview = workshop.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
+    preview = (
+        workshop.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
+    )
     chunks, labels = {"views": workshop.chunk(views)}, {"color": list(to_linear(color))}
-    return TaskResult(outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels))
+    return TaskResult(
+        outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels)
+    )

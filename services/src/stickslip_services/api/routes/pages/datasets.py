@@ -18,10 +18,23 @@ from stickslip_schemas.store import Store
 
 from stickslip_services.api.routes.common import ContextDep, Version, matches
 from stickslip_services.catalog.inputs import find_certificate, known_scenes, list_certificates
-from stickslip_services.catalog.versions import find_dataset, find_version, list_datasets, read_contents
+from stickslip_services.catalog.versions import (
+    find_dataset,
+    find_version,
+    list_datasets,
+    read_contents,
+)
 from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import coloured, histograms, losses, mp4, sample_view, sliders, thumbs
+from stickslip_services.pages.browsing import (
+    coloured,
+    histograms,
+    losses,
+    mp4,
+    sample_view,
+    sliders,
+    thumbs,
+)
 from stickslip_services.pages.rendering import html_page, plot, spec_text, table
 from stickslip_services.pages.samples import SampleData, motion
 from stickslip_services.queue.context import Context
@@ -42,7 +55,10 @@ class Opened:
 
 def _opened(dataset: str, version: Version, context: ContextDep) -> Opened:
     with context.database.read() as connection:
-        found, committed = find_dataset(connection, dataset), find_version(connection, dataset, version)
+        found, committed = (
+            find_dataset(connection, dataset),
+            find_version(connection, dataset, version),
+        )
     return Opened(found, committed, _sample_data(context.store, committed.manifest))
 
 
@@ -93,16 +109,22 @@ def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Res
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")
-def get_thumbs(request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0) -> Response:
+def get_thumbs(
+    request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0
+) -> Response:
     shown = thumbs(opened.data, request.query_params, start)
     page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **shown)
     if not start:
-        page.headers["HX-Replace-Url"] = f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
+        page.headers["HX-Replace-Url"] = (
+            f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
+        )
     return page
 
 
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
-def get_sample(opened: OpenedDep, slot: int, beside: Annotated[str, Query(max_length=20)] = "") -> Response:
+def get_sample(
+    opened: OpenedDep, slot: int, beside: Annotated[str, Query(max_length=20)] = ""
+) -> Response:
     """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
     data, name = opened.data, f"version {opened.version.version} of {opened.dataset.id}"
     last = data.manifest.sample_count - 1
@@ -141,9 +163,17 @@ def get_spec(opened: OpenedDep) -> Response:
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
 def get_picture(
-    opened: OpenedDep, slot: Slot, array: str, index: Annotated[int, Path(ge=0)], request: Request, step: Step = 1
+    opened: OpenedDep,
+    slot: Slot,
+    array: str,
+    index: Annotated[int, Path(ge=0)],
+    request: Request,
+    step: Step = 1,
 ) -> Response:
-    """Return a picture or a frame of ground truth of a sample as PNG; `step` takes every `step`-th pixel."""
+    """Return a picture or a frame of ground truth of a sample as PNG.
+
+    `step` takes every `step`-th pixel.
+    """
     data = opened.data
     tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}"'
     headers = {"Cache-Control": "private, max-age=86400", "ETag": tag}
@@ -211,18 +241,29 @@ def get_certificate(digest: str, context: ContextDep) -> Response:
     certificate = Certificate.model_validate_json(context.store.read(stored.artifact))
     plots = {protocol.protocol: list(_curves(protocol)) for protocol in certificate.protocols}
     return html_page(
-        "certificate.html", here="certificates", certificate=certificate, digest=digest, builds=builds, plots=plots
+        "certificate.html",
+        here="certificates",
+        certificate=certificate,
+        digest=digest,
+        builds=builds,
+        plots=plots,
     )
 
 
 def _builds(context: Context, connection: Connection) -> set[str]:
-    return {builds.sim_core for worker in alive_workers(context, connection) for builds in worker.builds.values()}
+    return {
+        builds.sim_core
+        for worker in alive_workers(context, connection)
+        for builds in worker.builds.values()
+    }
 
 
 def _curves(protocol: ProtocolReport) -> Iterator[dict[str, Any]]:
     for curve in protocol.curves[:6]:
         dense = curve.dense_x, curve.dense_master
-        line = dense if curve.dense_x else (curve.x, curve.master)  # of a certificate without dense curves
+        line = (
+            dense if curve.dense_x else (curve.x, curve.master)
+        )  # of a certificate without dense curves
         name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
         yield plot(
             _known("master curve", *line),

@@ -1,4 +1,6 @@
-"""Pages of jobs (the list, one job, the map of its grid, its buttons), of workers, and of the HTTP interface."""
+"""Pages of jobs (the list, one job, the map of its grid, its buttons), of workers, and of the HTTP
+interface.
+"""
 
 import asyncio
 import pathlib
@@ -108,7 +110,9 @@ def get_job(job_id: str, context: ContextDep) -> Response:
             elapsed=None if job.started_at is None else end - job.started_at.timestamp(),
             costs=estimated(job.spec, count(job.spec), {}, 0),
             previews=list_previews(connection, seq, count=24, newest=True),
-            rejected=list_samples(connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected).items,
+            rejected=list_samples(
+                connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected
+            ).items,
             failed=failed_tasks(connection, seq, context.settings, SHOWN_LOST),
             states=JobState,
             url=context.settings.url,
@@ -155,13 +159,19 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
 
 @router.get("/ui/changes")
 def get_changes(context: ContextDep) -> EventStream:
-    """Send an event to a page after each change of the database, at most once a second, without reading it."""
-    return EventStream(_changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
+    """Send an event to a page after each change of the database, at most once a second, without
+    reading it.
+    """
+    return EventStream(
+        _changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream"
+    )
 
 
 async def _changes(context: Context) -> AsyncIterator[bytes]:
     yield b"retry: 2000\n\n"
-    sent = -1  # the first event comes at once, because the database may have changed since the page was rendered
+    # the first event comes at once, because the database may have changed since the page was
+    # rendered
+    sent = -1
     while True:
         await context.notifier.wait(sent, 15.0)
         count = context.notifier.count
@@ -180,7 +190,9 @@ def get_workers(context: ContextDep) -> Response:
             if entry.extent == "full" and entry.passed
         }
         own = dataset_versions.c
-        read_at, damaged = connection.execute(select(func.min(own.scrubbed_at), func.sum(own.damaged))).one()
+        read_at, damaged = connection.execute(
+            select(func.min(own.scrubbed_at), func.sum(own.damaged))
+        ).one()
     return html_page(
         "workers.html",
         here="workers",
@@ -194,7 +206,10 @@ def get_workers(context: ContextDep) -> Response:
 
 
 def _memory() -> dict[str, int] | None:
-    """Return the memory of this machine, `MemTotal` and `MemAvailable` [B]; None without Linux's /proc."""
+    """Return the memory of this machine, `MemTotal` and `MemAvailable` [B].
+
+    None without Linux's /proc.
+    """
     try:
         lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
     except OSError:

@@ -1,7 +1,7 @@
 """The tables of 0.1.0, and the triggers that keep the audit log append-only.
 
-Until 0.1.0 is released, the baseline makes the tables as `tables.py` has them. The release writes them out here:
-a migration must not change later (CONTRIBUTING.md, Release).
+Until 0.1.0 is released, the baseline makes the tables as `tables.py` has them. The release writes
+them out here: a migration must not change later (CONTRIBUTING.md, Release).
 """
 
 from alembic import op
