@@ -1,7 +1,8 @@
-"""Count the lines of source, and fail where a file or a class is longer than anybody can keep in mind.
+"""Count the lines of source, and fail if a file is longer than a reader can keep in mind.
 
-Source is what git tracks of .py .pyi .cpp .hpp .html .js .css in the distributions, without tests. Code lines are lines
-that are neither empty nor only a comment, and do not belong to a docstring.
+Source is what git tracks of .py .pyi .cpp .hpp .html .js .css in the distributions, without tests.
+A code line is neither empty nor only a comment, and it does not belong to a docstring. There is no
+limit on the total: a limit makes the code dense. `make density` measures how dense the code is.
 """
 
 import ast
@@ -9,58 +10,71 @@ import subprocess
 import sys
 from pathlib import Path
 
-FOLDERS = ("schemas/src", "services/src", "workers", "training/src", "sim_core/src", "sim_core/python")
+FOLDERS = (
+    "schemas/src",
+    "services/src",
+    "workers",
+    "training/src",
+    "sim_core/src",
+    "sim_core/python",
+)
 ENDINGS = (".py", ".pyi", ".cpp", ".hpp", ".html", ".js", ".css")
 
-MAX_SOURCE_LINES = 49_884
-"""The goal is 50,000. Lower this with every change that removes lines; never raise it.
-
-It was raised once, from 53,500, for scenes as data and the checks of cloth: later changes must pay it back."""
-
 MAX_CODE_LINES = {".py": 400, ".cpp": 300, ".hpp": 300}
-MAX_CLASS_LINES = 250
 
 
 def source_files() -> list[Path]:
     """Return the tracked source files of the distributions."""
-    listed = subprocess.run(["git", "ls-files", "-z", *FOLDERS], capture_output=True, text=True, check=True).stdout
-    paths = [Path(name) for name in listed.split("\0") if name.endswith(ENDINGS) and not name.endswith(".min.js")]
-    return [path for path in paths if "tests" not in path.parts and path.is_file()]
+    command = ["git", "ls-files", "-z", *FOLDERS]
+    listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    sources = []
+    for name in listing.split("\0"):
+        path = Path(name)
+        is_ours = name.endswith(ENDINGS) and not name.endswith(".min.js")
+        if is_ours and "tests" not in path.parts and path.is_file():
+            sources.append(path)
+    return sources
 
 
-def python_code_lines(text: str) -> tuple[set[int], dict[str, int]]:
-    """Return the numbers of the code lines of a Python file, and how many each class has."""
-    tree = ast.parse(text)
-    code = {number for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"}
+def docstring_lines(tree: ast.Module) -> set[int]:
+    """Return the numbers of the lines that belong to strings that stand alone."""
+    numbers: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            code -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    classes = {
-        node.name: len(code & set(range(node.lineno, (node.end_lineno or node.lineno) + 1)))
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ClassDef)
-    }
-    return code, classes
+        if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+            continue
+        if isinstance(node.value.value, str):
+            numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return numbers
+
+
+def code_lines(path: Path, text: str) -> int:
+    """Return the number of code lines of a file."""
+    comment = "#" if path.suffix == ".py" else "//"
+    docstrings = docstring_lines(ast.parse(text)) if path.suffix == ".py" else set()
+    total = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        content = line.strip()
+        if content and not content.startswith(comment) and number not in docstrings:
+            total += 1
+    return total
 
 
 def main() -> int:
-    """Print the sizes; return 1 where one is over its limit."""
-    total, faults = 0, []
+    """Print the sizes; return 1 if a file is over its limit."""
+    total = 0
+    faults = []
     for path in source_files():
         text = path.read_text(encoding="utf-8")
         total += text.count("\n")
-        lines = sum(1 for line in text.splitlines() if line.strip() and not line.strip().startswith("//"))
-        if path.suffix == ".py":
-            code, classes = python_code_lines(text)
-            lines = len(code)
-            faults += [f"{path}: class {name} has {n} code lines" for name, n in classes.items() if n > MAX_CLASS_LINES]
         limit = MAX_CODE_LINES.get(path.suffix)
-        if limit is not None and lines > limit:
+        if limit is None:
+            continue
+        lines = code_lines(path, text)
+        if lines > limit:
             faults.append(f"{path} has {lines} code lines, the limit is {limit}")
-    print(f"{total} lines of source, the limit is {MAX_SOURCE_LINES}")
-    if total > MAX_SOURCE_LINES:
-        faults.append("the distributions have grown over their limit: what is added pays with what goes")
-    print(*faults, sep="\n", end="\n" if faults else "")
+    print(f"{total} lines of source")
+    for fault in faults:
+        print(fault)
     return 1 if faults else 0
 
 
