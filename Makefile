@@ -22,31 +22,33 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup demo test-fast test test-slow test-main test-blender check size docs bench wheels release-wheels constraints clean
+.PHONY: setup setup-dev demo test-fast test test-slow test-main test-blender test-without-blender test-core check size docs bench wheels release-wheels release-check constraints clean
 
+# The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
+
+setup-dev: setup .venv/dev.stamp
 
 .venv/setup.stamp: constraints.txt requirements.txt $(PYPROJECTS)
 	@tools/check_system.sh $(PYTHON)
-	@echo "setting up .venv (a few minutes the first time)"
-	@test -x $(PY) || $(PYTHON) -m venv .venv
-	@$(PY) -m pip install $(PIP_FLAGS) nanobind cmeel-eigen --constraint constraints.txt
-	@$(PY) -m pip install $(PIP_FLAGS) --requirement requirements.txt --constraint constraints.txt
+	@$(PYTHON) tools/setup_environment.py runtime
 	@touch $@ .venv/core.stamp
+
+.venv/dev.stamp: constraints.txt requirements-dev.txt $(PYPROJECTS) | .venv/setup.stamp
+	@$(PYTHON) tools/setup_environment.py development
+	@touch $@
 
 # The editable install builds the C++ core once: a changed source builds it again. nanobind and Eigen stand in .venv before:
 # a wheel finds them at the same places, and reuses what has been compiled.
 .venv/core.stamp: $(CORE_SOURCES) | .venv/setup.stamp
 	@if [ -n "$$(find $(CORE_SOURCES) -newer $@ 2>&1)" ]; then \
-	  echo "building sim_core"; \
+	  echo "building sim_core (1 to 3 minutes)"; \
 	  $(PY) -m pip install $(PIP_FLAGS) --no-deps --editable sim_core && touch $@; \
 	fi
 
 .venv-blender/setup.stamp: constraints-blender.txt requirements-blender.txt $(PYPROJECTS)
 	@tools/check_system.sh $(PYTHON)
-	@echo "setting up .venv-blender (a few minutes the first time)"
-	@test -x $(BLENDER_PY) || $(PYTHON) -m venv .venv-blender
-	@$(BLENDER_PY) -m pip install $(PIP_FLAGS) --requirement requirements-blender.txt --constraint constraints-blender.txt
+	@$(PYTHON) tools/setup_environment.py blender
 	@touch $@ .venv-blender/raster.stamp
 
 # As for the core: a changed source of the rasteriser builds it again.
@@ -66,11 +68,11 @@ demo: setup
 # A process of tests that dies ends the run: xdist waits for ever for the tests of one that it starts anew.
 PYTEST = $(PY) -m pytest --quiet --numprocesses=auto --dist=loadgroup --no-loadscope-reorder --max-worker-restart=0
 
-test-fast: setup
+test-fast: setup-dev
 	$(PYTEST) -m "not slow and not real and not physics" --cpu-limit=1
 
-test: setup
-	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender check
+test: setup-dev
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender test-without-blender test-core check
 
 # Tests wait a quarter of their time: one more runs than there are cores.
 test-main:
@@ -79,11 +81,22 @@ test-main:
 test-blender:
 	$(BLENDER_PY) -m pytest --quiet workers/blender
 
-test-slow: setup
+# All but Blender and the tests that start it, on any Python from 3.11.
+test-without-blender: .venv/core.stamp .venv/dev.stamp
+	$(PYTEST) -m "not slow and not real"
+
+# The core alone, on any system that has a C++20 compiler: CI runs it on arm64 and on macOS.
+test-core:
+	$(PYTHON) -m venv .venv-core
+	.venv-core/bin/python -m pip install $(PIP_FLAGS) ./sim_core pytest pytest-timeout hypothesis
+	.venv-core/bin/python -m pytest --quiet -p no:cacheprovider --rootdir sim_core --confcutdir sim_core \
+	  --import-mode importlib -m "not slow" sim_core/tests
+
+test-slow: setup-dev
 	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow
 	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
-check: setup
+check: setup-dev
 	$(PY) -m ruff format --check .
 	$(PY) -m ruff check .
 	.venv/bin/clang-format --dry-run --Werror $(CPP_FILES)
@@ -105,22 +118,22 @@ size:
 	@$(PY) tools/size.py
 
 # A warning is an error; tests/test_docs_code.py does the same, and runs the code of the pages.
-docs: setup
+docs: setup-dev
 	$(PY) -m sphinx -W --keep-going -q -b html docs build/docs
 	@echo "build/docs/index.html"
 
-bench: setup
+bench: setup-dev
 	@for script in $(BENCHMARKS); do \
 	  echo "== $$script"; \
 	  case $$script in */render_*) $(BLENDER_PY) $$script ;; *) $(PY) $$script ;; esac || exit 1; \
 	done
 
 # Everything that PyPI gets: source distributions, and wheels of this machine. Release wheels come from cibuildwheel.
-wheels: setup
+wheels: setup-dev
 	@for distribution in $(DISTRIBUTIONS); do $(PY) -m build --outdir dist $$distribution || exit 1; done
 
 # In CI, with Docker: manylinux wheels of the two compiled distributions; their pyproject.toml configures cibuildwheel.
-release-wheels: setup
+release-wheels: setup-dev
 	@for distribution in schemas services training workers; do $(PY) -m build --outdir dist $$distribution || exit 1; done
 	@for distribution in sim_core workers/blender; do \
 	  $(PY) -m build --sdist --outdir dist $$distribution || exit 1; \
@@ -128,9 +141,13 @@ release-wheels: setup
 	  $(PY) -m cibuildwheel --platform linux --output-dir dist $$distribution || exit 1; \
 	done
 
+# What a stranger meets: pins that the index has, and a fresh clone whose set-up and demo are measured for README.md.
+release-check: setup-dev
+	$(PY) tools/release_check.py --python $(PYTHON) --with-tests
+
 # Newest versions that the ranges of the components allow, tried in fresh environments.
 constraints:
 	tools/update_constraints.sh $(PYTHON)
 
 clean:
-	rm -rf .venv .venv-blender .venv-lerobot demo-out
+	rm -rf .venv .venv-blender .venv-core .venv-lerobot demo-out

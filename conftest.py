@@ -1,5 +1,4 @@
-"""What holds for the tests of all components: tiers, groups for parallel runs, and what each test
-costs.
+"""Rules for the tests of all components: tiers, groups for parallel runs, costs.
 
 `make test-fast` runs the tests without the markers `slow`, `real` and `physics`, and fails one that
 takes more CPU time than `--cpu-limit`. With `--cpu-report FILE` every test's CPU time [s] is
@@ -45,9 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Keep the garbage collector from what imports make, now and later: it would take a tenth of
-    the time.
-    """
+    """Keep the garbage collector from imported objects: it would take a tenth of the time."""
     gc.disable()
     yield
     gc.freeze()
@@ -55,11 +52,10 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one process run all tests that share a server or a fixture of their module, and sort the
-    modules.
+    """Let one process run all tests that share a server or a module's fixture; sort the modules.
 
-    Long rows of tests come first, then what waits or takes long: no process is left with it when
-    the others are done.
+    Long rows of tests come first, then tests that wait or take long: no process is left with them
+    when the others are done.
     """
     turns: dict[Path, tuple[bool, float, bool, bool]] = {}
     for item in items:
@@ -99,9 +95,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
-    """Stop a server when its last test is over: Ray takes a tenth of a processor while nobody uses
-    it.
-    """
+    """Stop a server when its last test is over: an idle Ray takes a tenth of a processor."""
     yield
     for name in item.stash.get(LAST_OF, ()):
         item._fixtureinfo.name2fixturedefs[name][-1].finish(item._request)
@@ -115,8 +109,9 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     item.stash[CPU_SECONDS] = sum(os.times()[:4]) - before
     limit = item.config.getoption("--cpu-limit")
     if limit is not None and item.stash[CPU_SECONDS] > limit:
+        seconds = item.stash[CPU_SECONDS]
         pytest.fail(
-            f"took {item.stash[CPU_SECONDS]:.1f} CPU s, a fast test may take {limit:g}: mark it or make it quick"
+            f"took {seconds:.1f} CPU s, a fast test may take {limit:g}: mark it or make it quick"
         )
 
 

@@ -71,8 +71,9 @@ def main() -> None:
 
 
 def wait_for_worker(url: str, since: datetime) -> None:
-    """Wait until a worker has registered since then: a job is planned for the builds of the newest
-    one.
+    """Wait until a worker has registered since then.
+
+    A job is planned for the builds of the newest worker.
     """
     with Client(url) as client:
         while not any(worker.registered_at >= since for worker in client.workers()):
@@ -80,14 +81,14 @@ def wait_for_worker(url: str, since: datetime) -> None:
 
 
 def report(dataset: Path, database: Path, job: str, wall: float) -> None:
-    """Print the wall time of the job, and the CPU seconds of its tasks: those made now, and those
-    from before.
-    """
+    """Print the wall time of the job and the CPU seconds of its tasks, new and cached."""
     spent: dict[tuple[str, bool], list[float]] = defaultdict(list)
     with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
         rows = connection.execute(
-            "SELECT stage, cached, cpu_seconds FROM tasks JOIN job_tasks ON job_tasks.task = tasks.seq "
-            "JOIN jobs ON jobs.seq = job_tasks.job WHERE jobs.id = ? AND tasks.cpu_seconds IS NOT NULL",
+            "SELECT stage, cached, cpu_seconds FROM tasks "
+            "JOIN job_tasks ON job_tasks.task = tasks.seq "
+            "JOIN jobs ON jobs.seq = job_tasks.job "
+            "WHERE jobs.id = ? AND tasks.cpu_seconds IS NOT NULL",
             (job,),
         )
         for stage, cached, seconds in rows:
@@ -112,9 +113,8 @@ def report(dataset: Path, database: Path, job: str, wall: float) -> None:
         )
     files = {file.path: file.size for file in manifest.files}
     video = sum(size for path, size in files.items() if path.startswith("video/"))
-    console.print(
-        f"  video {video / 1e6:.0f} MB, {frames * 224 * 224 * 3 / max(video, 1):.2f} times smaller than raw"
-    )
+    raw = frames * 224 * 224 * 3
+    console.print(f"  video {video / 1e6:.0f} MB, {raw / max(video, 1):.2f} times smaller than raw")
     _print_labels(dataset)
 
 

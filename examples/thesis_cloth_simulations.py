@@ -1,5 +1,6 @@
-"""Make the thesis's 160 cloth simulations through the service, with the certificate, and report
-what they cost.
+"""Make the thesis's 160 cloth simulations through the service, with the certificate.
+
+The script reports the cost of the simulations.
 
     .venv/bin/python examples/thesis_cloth_simulations.py [--out DIR] [--certificate DIR]
 
@@ -55,28 +56,29 @@ def report(out: Path) -> None:
     """Print the CPU seconds of the simulations, and how many of their steps did not converge."""
     with sqlite3.connect(f"file:{out / DATABASE}?mode=ro", uri=True) as database:
         rows = database.execute(
-            "SELECT payload, cpu_seconds FROM tasks WHERE stage = 'simulate' AND state = 'succeeded'"
+            "SELECT payload, cpu_seconds FROM tasks "
+            "WHERE stage = 'simulate' AND state = 'succeeded'"
         )
-        found = [(json.loads(payload), seconds) for payload, seconds in rows]
-    costs = np.array([seconds for _, seconds in found])
-    names = [f"{document['material']}, mu {document['mu']:g}" for document, _ in found]
+        simulations = [(json.loads(payload), seconds) for payload, seconds in rows]
+    costs = np.array([seconds for _, seconds in simulations])
+    names = [f"{document['material']}, mu {document['mu']:g}" for document, _ in simulations]
     labels = zarr.open_group(out / "dataset", mode="r")
     valid = np.asarray(labels["valid"])
     steps, unconverged = (
         np.asarray(labels[name])[valid] for name in ("steps", "unconverged_steps")
     )
-    shares = unconverged / steps
+    fractions = unconverged / steps
+    median = np.median(costs)
     console.rule("cost")
     console.print(
-        f"{len(costs)} simulations, {costs.sum() / 3600:.2f} CPU h; median {np.median(costs):.1f} CPU s"
+        f"{len(costs)} simulations, {costs.sum() / 3600:.2f} CPU h; median {median:.1f} CPU s"
     )
     for i in np.argsort(costs)[::-1][:5]:
-        console.print(
-            f"  {costs[i]:6.1f} CPU s, {costs[i] / np.median(costs):.1f} x the median: {names[i]}"
-        )
+        console.print(f"  {costs[i]:6.1f} CPU s, {costs[i] / median:.1f} x the median: {names[i]}")
     console.print(
-        f"steps that did not converge: {unconverged.sum()} of {steps.sum()}; at most {100 * shares.max():.3f} % of one "
-        f"simulation; in {np.count_nonzero(unconverged)} of {len(steps)} valid samples; "
+        f"steps that did not converge: {unconverged.sum()} of {steps.sum()}; "
+        f"at most {100 * fractions.max():.3f} % of one simulation; "
+        f"in {np.count_nonzero(unconverged)} of {len(steps)} valid samples; "
         f"{np.count_nonzero(~valid)} were rejected"
     )
 

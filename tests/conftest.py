@@ -51,13 +51,9 @@ def hub() -> Iterator[int]:
 @pytest.fixture
 def lab(hub: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
     """The coordinator with its database and its bucket."""
-    pytest.importorskip(
-        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-    )
-    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    pytest.importorskip(
-        "psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'"
-    )
+    pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+    pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: make setup-dev")
     from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()

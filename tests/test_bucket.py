@@ -13,10 +13,8 @@ from harness import STICKSLIP, Service, read_arrays
 from stickslip_sim_core import solve_rods
 from zarr.storage import ObjectStore
 
-pytest.importorskip(
-    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-)
-pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
 
 import obstore.store
 from stickslip_testing.s3 import make_bucket, s3_proxy, variables

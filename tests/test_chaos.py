@@ -353,13 +353,9 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
     """Two nodes, each a coordinator and a dispatcher, on one PostgreSQL database and one bucket
     that fails at times.
     """
-    pytest.importorskip(
-        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-    )
-    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
-    pytest.importorskip(
-        "psycopg", reason="psycopg is not installed: pip install 'stickslip[postgresql]'"
-    )
+    pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+    pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
+    pytest.importorskip("psycopg", reason="psycopg is not installed: make setup-dev")
     from stickslip_testing.postgresql import find_programs, postgresql_server
     from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 

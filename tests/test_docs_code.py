@@ -185,7 +185,7 @@ def test_the_reference_of_specs_is_up_to_date() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip("sphinx", reason="pip install sphinx myst-parser furo")
+    pytest.importorskip("sphinx", reason="make setup-dev")
     command = [
         sys.executable,
         "-m",

@@ -40,9 +40,7 @@ KUBERNETES = ("1.27", "1.31", "1.37")
 between.
 """
 
-helm = pytest.importorskip(
-    "helm_python", reason="Helm is not installed: pip install helm-python-sdk"
-)
+helm = pytest.importorskip("helm_python", reason="Helm is not installed: make setup-dev")
 
 
 def rendered(values: dict[str, Any]) -> list[dict[str, Any]]:
@@ -160,10 +158,8 @@ CRDS = {
 @pytest.mark.parametrize("version", KUBERNETES)
 @pytest.mark.parametrize("name", CI)
 def test_kubernetes_takes_every_object(name: str, version: str) -> None:
-    jsonschema = pytest.importorskip("jsonschema", reason="pip install jsonschema")
-    kubernetes = pytest.importorskip(
-        "kubernetes_validate", reason="pip install kubernetes-validate"
-    )
+    jsonschema = pytest.importorskip("jsonschema", reason="make setup-dev")
+    kubernetes = pytest.importorskip("kubernetes_validate", reason="make setup-dev")
     objects = rendered(CI[name])
     for item in objects:
         spec = CRDS.get((item["apiVersion"], item["kind"]))
@@ -187,9 +183,7 @@ def test_kubernetes_takes_every_object(name: str, version: str) -> None:
 
 
 def test_strict_means_strict() -> None:
-    kubernetes = pytest.importorskip(
-        "kubernetes_validate", reason="pip install kubernetes-validate"
-    )
+    kubernetes = pytest.importorskip("kubernetes_validate", reason="make setup-dev")
     (service,) = of_kind(rendered(CI["minimal"]), "Service").values()
     service["spec"]["portz"] = []
     with pytest.raises(kubernetes.ValidationError, match="portz"):
@@ -418,7 +412,7 @@ def test_the_dashboard_reaches_its_config_map() -> None:
 
 def test_promql_is_sound() -> None:
     parser = pytest.importorskip(
-        "promql_parser", reason="promql-parser is not installed: pip install promql-parser"
+        "promql_parser", reason="promql-parser is not installed: make setup-dev"
     )
     for expression in expressions():
         parser.parse(expression.replace("$__rate_interval", "5m"))

@@ -102,9 +102,7 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
     Then a node comes late, one has other builds, one is killed, one freezes, one is cut off, and
     the head is killed.
     """
-    helm = pytest.importorskip(
-        "helm_python", reason="Helm is not installed: pip install helm-python-sdk"
-    )
+    helm = pytest.importorskip("helm_python", reason="Helm is not installed: make setup-dev")
     values = {"store": {"url": BUCKET}, "ray": {"enabled": True, "maxReplicas": 2, "slots": 1}}
     with helm.Chart.load(CHART) as chart:
         text = chart.render(values, name="demo", namespace="lab")["stickslip/templates/ray.yaml"]

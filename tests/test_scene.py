@@ -13,10 +13,8 @@ import httpx
 import pytest
 from harness import STICKSLIP, Service, read_arrays, wait_for
 
-pytest.importorskip(
-    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-)
-pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
 
 from stickslip_testing.s3 import make_bucket, s3_proxy, variables
 from stickslip_training.data.samples import Samples

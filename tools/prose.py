@@ -40,9 +40,7 @@ def phrases() -> tuple[re.Pattern[str], list[str]]:
 
 
 def complaints(path: Path, bad: re.Pattern[str], instead: list[str]) -> Iterator[str]:
-    """Yield a line for every bad phrase of a file, and for every complaint of proselint about
-    Markdown.
-    """
+    """Yield a line for each bad phrase of a file, and for each complaint of proselint."""
     text = path.read_text()
     if path.suffix == ".md":
         text = re.sub(r"^```.*?^```|`[^`\n]*`", _blank, text, flags=re.DOTALL | re.MULTILINE)
@@ -52,8 +50,9 @@ def complaints(path: Path, bad: re.Pattern[str], instead: list[str]) -> Iterator
             yield f"{path.relative_to(ROOT)}:{result.pos[0]}: {result.check_result.message}"
     for match in bad.finditer(text):
         line = 1 + text.count("\n", 0, match.start())
-        found = " ".join(match[0].split())
-        yield f"{path.relative_to(ROOT)}:{line}: {found!r}: write instead: {instead[(match.lastindex or 1) - 1]}"
+        phrase = " ".join(match[0].split())
+        replacement = instead[(match.lastindex or 1) - 1]
+        yield f"{path.relative_to(ROOT)}:{line}: {phrase!r}: write instead: {replacement}"
 
 
 def _blank(match: re.Match[str]) -> str:
@@ -69,9 +68,12 @@ def main(arguments: list[str]) -> int:
     ).stdout.split("\n")
     paths = [ROOT / name for name in arguments or tracked if name and name != "tools/prose.py"]
     bad, instead = phrases()
-    found = [line for path in paths if path.exists() for line in complaints(path, bad, instead)]
-    sys.stdout.write("".join(f"{line}\n" for line in found))
-    return 1 if found else 0
+    faults: list[str] = []
+    for path in paths:
+        if path.exists():
+            faults += complaints(path, bad, instead)
+    sys.stdout.write("".join(f"{line}\n" for line in faults))
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

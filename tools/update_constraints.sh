@@ -16,14 +16,20 @@ numcodecs==0.16.6
 soupsieve<3
 PINS
 
-freeze() { # environment, requirements file, constraints file
-  "$python" -m venv "$work/$1"
-  "$work/$1/bin/python" -m pip install --quiet --disable-pip-version-check -r "$2" -c "$work/pins.txt"
+# A local version such as 2.13.0+cpu stands on no public index: only its public part is written.
+freeze() { # environment, constraints file, requirements files
+  environment=$1 constraints=$2
+  shift 2
+  "$python" -m venv "$work/$environment"
+  for requirements in "$@"; do
+    "$work/$environment/bin/python" -m pip install --quiet --disable-pip-version-check -r "$requirements" \
+      -c "$work/pins.txt"
+  done
   {
     echo "# Written by tools/update_constraints.sh (make constraints); do not edit."
-    "$work/$1/bin/python" -m pip freeze --exclude-editable | grep -v ' @ file:'
-  } >"$3"
+    "$work/$environment/bin/python" -m pip freeze --exclude-editable | grep -v ' @ file:' | sed 's/+.*//'
+  } >"$constraints"
 }
 
-freeze service requirements.txt constraints.txt
-freeze blender requirements-blender.txt constraints-blender.txt
+freeze service constraints.txt requirements.txt requirements-dev.txt
+freeze blender constraints-blender.txt requirements-blender.txt

@@ -41,7 +41,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def postgresql() -> Iterator["PostgresqlServer"]:
     """A PostgreSQL server, started with the first test that needs it."""
     if find_spec("psycopg") is None:
-        pytest.skip("psycopg is not installed: pip install 'stickslip[server,postgresql]'")
+        pytest.skip("psycopg is not installed: make setup-dev")
     from stickslip_testing.postgresql import find_programs, postgresql_server
 
     programs = find_programs()
@@ -54,10 +54,8 @@ def postgresql() -> Iterator["PostgresqlServer"]:
 @pytest.fixture(scope="session")
 def s3() -> Iterator["Proxy"]:
     """An S3 server behind a proxy, started with the first test that needs it."""
-    pytest.importorskip(
-        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-    )
-    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+    pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+    pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
     from stickslip_testing.s3 import s3_proxy
 
     with s3_proxy() as proxy:

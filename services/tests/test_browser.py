@@ -26,8 +26,8 @@ from stickslip_testing.jobs import parsed, rods, show_job
 from stickslip_testing.servers import serving, wait_until
 from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-axe = pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")
+sync_api = pytest.importorskip("playwright.sync_api", reason="make setup-dev")
+axe = pytest.importorskip("axe_playwright_python", reason="make setup-dev")
 
 pytestmark = pytest.mark.real
 

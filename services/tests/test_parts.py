@@ -150,4 +150,7 @@ def test_an_export_is_the_training_packages_work(
     assert "an export needs one of" in capfd.readouterr().err
     monkeypatch.setattr("stickslip_services.cli.datasets.find_spec", lambda _name: None)
     done = run("export", dataset, "--webdataset", tmp_path / "out", "--url", url)
-    assert (done.exit_code, "pip install 'stickslip-training[export]'" in done.stderr) == (1, True)
+    assert (done.exit_code, "pip install ./schemas './training[export]'" in done.stderr) == (
+        1,
+        True,
+    )

@@ -547,5 +547,7 @@ def test_a_password_is_not_shown(tmp_path: Path) -> None:
 
 def test_a_missing_driver_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stickslip_services.database.opening.find_spec", lambda _name: None)
-    with pytest.raises(DatabaseRefusedError, match=r"pip install 'stickslip\[server,postgresql\]'"):
+    with pytest.raises(
+        DatabaseRefusedError, match=r"pip install ./schemas './services\[server,postgresql\]'"
+    ):
         connect(Settings.chosen(data=tmp_path, database="postgresql://me@host/name"))

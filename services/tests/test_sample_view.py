@@ -176,7 +176,7 @@ def test_a_body_of_triangles_follows_its_bones() -> None:
 
 
 def test_a_film_shows_the_frames_of_the_clip() -> None:
-    av = pytest.importorskip("av", reason="pip install 'stickslip[films]'")
+    av = pytest.importorskip("av", reason="make setup-dev")
     frames = [np.full((224, 224, 3), level, np.uint8) for level in (20, 120, 220)]
     with av.open(BytesIO(mp4(frames))) as film:
         assert (film.streams.video[0].average_rate, film.streams.video[0].codec_context.name) == (

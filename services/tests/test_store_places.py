@@ -23,9 +23,7 @@ from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, sho
 from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
 
-pytest.importorskip(
-    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-)
+pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
 
 import obstore.store
 from stickslip_testing.s3 import Proxy, no_fault

@@ -45,7 +45,7 @@ def test_the_command_line_needs_no_extra() -> None:
     assert "pull" in done.stdout
     done = run_without_extras(run.format("'up', '--port', '0'"))
     assert done.returncode == 1
-    assert "pip install 'stickslip[server]'" in " ".join(done.stderr.split())
+    assert "pip install ./schemas './services[server]'" in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
 
 
@@ -55,7 +55,11 @@ def test_the_command_line_needs_no_extra() -> None:
     [
         ("thesis-rods.yaml", 0, "10000 (train"),
         ("demo-cloth.yaml", 0, "the spec is valid"),
-        ("fabric-cloth.yaml", 1, "numpy is not installed: pip install 'stickslip[arrays]'"),
+        (
+            "fabric-cloth.yaml",
+            1,
+            "numpy is not installed: run `pip install ./schemas './services[arrays]'`",
+        ),
     ],
 )
 def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(
@@ -75,7 +79,7 @@ def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(
 @pytest.mark.real
 def test_a_dataset_is_not_opened_without_arrays() -> None:
     done = run_without_extras("from stickslip import Client\nClient().open('ds-0000000000000000')")
-    assert "is not installed: pip install 'stickslip[arrays]'" in done.stderr
+    assert "is not installed: run `pip install ./schemas './services[arrays]'`" in done.stderr
 
 
 def test_only_what_the_extra_installs_is_said_to_be_in_it() -> None:

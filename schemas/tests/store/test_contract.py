@@ -62,10 +62,8 @@ def directory(root: Path) -> Place:
 @pytest.fixture(scope="module")
 def server() -> Iterator["Proxy"]:
     """A real S3 server behind a proxy."""
-    pytest.importorskip(
-        "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-    )
-    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+    pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+    pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
     from stickslip_testing.s3 import s3_proxy
 
     with s3_proxy() as proxy:
@@ -361,6 +359,6 @@ def test_a_bucket_without_obstore_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(
         ValueError,
-        match=r"needs obstore, which is not installed: pip install 'stickslip-schemas\[s3\]'",
+        match=r"needs obstore, which is not installed: run `pip install './schemas\[s3\]'`",
     ):
         open_store("s3://bucket/store")

@@ -9,10 +9,8 @@ import pytest
 from stickslip_schemas.base import sha256
 from stickslip_schemas.store import is_unavailable
 
-pytest.importorskip(
-    "obstore", reason="obstore is not installed: pip install 'stickslip-schemas[s3]'"
-)
-pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
 
 import obstore
 import obstore.exceptions

@@ -16,10 +16,8 @@ from stickslip_training.data.sources import (
     open_source,
 )
 
-pytest.importorskip(
-    "obstore", reason="obstore is not installed: pip install 'stickslip-training[s3]'"
-)
-pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[server]'")
+pytest.importorskip("obstore", reason="obstore is not installed: make setup-dev")
+pytest.importorskip("moto", reason="moto is not installed: make setup-dev")
 
 import obstore.store
 from stickslip_testing.s3 import make_bucket, s3_proxy, variables

@@ -56,9 +56,7 @@ def same(found: Any, wanted: np.ndarray) -> bool:
 
 
 def test_hdf5_is_the_source(source: Any, tmp_path: Path) -> None:
-    h5py = pytest.importorskip(
-        "h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'"
-    )
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed: make setup-dev")
     target = tmp_path / "out.h5"
     export(source, "--hdf5", target)
     wanted = expected(source)
@@ -80,9 +78,7 @@ def test_hdf5_is_the_source(source: Any, tmp_path: Path) -> None:
 
 
 def test_a_flipped_bit_in_hdf5_is_an_error(clips: Any, tmp_path: Path) -> None:
-    h5py = pytest.importorskip(
-        "h5py", reason="h5py is not installed: pip install 'stickslip-training[export]'"
-    )
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed: make setup-dev")
     target = tmp_path / "out.h5"
     export(clips, "--hdf5", target)
     with h5py.File(target) as file:
@@ -98,7 +94,7 @@ def test_webdataset_is_the_source(
     source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     webdataset = pytest.importorskip(
-        "webdataset", reason="webdataset is not installed: pip install webdataset"
+        "webdataset", reason="webdataset is not installed: make setup-dev"
     )
     monkeypatch.setattr(
         content_module,
@@ -139,9 +135,7 @@ def test_webdataset_is_the_source(
 def test_huggingface_is_the_source(
     source: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    datasets = pytest.importorskip(
-        "datasets", reason="datasets is not installed: pip install 'stickslip-training[export]'"
-    )
+    datasets = pytest.importorskip("datasets", reason="datasets is not installed: make setup-dev")
     monkeypatch.setattr(
         content_module,
         "FILE_BYTES",

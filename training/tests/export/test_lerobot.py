@@ -84,9 +84,7 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
 
 
 def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> None:
-    pytest.importorskip(
-        "pandas", reason="pandas is not installed: pip install 'stickslip-training[export]'"
-    )
+    pytest.importorskip("pandas", reason="pandas is not installed: make setup-dev")
     parquet = pytest.importorskip("pyarrow.parquet")
     made, data = content(without=(3,))  # the second simulation lacks a view
     lerobot.write(made, tmp_path, lambda _: None)
@@ -122,9 +120,7 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
 
 
 def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
-    av = pytest.importorskip(
-        "av", reason="av is not installed: pip install 'stickslip-training[export]'"
-    )
+    av = pytest.importorskip("av", reason="av is not installed: make setup-dev")
     made, data = content(1)
     lerobot.write(made, tmp_path, lambda _: None)
     for slot, view in enumerate(VIEWS):

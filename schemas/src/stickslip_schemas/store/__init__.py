@@ -21,6 +21,7 @@ from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import quote, unquote, urlsplit
 
 from stickslip_schemas.base import is_sha256, sha256
+from stickslip_schemas.installation import install_hint
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -255,7 +256,8 @@ def open_store(place: str | Path) -> Store:
         from stickslip_schemas.store.bucket import BucketStore
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"the store {place} needs obstore, which is not installed: pip install 'stickslip-schemas[s3]'"
+            f"the store {place} needs obstore, which is not installed: "
+            + install_hint("stickslip-schemas", "s3")
         ) from error
     url = urlsplit(place)
     return BucketStore(url.netloc, unquote(url.path).strip("/"))

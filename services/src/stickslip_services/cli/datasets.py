@@ -12,6 +12,7 @@ import click
 from click.exceptions import Exit
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
+from stickslip_schemas.installation import install_hint
 
 from stickslip_services.cli.common import (
     FILE,
@@ -132,7 +133,8 @@ def export(client: Client) -> None:
     """
     if find_spec("stickslip_training") is None:
         raise ClientError(
-            "`stickslip export` needs the training package: pip install 'stickslip-training[export]'"
+            "`stickslip export` needs the training package: "
+            + install_hint("stickslip-training", "export")
         )
     given = click.get_current_context().args
     arguments = []
@@ -194,7 +196,8 @@ def verify(target: Path, allowed_signers: Path | None) -> None:
         click.echo(f"{target}: all files are present and unchanged{signed}")
         if not READS_ARRAYS:
             say(
-                "sample keys were not compared with the manifest: that needs pip install 'stickslip[arrays]'"
+                "sample keys were not compared with the manifest, which needs more packages: "
+                + install_hint("stickslip", "arrays")
             )
         return
     print_table(

@@ -21,6 +21,7 @@ from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
 from stickslip_schemas.format.manifest import Contents, Manifest
+from stickslip_schemas.installation import install_hint
 
 from stickslip_services.addresses import DEFAULT_URL
 
@@ -80,7 +81,7 @@ class MissingExtraError(ClientError):
     """Packages of an extra are not installed."""
 
     def __init__(self, extra: str, what: str) -> None:
-        super().__init__(f"{what} is not installed: pip install 'stickslip[{extra}]'")
+        super().__init__(f"{what} is not installed: {install_hint('stickslip', extra)}")
 
 
 def raise_for_problem(response: httpx.Response) -> None:

@@ -14,6 +14,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, inspect, text
 from sqlalchemy.exc import DBAPIError
 from stickslip_schemas.format.manifest import MANIFEST_NAME
+from stickslip_schemas.installation import install_hint
 from stickslip_schemas.store import open_store
 
 from stickslip_services.database.database import Database, Role, SqliteDatabase
@@ -34,7 +35,7 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
     if find_spec("psycopg") is None:
         raise DatabaseRefusedError(
             f"the database {settings.database_name} needs psycopg, which is not installed: "
-            "pip install 'stickslip[server,postgresql]'"
+            + install_hint("stickslip", "server", "postgresql")
         )
     from stickslip_services.database.postgresql import PostgresqlDatabase
 

@@ -16,6 +16,7 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 from stickslip_schemas.format.selection import Selection
+from stickslip_schemas.installation import install_hint
 from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.data.reader import DatasetReader
@@ -168,7 +169,8 @@ def export(
         [(option, target)] = given.items()
         if missing := [name for name in _NEEDED.get(option, []) if find_spec(name) is None]:
             raise ImportError(
-                f"{option} needs {', '.join(missing)}, which is not installed: pip install 'stickslip-training[export]'"
+                f"{option} needs {', '.join(missing)}, which is not installed: "
+                + install_hint("stickslip-training", "export")
             )
         selection = Selection.of_options(arrays, split, where)
         with DatasetReader(dataset) as reader:

@@ -26,6 +26,7 @@ import torch
 from pydantic import ValidationError
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from stickslip_schemas.installation import install_hint
 from stickslip_schemas.spec.cameras import Camera, undistorted
 
 from stickslip_training.arrays import Array, Floats
@@ -186,7 +187,7 @@ def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
         import av
     except ModuleNotFoundError as error:
         raise VideoError(
-            "reading videos needs PyAV: pip install 'stickslip-training[video]'"
+            "reading videos needs PyAV: " + install_hint("stickslip-training", "video")
         ) from error
     try:
         with av.open(str(path)) as container:
@@ -219,7 +220,7 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
         import cv2
     except ModuleNotFoundError as error:
         raise VideoError(
-            "following the holders needs OpenCV: pip install 'stickslip-training[video]'"
+            "following the holders needs OpenCV: " + install_hint("stickslip-training", "video")
         ) from error
     seen, depth = camera.project(holder_points(np.zeros(1))[0])
     window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)

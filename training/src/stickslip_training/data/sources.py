@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
+from stickslip_schemas.installation import install_hint
 
 API_KEY_VARIABLE = "STICKSLIP_API_KEY"
 """Environment variable with the key that is sent to a server where none is given."""
@@ -180,7 +181,8 @@ class BucketSource(_RemoteSource):
             import obstore
         except ModuleNotFoundError as error:
             raise SourceError(
-                f"{self} needs obstore, which is not installed: pip install 'stickslip-training[s3]'"
+                f"{self} needs obstore, which is not installed: "
+                + install_hint("stickslip-training", "s3")
             ) from error
         if self._client is not None and self._pid != os.getpid():
             raise SourceError(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
+from stickslip_schemas.installation import install_hint
 from stickslip_schemas.spec.cameras import Camera, read_rigs
 
 from stickslip_training.reconstruction.pipeline import Reconstruction, reconstruct
@@ -27,7 +28,9 @@ def import_pillow() -> Any:
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
-        raise ImportError("Pillow is missing: pip install 'stickslip-training[images]'") from error
+        raise ImportError(
+            "Pillow is missing: " + install_hint("stickslip-training", "images")
+        ) from error
     return Image
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from stickslip_schemas.installation import install_hint
 from stickslip_schemas.spec.jobs import Quality
 
 # Debian's names
@@ -43,7 +44,8 @@ def import_bpy() -> Any:
             import bpy
     except ModuleNotFoundError as error:
         raise ImportError(
-            "bpy is missing: stickslip_blender runs in an environment of its own (pip install stickslip-blender)"
+            "bpy is missing: stickslip_blender runs in an environment of its own: "
+            + install_hint("stickslip-blender", "bpy")
         ) from error
     except ImportError as error:
         raise ImportError(

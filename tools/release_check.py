@@ -1,0 +1,167 @@
+"""Set up a fresh clone as a stranger does, and measure the promises of README.md.
+
+`make release-check` runs it.
+
+    python tools/release_check.py [--python python3.11] [--keep DIR] [--with-tests]
+
+1. Every pin of the constraints is on the index with its public version: no folder of wheels helps.
+2. `make setup` and `make demo` of a fresh clone end well. Their minutes, CPU seconds, packages and
+   gigabytes are written to tools/setup_measurements.json, which README.md must agree with.
+3. With `--with-tests`, `make setup-dev` and `make test` are measured, too.
+"""
+
+import argparse
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+MEASUREMENTS = ROOT / "tools" / "setup_measurements.json"
+INDEX_REQUESTS = 8
+"""So many pins are looked up at the same time."""
+
+DEMO_CPU_SECONDS = 400
+"""The demo must not take more CPU time than this after set-up [s]."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a command took."""
+
+    minutes: float
+    cpu_seconds: float
+
+
+def find_missing_pins(python: str) -> list[str]:
+    """Return the pins that the index does not have in their public version."""
+    pins = []
+    for path in sorted(ROOT.glob("constraints*.txt")):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if line and not line.startswith("#"):
+                pins.append(line)
+    # A folder of wheels, for example with a CPU build of PyTorch, would hide that the index has
+    # none.
+    environment = {name: value for name, value in os.environ.items() if name != "PIP_FIND_LINKS"}
+
+    def is_missing(pin: str) -> bool:
+        name, _, version = pin.partition("==")
+        command = [python, "-m", "pip", "index", "versions", name]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        versions = re.findall(r"[\w.+!-]+", done.stdout.partition("Available versions:")[2])
+        return version not in versions
+
+    with ThreadPoolExecutor(INDEX_REQUESTS) as pool:
+        missing = list(pool.map(is_missing, pins))
+    return [pin for pin, is_gone in zip(pins, missing, strict=True) if is_gone]
+
+
+def run_measured(command: list[str], folder: Path) -> Measurement:
+    """Run a command in a folder; end the program if it fails."""
+    print("==", *command, flush=True)
+    started = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, cwd=folder, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Measurement((time.monotonic() - started) / 60, cpu_seconds)
+
+
+def count_packages(environment: Path) -> int:
+    """Return how many packages an environment has."""
+    return len(list(environment.glob("lib/python3*/site-packages/*.dist-info")))
+
+
+def gigabytes(folder: Path) -> float:
+    """Return the size of a folder on the disk [GB]."""
+    done = subprocess.run(
+        ["du", "-s", "-B1", str(folder)], capture_output=True, text=True, check=True
+    )
+    return int(done.stdout.split()[0]) / 1e9
+
+
+def measure(clone: Path, python: str, with_tests: bool) -> dict[str, Any]:
+    """Set a clone up, run the demo and, if asked, the tests; return the record."""
+    make = ["make", f"PYTHON={python}"]
+    setup = run_measured([*make, "setup"], clone)
+    demo = run_measured([*make, "demo"], clone)
+    if demo.cpu_seconds > DEMO_CPU_SECONDS:
+        sys.exit(f"the demo took {demo.cpu_seconds:.0f} CPU s, and may take {DEMO_CPU_SECONDS}")
+    runtime = clone / ".venv"
+    blender = clone / ".venv-blender"
+    # Blender's environment is made after the other: two thirds of the time are the first one's.
+    record: dict[str, Any] = {
+        "environments": {
+            "runtime": {
+                "packages": count_packages(runtime),
+                "minutes": round(setup.minutes * 2 / 3, 1),
+                "gigabytes": round(gigabytes(runtime), 1),
+            },
+            "blender": {
+                "packages": count_packages(blender),
+                "minutes": round(setup.minutes / 3, 1),
+                "gigabytes": round(gigabytes(blender), 1),
+            },
+        },
+        "minutes": {"setup": round(setup.minutes), "demo": round(demo.minutes)},
+        "demo_cpu_seconds": round(demo.cpu_seconds),
+    }
+    if with_tests:
+        development = run_measured([*make, "setup-dev"], clone)
+        test = run_measured([*make, "test"], clone)
+        before = record["environments"]["runtime"]
+        record["environments"]["development"] = {
+            "packages": count_packages(runtime) - before["packages"],
+            "minutes": round(development.minutes, 1),
+            "gigabytes": round(gigabytes(runtime) - before["gigabytes"], 1),
+        }
+        record["minutes"]["setup-dev"] = round(development.minutes)
+        record["minutes"]["test"] = round(test.minutes)
+    return record
+
+
+def merge_records(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Return the old record with the numbers that were measured anew."""
+    merged = dict(old)
+    for name, value in new.items():
+        merged[name] = {**old.get(name, {}), **value} if isinstance(value, dict) else value
+    return merged
+
+
+def main() -> int:
+    """Check the pins, measure a fresh clone and write the record."""
+    parser = argparse.ArgumentParser(description="Measure the set-up of a fresh clone.")
+    parser.add_argument(
+        "--python", default="python3.11", help="the interpreter of the environments"
+    )
+    parser.add_argument("--keep", type=Path, help="clone into this empty folder, and keep it")
+    parser.add_argument("--with-tests", action="store_true", help="run make test, too")
+    options = parser.parse_args()
+    missing = find_missing_pins(options.python)
+    if missing:
+        sys.exit(f"pins that the index does not have: {', '.join(missing)}")
+    folder = options.keep or Path(tempfile.mkdtemp(prefix="stickslip-release-"))
+    try:
+        clone = folder / "clone"
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
+        record = measure(clone, options.python, options.with_tests)
+    finally:
+        if options.keep is None:
+            shutil.rmtree(folder)
+    old = json.loads(MEASUREMENTS.read_text(encoding="utf-8"))
+    MEASUREMENTS.write_text(json.dumps(merge_records(old, record), indent=2) + "\n")
+    print(f"wrote {MEASUREMENTS}; tests/test_installation.py compares README.md with it")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
