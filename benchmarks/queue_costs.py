@@ -27,7 +27,8 @@ from typing import Any
 
 import httpx
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
-from stickslip_services.access.keys import Scope, create_key
+from stickslip_services.access.keys import create_key
+from stickslip_services.access.principals import Scope
 from stickslip_services.api.middleware import allow_many_files
 from stickslip_services.api.sse import MOST_STREAMS
 from stickslip_services.database.database import Role

@@ -9,20 +9,13 @@ import pytest
 from click.testing import CliRunner
 from sqlalchemy import delete, update
 from sqlalchemy.exc import DBAPIError
-from stickslip_services.access.keys import (
-    NOBODY,
-    Asker,
-    Scope,
-    asking,
-    create_key,
-    read_audit_log,
-    revoke_key,
-    sealer,
-)
+from stickslip_services.access import audit_log
+from stickslip_services.access.keys import create_key, revoke_key, sealer
+from stickslip_services.access.principals import NOBODY, Principal, Scope, acting_as
 from stickslip_services.access.webhooks import create_webhook, delete_webhook, retry_webhook
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
-from stickslip_services.database.tables import audit_log
+from stickslip_services.database.tables import audit_log as audit_rows
 from stickslip_services.errors import NotFoundError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
@@ -38,15 +31,15 @@ pytestmark = pytest.mark.databases
 def lines(context: Context, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
     """Return who did what, the oldest first."""
     with context.database.read() as connection:
-        found = read_audit_log(connection, subject=subject)
+        found = audit_log.read(connection, subject=subject)
     return [(line.actor, line.action, line.details) for line in reversed(found)]
 
 
 def test_every_change_of_a_job_has_its_line(context: Context, worker: PretendWorker) -> None:
-    with asking(Asker("key-1 ada")):
+    with acting_as(Principal("key-1 ada")):
         job = submit_job(context, parsed(rods(name="hers")), None, priority=3).id  # type: ignore[union-attr]
         pause_job(context, job)
-    with asking(Asker("key-2 bert")):
+    with acting_as(Principal("key-2 bert")):
         resume_job(context, job)
         prioritise_job(context, job, 7)
         cancel_job(context, job)
@@ -75,7 +68,7 @@ def test_what_is_refused_or_fails_leaves_no_line(
 
 
 def test_keys_and_webhooks_have_lines(context: Context) -> None:
-    with asking(Asker("user ada")), context.database.write() as connection:
+    with acting_as(Principal("user ada")), context.database.write() as connection:
         key, secret = create_key(connection, "bert", [Scope.read, Scope.submit], 1.0)
         revoke_key(connection, key, 2.0)
         hook, sign = create_webhook(
@@ -98,7 +91,7 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
     assert not any(secret in json.dumps(found) for secret in (secret, sign))
 
 
-@pytest.mark.parametrize("change", [update(audit_log).values(actor="nobody"), delete(audit_log)])
+@pytest.mark.parametrize("change", [update(audit_rows).values(actor="nobody"), delete(audit_rows)])
 def test_no_line_can_be_changed(context: Context, change: Any) -> None:
     submit_job(context, parsed(rods()), None)
     before = lines(context)

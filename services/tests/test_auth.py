@@ -14,7 +14,8 @@ import pytest
 from click.testing import CliRunner
 from fastapi import FastAPI
 from pydantic import ValidationError
-from stickslip_services.access.keys import Scope, create_key, list_keys, revoke_key
+from stickslip_services.access.keys import create_key, list_keys, revoke_key
+from stickslip_services.access.principals import Scope
 from stickslip_services.api.middleware import needed_scope
 from stickslip_services.app import main, make_app
 from stickslip_services.cli import app as cli

@@ -11,8 +11,9 @@ from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.tasks import PackTask
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, LeaseState
-from stickslip_services.access.keys import Asker, asking, check_quota, find_project, set_quota
-from stickslip_services.api.routes.workers import Gathering
+from stickslip_services.access.principals import Principal, acting_as
+from stickslip_services.access.quotas import check_quota, find_project, set_quota
+from stickslip_services.api.routes.workers import Batcher
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError
 from stickslip_services.queue.context import Context
@@ -26,7 +27,7 @@ from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejectio
 
 
 def submit(context: Context, *, priority: int = 0, project: str = "", **spec: Any) -> str:
-    with asking(Asker(project=project)):
+    with acting_as(Principal(project=project)):
         return submit_job(context, parsed(rods(**spec)), priority=priority).id  # type: ignore[union-attr]
 
 
@@ -323,16 +324,16 @@ def test_calls_that_wait_are_gathered_and_fail_together() -> None:
         return [10 * item for item in items]
 
     async def use() -> list[int | BaseException]:
-        gathering = Gathering(call)
-        waiting = [asyncio.create_task(gathering.add(item)) for item in (1,)]
+        batcher = Batcher(call)
+        waiting = [asyncio.create_task(batcher.add(item)) for item in (1,)]
         while not calls:
             await asyncio.sleep(0.01)
-        waiting += [asyncio.create_task(gathering.add(item)) for item in (2, 3, 4)]
+        waiting += [asyncio.create_task(batcher.add(item)) for item in (2, 3, 4)]
         await asyncio.sleep(0)
         waiting[3].cancel()
         first.set()
         results = await asyncio.gather(*waiting, return_exceptions=True)
-        return [*results, await gathering.add(5)]
+        return [*results, await batcher.add(5)]
 
     one, two, three, four, five = asyncio.run(use())
     assert (one, five, calls) == (10, 50, [[1], [2, 3, 4], [5]])

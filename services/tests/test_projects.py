@@ -8,14 +8,9 @@ import httpx
 import pytest
 from click.testing import CliRunner
 from stickslip_schemas.base import JobState
-from stickslip_services.access.keys import (
-    Asker,
-    asking,
-    find_project,
-    list_projects,
-    read_audit_log,
-    set_quota,
-)
+from stickslip_services.access import audit_log
+from stickslip_services.access.principals import Principal, acting_as
+from stickslip_services.access.quotas import find_project, list_projects, set_quota
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
 from stickslip_services.errors import QuotaExceededError
@@ -32,7 +27,7 @@ pytestmark = pytest.mark.databases
 
 
 def submit(context: Context, project: str, *, priority: int = 0, **spec: Any) -> str:
-    with asking(Asker(project=project)):
+    with acting_as(Principal(project=project)):
         job = submit_job(context, parsed(rods(**spec)), None, priority=priority)
     return job.id  # type: ignore[union-attr]
 
@@ -76,7 +71,7 @@ def test_a_quota_of_samples_refuses_what_is_too_much(
         assert violations(connection) == []
         assert [project.name for project in list_projects(connection)] == ["", "lab", "other"]
         assert [
-            line.subject for line in read_audit_log(connection) if line.action == "project.quota"
+            line.subject for line in audit_log.read(connection) if line.action == "project.quota"
         ] == ["lab", "lab"]
 
 

@@ -13,11 +13,14 @@ import httpx
 import pytest
 from fastapi import FastAPI
 from PIL import Image
-from sqlalchemy import select
+from sqlalchemy import insert, select
 from starlette.routing import Route
-from stickslip_services.access.keys import Scope, create_key
+from stickslip_services.access.keys import create_key
+from stickslip_services.access.principals import Principal, Scope, acting_as
 from stickslip_services.app import make_app
-from stickslip_services.database.tables import previews, tasks
+from stickslip_services.catalog.versions import list_datasets
+from stickslip_services.database.database import PageRequest
+from stickslip_services.database.tables import dataset_versions, datasets, previews, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import task_id
 from stickslip_services.settings import Settings
@@ -281,3 +284,38 @@ def test_an_admin_sees_every_project(tenants: Tenants) -> None:
         time.sleep(1.1)
         answer = httpx.get(answer.url, headers=answer.request.headers, trust_env=False)
     assert answer.status_code == 200
+
+
+def test_only_requests_without_a_project_find_versions_without_a_job(context: Context) -> None:
+    """`stickslip reindex` registers versions of a store whose jobs are unknown."""
+    with context.database.write() as connection:
+        connection.execute(
+            insert(datasets).values(id="ds-orphan", name="found", kind="rod", spec_digest="0" * 64)
+        )
+        connection.execute(
+            insert(dataset_versions).values(
+                dataset="ds-orphan",
+                version=1,
+                publish_task=10**6,
+                manifest="1" * 64,
+                group_digest="2" * 64,
+                created_at=0.0,
+                sample_count=1,
+                valid_count=1,
+                bytes=1,
+                scrubbed_at=0.0,
+                damaged=0,
+            )
+        )
+    everything_but_admin = frozenset(Scope) - {Scope.admin}
+    visible_to = {
+        "nobody": Principal(scopes=everything_but_admin),
+        "project": Principal("key-1 ada", everything_but_admin, "alpha"),
+        "administrator": Principal("key-2 bert", frozenset({Scope.admin}), "alpha"),
+    }
+    found = {}
+    for name, principal in visible_to.items():
+        with acting_as(principal), context.database.read() as connection:
+            page = list_datasets(connection, PageRequest(10, None))
+            found[name] = [dataset.id for dataset in page.items]
+    assert found == {"nobody": ["ds-orphan"], "project": [], "administrator": ["ds-orphan"]}

@@ -113,7 +113,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.context = context
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
-    app.state.renewals = workers.Gathering(partial(renew_leases, context))
+    app.state.renewals = workers.Batcher(partial(renew_leases, context))
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with
     # one after the other.

@@ -21,7 +21,8 @@ from sqlalchemy import ColumnElement, Connection, Row, and_, delete, func, inser
 from standardwebhooks import Webhook as Signer
 from stickslip_schemas.documents.responses import EventName
 
-from stickslip_services.access.keys import check_project, note
+from stickslip_services.access import audit_log
+from stickslip_services.access.principals import check_project
 from stickslip_services.addresses import is_loopback
 from stickslip_services.database.database import Clock, Database, as_datetime
 from stickslip_services.database.tables import events, jobs, webhooks
@@ -77,7 +78,7 @@ def create_webhook(
             created_at=now,
         )
     )
-    note(connection, "webhook.create", name, now, url=url, project=project)
+    audit_log.append(connection, "webhook.create", name, now, url=url, project=project)
     return name, secret
 
 
@@ -97,14 +98,14 @@ def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
         == 0
     ):
         raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
-    note(connection, "webhook.retry", webhook_id, now)
+    audit_log.append(connection, "webhook.retry", webhook_id, now)
 
 
 def delete_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Delete a webhook; raise NotFoundError."""
     if connection.execute(delete(webhooks).where(webhooks.c.id == webhook_id)).rowcount == 0:
         raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
-    note(connection, "webhook.delete", webhook_id, now)
+    audit_log.append(connection, "webhook.delete", webhook_id, now)
 
 
 class WebhookDelivery:

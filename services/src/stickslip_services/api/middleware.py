@@ -29,7 +29,8 @@ from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import MEDIA_TYPE, ProblemCode
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from stickslip_services.access.keys import Asker, KeyRing, Scope, asking
+from stickslip_services.access.keys import KeyRing
+from stickslip_services.access.principals import Principal, Scope, acting_as
 from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import ProblemError
 
@@ -226,15 +227,15 @@ class KeyMiddleware:
         if isinstance(admitted, ProblemError):
             await admitted.answer(scope, receive, send)
             return
-        with asking(admitted):
+        with acting_as(admitted):
             await self._app(scope, receive, send)
 
-    async def _admitted(self, headers: Headers, needed: Scope) -> Asker | ProblemError:
+    async def _admitted(self, headers: Headers, needed: Scope) -> Principal | ProblemError:
         """Return the holder of the request's key, or why the request is refused."""
         authorization = headers.get("authorization")
         if authorization is None:
             if needed in self._open:
-                return Asker(scopes=self._open)
+                return Principal(scopes=self._open)
             return _unauthorized(f"the request needs a key of the scope `{needed}`")
         secret = _secret(authorization)
         if secret is None or self._ring.is_fresh:

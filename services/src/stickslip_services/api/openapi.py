@@ -20,7 +20,7 @@ from stickslip_schemas.documents.worker_api import (
 from stickslip_schemas.format.manifest import Manifest
 from stickslip_schemas.kinds import job_spec_adapter
 
-from stickslip_services.access.keys import Scope
+from stickslip_services.access.principals import Scope
 from stickslip_services.api.middleware import needed_scope
 
 _MODELS = (

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.documents.responses import EventName, JobProgressEvent
 
-from stickslip_services.access.keys import this_asker
+from stickslip_services.access.principals import current_principal
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import StoredEvent, read_events, show_job
@@ -54,7 +54,10 @@ class EventStream(StreamingResponse):
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         address = scope["client"][0] if scope["client"] else "no address"
-        owners = {f"key {this_asker().name}": MOST_STREAMS, f"address {address}": MOST_STREAMS}
+        owners = {
+            f"key {current_principal().name}": MOST_STREAMS,
+            f"address {address}": MOST_STREAMS,
+        }
         places = {
             (scope["app"], owner): most
             for owner, most in {**owners, "coordinator": ALL_STREAMS}.items()

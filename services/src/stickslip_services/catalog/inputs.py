@@ -20,7 +20,8 @@ from stickslip_schemas.scene.library import built_in_files, load_scene, scene_na
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import Store
 
-from stickslip_services.access.keys import note, own, this_asker
+from stickslip_services.access import audit_log
+from stickslip_services.access.principals import current_principal, is_visible_project
 from stickslip_services.database.database import Database, PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates, dataset_versions, jobs, uploads
 from stickslip_services.errors import NotFoundError, UnknownFileError
@@ -66,7 +67,7 @@ def register_certificate(
                 )
             )
         entry = _entry(find_certificate(connection, certificate.digest))
-        note(
+        audit_log.append(
             connection,
             "certificate.register",
             entry.digest,
@@ -115,8 +116,8 @@ def store_file(database: Database, store: Store, data: bytes) -> FileUpload:
 
 
 def _store(database: Database, store: Store, data: bytes) -> Sha256:
-    """Store an artifact for the project of the asker."""
-    row = {"project": this_asker().project, "digest": store.publish(data)}
+    """Store an artifact for the project of the principal."""
+    row = {"project": current_principal().project, "digest": store.publish(data)}
     with database.write() as connection:
         if connection.scalar(select(uploads.c.digest).filter_by(**row)) is None:
             connection.execute(insert(uploads).values(row))
@@ -132,7 +133,7 @@ def check_files(database: Database, store: Store, spec: JobSpec) -> None:
     wrong = []
     with database.read() as connection:
         asked = select(uploads.c.digest).where(
-            uploads.c.digest.in_(spec.artifacts.values()), own(uploads.c.project)
+            uploads.c.digest.in_(spec.artifacts.values()), is_visible_project(uploads.c.project)
         )
         uploaded = set(connection.scalars(asked))
     for pointer, digest in spec.artifacts.items():
@@ -140,7 +141,7 @@ def check_files(database: Database, store: Store, spec: JobSpec) -> None:
             if (data := built_in_files().get(digest)) is not None:
                 if not store.exists(digest):
                     store.publish(data)
-            elif digest not in uploaded and not this_asker().sees_all:
+            elif digest not in uploaded and not current_principal().sees_all:
                 raise FileNotFoundError
             _check(spec, pointer, store.read(digest))
         except (UnfitPictureError, UnfitFileError) as error:
@@ -196,7 +197,7 @@ def known_scenes(connection: Connection) -> dict[str, KnownScene]:
     }
     rows = connection.execute(
         select(jobs.c.spec, jobs.c.dataset, jobs.c.version)
-        .where(jobs.c.kind == KIND, own(jobs.c.project))
+        .where(jobs.c.kind == KIND, is_visible_project(jobs.c.project))
         .order_by(jobs.c.seq.desc())
         .limit(NEWEST)
     )

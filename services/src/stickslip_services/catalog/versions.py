@@ -32,7 +32,7 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
-from stickslip_services.access.keys import own_version
+from stickslip_services.access.principals import is_visible_version
 from stickslip_services.client.verifying import is_signature, sign
 from stickslip_services.database.database import PageRequest, document_of, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
@@ -276,7 +276,7 @@ of its files.
 
 
 def _is_own() -> ColumnElement[bool]:
-    return exists().where(dataset_versions.c.dataset == datasets.c.id, own_version())
+    return exists().where(dataset_versions.c.dataset == datasets.c.id, is_visible_version())
 
 
 def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
@@ -285,7 +285,7 @@ def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) ->
         .where(
             dataset_versions.c.dataset == row.id,
             dataset_versions.c.manifest.is_not(None),
-            own_version(),
+            is_visible_version(),
         )
         .order_by(dataset_versions.c.version)
     )

@@ -16,9 +16,12 @@ import click
 from click.exceptions import Exit
 from sqlalchemy import Connection
 
+from stickslip_services.access import audit_log as stored_audit_log
 from stickslip_services.access import keys as stored_keys
+from stickslip_services.access import quotas as stored_quotas
 from stickslip_services.access import webhooks as stored_webhooks
-from stickslip_services.access.keys import Scope, read_audit_log, visited
+from stickslip_services.access.keys import command_transaction
+from stickslip_services.access.principals import Scope
 from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import print_table, say, shows_errors
 from stickslip_services.database.database import Role, as_datetime
@@ -68,7 +71,7 @@ def administers(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(settings: Settings, **given: Any) -> None:
-        with visited(settings) as connection:
+        with command_transaction(settings) as connection:
             command(connection, **given)
 
     return shows_errors(options("data", "database")(run))
@@ -137,7 +140,7 @@ def list_projects(connection: Connection) -> None:
     them.
     """
     rows = []
-    for project in stored_keys.list_projects(connection):
+    for project in stored_quotas.list_projects(connection):
         limits = _limit(project.max_jobs), _limit(project.max_samples)
         rows.append(
             (
@@ -162,7 +165,7 @@ def list_projects(connection: Connection) -> None:
 @administers
 def set_quota(connection: Connection, name: str, samples: int | None, jobs: int | None) -> None:
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
-    stored_keys.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
+    stored_quotas.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
     click.echo(
         f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended"
@@ -187,7 +190,7 @@ def webhooks() -> None:
 @options("data", "database")
 def create_webhook(settings: Settings, url: str, project: str) -> None:
     """Make a webhook for events from now on, and print the secret that verifies its signatures."""
-    with visited(settings) as connection:
+    with command_transaction(settings) as connection:
         sealing = stored_keys.sealer(settings)
         webhook_id, secret = stored_webhooks.create_webhook(
             connection, sealing, url, time.time(), project=project
@@ -244,7 +247,7 @@ def delete_webhook(connection: Connection, webhook: str) -> None:
 @administers
 def audit_log(connection: Connection, subject: str | None, limit: int, as_json: bool) -> None:
     """Show who changed what and when, newest first."""
-    entries = read_audit_log(connection, subject=subject, limit=limit)
+    entries = stored_audit_log.read(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
             click.echo(entry.model_dump_json())

@@ -11,7 +11,7 @@ import click
 from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
-from stickslip_services.access.keys import asking, this_user
+from stickslip_services.access.principals import acting_as, local_user
 from stickslip_services.cli.common import amount, say, shows_errors
 from stickslip_services.client.http import ClientError
 from stickslip_services.database.database import Database, Role
@@ -46,7 +46,7 @@ def _owned(settings: Settings) -> Iterator[tuple[Database, Store]]:
 
     Raise DatabaseRefusedError if one runs.
     """
-    with locked(settings.data), asking(this_user()), opened(settings, Role.upkeep) as database:
+    with locked(settings.data), acting_as(local_user()), opened(settings, Role.upkeep) as database:
         try:
             yield database, open_store(settings.store_place)
         except ValueError as error:  # a damaged manifest in the store
@@ -138,7 +138,7 @@ def scrub(settings: Settings, rate: float) -> None:
     """
     count = bad = 0
     _refuse_none(settings, Role.visitor)
-    with asking(this_user()), closing(Context.open(settings, role=Role.visitor)) as context:
+    with acting_as(local_user()), closing(Context.open(settings, role=Role.visitor)) as context:
         began = context.clock()
         while (found := scrubbed(context, before=began, rate=1e6 * rate)) is not None:
             version, damaged = found

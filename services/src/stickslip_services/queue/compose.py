@@ -22,7 +22,7 @@ from stickslip_schemas.plan.points import pack_key, publish_key
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.store import in_parallel
 
-from stickslip_services.access.keys import own_task
+from stickslip_services.access.principals import is_visible_task
 from stickslip_services.catalog.versions import find_reserved, reserve_number, version_number
 from stickslip_services.database.database import Prepared, batches
 from stickslip_services.database.tables import samples, task_dependencies, tasks
@@ -70,7 +70,7 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     Raises NotFoundError, or ConflictError where its dependencies are not settled.
     """
     key = task_key(name)
-    asked = tasks.c.key == key, own_task(tasks.c.seq)
+    asked = tasks.c.key == key, is_visible_task(tasks.c.seq)
     row = None if key is None else connection.execute(select(tasks).where(*asked)).one_or_none()
     if key is None or row is None or task_id(row.stage, key) != name:
         raise NotFoundError(f"there is no task {name[:100]!r}")

@@ -18,7 +18,8 @@ from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME, seal_text
 
-from stickslip_services.access.keys import admit_local_worker, note
+from stickslip_services.access import audit_log
+from stickslip_services.access.keys import admit_local_worker
 from stickslip_services.catalog.versions import damaged_files, mend_signature
 from stickslip_services.database.database import Prepared
 from stickslip_services.database.opening import upgrade
@@ -146,7 +147,7 @@ def _change(
     with context.transaction() as tx:
         job = find_job(tx.connection, job_id)
         yield tx, job
-        note(tx.connection, action, job_id, tx.now, **details)
+        audit_log.append(tx.connection, action, job_id, tx.now, **details)
 
 
 def pause(tx: QueueTransaction, job: int, *, reason: Reason | None = None, message: str) -> None:

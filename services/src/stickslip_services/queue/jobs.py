@@ -19,7 +19,7 @@ from stickslip_schemas.documents.responses import (
     SampleState,
 )
 
-from stickslip_services.access.keys import own, own_task
+from stickslip_services.access.principals import is_visible_project, is_visible_task
 from stickslip_services.database.database import PageRequest, Prepared, document_of, read_page
 from stickslip_services.database.tables import (
     events,
@@ -55,7 +55,7 @@ def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
     """Return the row of a job; raise NotFoundError."""
     row = connection.execute(
-        select(jobs).where(jobs.c.id == job_id, own(jobs.c.project))
+        select(jobs).where(jobs.c.id == job_id, is_visible_project(jobs.c.project))
     ).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no job {job_id!r}")
@@ -90,7 +90,7 @@ def list_jobs(
     or dataset.
     """
     workers = alive_workers(context, connection)
-    query = select(jobs).where(own(jobs.c.project))
+    query = select(jobs).where(is_visible_project(jobs.c.project))
     if search:
         places = (jobs.c.name, jobs.c.kind, jobs.c.id, jobs.c.dataset)
         query = query.where(or_(*(place.icontains(search, autoescape=True) for place in places)))
@@ -101,7 +101,7 @@ def list_jobs(
 
 
 def job_projects(connection: Connection) -> list[str]:
-    query = select(jobs.c.project).where(own(jobs.c.project)).distinct()
+    query = select(jobs.c.project).where(is_visible_project(jobs.c.project)).distinct()
     return list(connection.scalars(query.order_by(jobs.c.project)))
 
 
@@ -206,10 +206,12 @@ def slowest_tasks(connection: Connection, job: int, count: int) -> list[dict[str
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
-    """Return whether an artifact is a preview that the asker sees, which is served without a
+    """Return whether an artifact is a preview that the principal sees, which is served without a
     dataset.
     """
-    query = select(previews.c.task).where(previews.c.digest == digest, own_task(previews.c.task))
+    query = select(previews.c.task).where(
+        previews.c.digest == digest, is_visible_task(previews.c.task)
+    )
     return connection.scalar(query.limit(1)) is not None
 
 

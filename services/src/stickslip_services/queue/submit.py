@@ -22,7 +22,9 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import Counts, Interval, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.access.keys import check_quota, note, this_asker
+from stickslip_services.access import audit_log
+from stickslip_services.access.principals import current_principal
+from stickslip_services.access.quotas import check_quota
 from stickslip_services.catalog.inputs import check_files
 from stickslip_services.database.database import Database, Prepared, batches, document_of
 from stickslip_services.database.tables import (
@@ -80,7 +82,7 @@ def submit_job(
     IdempotencyKeyReusedError.
     """
     check_files(context.database, context.store, spec)
-    project, print_ = this_asker().project, sha256(spec.model_dump_json().encode())
+    project, print_ = current_principal().project, sha256(spec.model_dump_json().encode())
     with context.database.write() as connection:
         if replay := _find_replay(connection, idempotency_key, print_):
             return replay
@@ -96,7 +98,7 @@ def submit_job(
                 begin_planning(tx, job, terms, plan_at_once(context, spec, terms))
         shown = show_job(context, connection, job)
         details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
-        note(connection, "job.submit", shown.id, now, **details)
+        audit_log.append(connection, "job.submit", shown.id, now, **details)
         if idempotency_key:
             row = {
                 "project": project,
@@ -123,7 +125,9 @@ def _find_replay(connection: Connection, key: str | None, fingerprint: str) -> R
     row = connection.execute(
         select(idempotency_keys.c.fingerprint, idempotency_keys.c.response, jobs.c.id)
         .join(jobs, jobs.c.seq == idempotency_keys.c.job)
-        .where(idempotency_keys.c.key == key, idempotency_keys.c.project == this_asker().project)
+        .where(
+            idempotency_keys.c.key == key, idempotency_keys.c.project == current_principal().project
+        )
     ).one_or_none()
     if row is None:
         return None

@@ -28,7 +28,7 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.store import ShownVersion, Store, Stored, in_parallel
 
-from stickslip_services.access.keys import note
+from stickslip_services.access import audit_log
 from stickslip_services.catalog.versions import (
     commit_version,
     find_committed,
@@ -81,7 +81,7 @@ def remove(database: Database, store: Store, dataset: str, version: int) -> tupl
                 is None
             ):
                 connection.execute(delete(datasets).where(datasets.c.id == dataset))
-        note(
+        audit_log.append(
             connection,
             "version.remove",
             f"{dataset}:v{version}",

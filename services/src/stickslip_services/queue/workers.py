@@ -13,7 +13,7 @@ from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
 
-from stickslip_services.access.keys import own
+from stickslip_services.access.principals import is_visible_project
 from stickslip_services.database.database import Prepared, as_datetime, document_of
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
@@ -157,7 +157,7 @@ def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | 
 def running_tasks(
     connection: Connection, frames: Mapping[str, tuple[int, int]]
 ) -> dict[str, list[responses.RunningTask]]:
-    """Return the tasks on lease that the asker sees, by worker, the longest-running first.
+    """Return the tasks on lease that the principal sees, by worker, the longest-running first.
 
     `frames` is the progress of simulations.
     """
@@ -166,7 +166,7 @@ def running_tasks(
             tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id
         )
         .outerjoin(jobs, jobs.c.seq == tasks.c.job)
-        .where(IS_LEASED, own(jobs.c.project))
+        .where(IS_LEASED, is_visible_project(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
     found: dict[str, list[responses.RunningTask]] = {}

@@ -22,7 +22,7 @@ from stickslip_schemas.base import Document
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
-from stickslip_services.access.keys import refuse_projects
+from stickslip_services.access.principals import refuse_projects
 from stickslip_services.api.routes.common import ContextDep, problem_responses
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.database.tables import tasks as tasks_

@@ -102,7 +102,7 @@ async def post_heartbeat(request: Request) -> Response:
     return Response(answer.model_dump_json(), media_type="application/json")
 
 
-class Gathering(Generic[T, U]):
+class Batcher(Generic[T, U]):
     """Calls a function in a thread: once for all items that have come while its last call was
     running.
     """
