@@ -22,7 +22,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-slow test-main test-blender test-without-blender test-core check size docs bench wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-slow test-main test-blender test-without-blender test-core check size density docs bench wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -104,7 +104,8 @@ check: setup-dev
 	$(PY) tools/prose.py
 	PYTHONPATH=workers/blender/src .venv/bin/lint-imports --no-logo
 	@for distribution in $(DISTRIBUTIONS); do (cd $$distribution && $(CURDIR)/$(PY) -m deptry --no-ansi .) || exit 1; done
-	@$(MAKE) --no-print-directory size
+	@$(MAKE) --no-print-directory size density
+	$(PY) tools/names.py
 	$(PY) -m mypy $(SOURCES)
 	MYPYPATH=.:tests $(PY) -m mypy --explicit-package-bases $(TESTS)
 
@@ -113,9 +114,13 @@ check: setup-dev
 	$(PYTHON) -m venv $@
 	$@/bin/pip install --quiet 'lerobot==0.4.4'
 
-# The lines of source, and what is longer than it should be.
+# The lines of source, and files that are longer than they should be.
 size:
 	@$(PY) tools/size.py
+
+# How dense the code is, beside the models. It warns and never fails.
+density: .venv/setup.stamp
+	@$(PY) tools/density.py
 
 # A warning is an error; tests/test_docs_code.py does the same, and runs the code of the pages.
 docs: setup-dev
