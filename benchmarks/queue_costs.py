@@ -29,7 +29,7 @@ import httpx
 from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
 from stickslip_services.access.keys import create_key
 from stickslip_services.access.principals import Scope
-from stickslip_services.api.middleware import allow_many_files
+from stickslip_services.api.protocol import allow_many_files
 from stickslip_services.api.sse import MOST_STREAMS
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import connect

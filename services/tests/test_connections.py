@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_services.api import middleware
+from stickslip_services.api import protocol
 from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
@@ -65,7 +65,7 @@ def test_600_half_open_requests_are_closed_within_20_seconds(server: ServerProce
 @pytest.fixture
 def quick(tmp_path: object, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A server that gives a client half a second."""
-    monkeypatch.setattr(middleware, "TURN_SECONDS", 0.5)
+    monkeypatch.setattr(protocol, "TURN_SECONDS", 0.5)
     with serving(make_app(settings)) as url:
         yield url
 
@@ -101,7 +101,7 @@ def test_drop_by_drop_is_too_slow_as_well(quick: str, opening: bytes) -> None:
 
 
 def test_a_steady_body_may_take_its_time(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(middleware, "LEAST_RATE", 100)
+    monkeypatch.setattr(protocol, "MIN_RATE", 100)
     body = json.dumps(rods()).encode()
     with connect(
         quick, HEADERS + f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()
@@ -134,8 +134,8 @@ def test_a_kept_connection_serves_request_after_request(quick: str) -> None:
 
 
 def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(middleware, "MOST_CONNECTIONS", 3)
-    monkeypatch.setattr(middleware, "TURN_SECONDS", 5.0)
+    monkeypatch.setattr(protocol, "MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(protocol, "TURN_SECONDS", 5.0)
     held = [connect(quick, HALF_BODY) for _ in range(3)]
     time.sleep(0.2)
     with connect(quick, b"") as connection:
@@ -150,8 +150,8 @@ def test_idle_connections_are_kept_longer_than_clients_keep_them(
     quick: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With equal times, a request now and then meets a connection that is being closed, and fails."""
-    assert middleware.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
-    monkeypatch.setattr(middleware, "IDLE_SECONDS", 0.3)
+    assert protocol.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
+    monkeypatch.setattr(protocol, "IDLE_SECONDS", 0.3)
     begin = time.monotonic()
     with connect(quick, b"GET /readyz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") as connection:
         assert answer(connection).startswith(b"HTTP/1.1 200")  # and then the end

@@ -237,6 +237,66 @@ def test_lists_tell_nothing_of_another_project(tenants: Tenants, method: str, pa
     assert "alpha" not in answer.text
 
 
+def may_be_kept_by_a_shared_cache(answer: httpx.Response) -> bool:
+    """Whether a proxy between the coordinator and several users may store an answer [RFC 9111, 3].
+
+    Every status can be stored: a proxy may take `public` or `max-age` of any of them, and some
+    (200, 301, 404, 405 ...) without a word. So only an explicit `private` or `no-store` keeps an
+    answer out, and `public` or `s-maxage` beside it is a contradiction.
+    """
+    words = answer.headers.get("cache-control", "").lower().split(",")
+    directives = {word.strip().partition("=")[0] for word in words}
+    is_closed = bool(directives & {"private", "no-store"})
+    return not is_closed or bool(directives & {"public", "s-maxage"})
+
+
+@pytest.mark.parametrize("reader", ["owner", "another project", "wrong key", "nobody"])
+def test_no_answer_that_needs_a_key_is_kept_by_a_shared_cache(
+    tenants: Tenants, reader: str
+) -> None:
+    """All operations, also those that the method or the path of the resource does not allow."""
+    authorization = {
+        "owner": tenants.alpha.headers["Authorization"],
+        "another project": tenants.beta.headers["Authorization"],
+        "wrong key": "Bearer sk_wrong",
+        "nobody": None,
+    }[reader]
+    headers = {} if authorization is None else {"Authorization": authorization}
+    templates = {path for _, path in operations(tenants.app)} - {path for _, path in ENDLESS}
+    open_to_all = {"/livez", "/readyz"}
+    with httpx.Client(
+        base_url=tenants.alpha.base_url, headers=headers, timeout=20, trust_env=False
+    ) as client:
+        calls = [
+            (method, template)
+            for template in [*sorted(templates), "/v1/nothing", "/nothing"]
+            for method in ("GET", "HEAD", "OPTIONS", "DELETE")
+        ]
+        for method, template in calls:
+            answer = tenants.call(client, method, template)
+            shown = f"{method} {template}: {answer.status_code} {answer.headers}"
+            assert not may_be_kept_by_a_shared_cache(answer), shown
+            assert "authorization" in answer.headers.get("vary", "").lower(), shown
+            if reader in ("nobody", "wrong key") and template not in open_to_all:
+                assert answer.status_code == 401, shown
+
+
+def test_a_file_is_private_in_every_form_of_its_answer(tenants: Tenants) -> None:
+    path = "/v1/datasets/{dataset}/versions/{version}/files/zarr.json".format(**tenants.parameters)
+    etag = tenants.alpha.get(path).headers["ETag"]
+    for headers, status in (
+        ({}, 200),
+        ({"Range": "bytes=0-3"}, 206),
+        ({"If-None-Match": etag}, 304),
+        ({"Range": "bytes=999999999-"}, 416),
+    ):
+        answer = tenants.alpha.get(path, headers=headers)
+        assert answer.status_code == status
+        assert not may_be_kept_by_a_shared_cache(answer), answer.headers
+    # A browser of one person may keep what never changes.
+    assert "immutable" in tenants.alpha.get(path).headers["cache-control"]
+
+
 @pytest.mark.parametrize(("method", "path"), sorted(HOUSE))
 def test_what_is_of_no_project_is_closed(tenants: Tenants, method: str, path: str) -> None:
     answer = tenants.call(tenants.beta, method, path)

@@ -28,7 +28,7 @@ from starlette.staticfiles import StaticFiles
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
 from stickslip_services.access.webhooks import WebhookDelivery
-from stickslip_services.api import middleware, problems
+from stickslip_services.api import middleware, problems, protocol
 from stickslip_services.api.openapi import describe
 from stickslip_services.api.routes import catalog, health, jobs, workers
 from stickslip_services.api.routes.health import Metrics
@@ -214,11 +214,11 @@ def _serve(settings: Settings, listener: socket.socket) -> int:
         timeout_graceful_shutdown=GRACE_SECONDS,
         lifespan="on",
         proxy_headers=False,
-        http=middleware.PatientProtocol,
+        http=protocol.PatientProtocol,
         ssl_certfile=settings.tls_certificate,
         ssl_keyfile=settings.tls_key,
     )
-    middleware.allow_many_files()
+    protocol.allow_many_files()
     server = _Server(config, settings.url)
     server.run(sockets=[listener])
     return 0 if server.started else 1

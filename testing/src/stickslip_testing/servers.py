@@ -26,7 +26,7 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 from stickslip_schemas.store import DirectoryStore
-from stickslip_services.api.middleware import PatientProtocol
+from stickslip_services.api.protocol import PatientProtocol
 from stickslip_services.app import make_app
 from stickslip_services.local.supervisor import listen
 from stickslip_services.settings import Settings

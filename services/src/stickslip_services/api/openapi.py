@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
@@ -137,10 +137,11 @@ def _name_by_title(document: dict[str, Any]) -> None:
 
 def _body_components() -> dict[str, Any]:
     """Return the OpenAPI components of request documents by name."""
-    adapters = [(name, "validation", adapter) for name, adapter in _DOCUMENTS.items()]
-    schemas, shared = TypeAdapter.json_schemas(
-        adapters, ref_template="#/components/schemas/{model}"
-    )  # type: ignore[arg-type]
+    adapters: list[tuple[str, Literal["validation"], TypeAdapter[Any]]] = [
+        (name, "validation", adapter) for name, adapter in _DOCUMENTS.items()
+    ]
+    template = "#/components/schemas/{model}"
+    schemas, shared = TypeAdapter.json_schemas(adapters, ref_template=template)
     components: dict[str, Any] = dict(shared.get("$defs", {}))
     for (name, _), schema in schemas.items():
         if schema != {"$ref": f"#/components/schemas/{name}"}:

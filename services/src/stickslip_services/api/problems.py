@@ -60,7 +60,9 @@ class ProblemError(Exception):
     def response(self, path: str, request_id: str | None) -> Response:
         # The request may contain text without a UTF-8 form; the answer must be valid UTF-8.
         content = self.document(path, request_id).model_dump_json(ensure_ascii=True)
-        return Response(content, self.status, self.headers, MEDIA_TYPE)
+        # The answer to an unexpected error passes no middleware, which would add these.
+        headers = {"Cache-Control": "no-store", "Vary": "Authorization", **(self.headers or {})}
+        return Response(content, self.status, headers, MEDIA_TYPE)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self.response(scope["path"], scope.get("state", {}).get("request_id"))(
