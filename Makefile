@@ -1,4 +1,4 @@
-# make demo | test-fast | test | test-slow | check | docs | bench | wheels | constraints | clean.
+# make demo | test-fast | test | test-kernels | test-slow | check | docs | bench | wheels | constraints | clean.
 # Every target sets up what it needs; a second call is quick.
 
 PYTHON ?= python3.11
@@ -22,7 +22,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-slow test-main test-blender test-without-blender test-core check size density docs bench wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check size density docs bench wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -91,6 +91,17 @@ test-core:
 	.venv-core/bin/python -m pip install $(PIP_FLAGS) ./sim_core pytest pytest-timeout hypothesis
 	.venv-core/bin/python -m pytest --quiet -p no:cacheprovider --rootdir sim_core --confcutdir sim_core \
 	  --import-mode importlib -m "not slow" sim_core/tests
+
+# Cloth and what it does on every level of the kernels (STICKSLIP_CLOTH_KERNEL) that this processor runs, but for the one that
+# `make test` takes. The rods give the same bits on all levels, which tests of theirs compare.
+KERNEL_TESTS = $(addprefix sim_core/tests/,cloth scenes protocols/test_protocols_cloth.py protocols/test_protocols_contact.py) \
+  tests/test_scenes_of_data.py tests/test_own_scene.py
+
+test-kernels: setup-dev
+	@for level in $$($(PY) tools/other_kernels.py); do \
+	  echo "cloth on kernels of level $$level"; \
+	  STICKSLIP_CLOTH_KERNEL=$$level $(PYTEST) $(KERNEL_TESTS) || exit 1; \
+	done
 
 test-slow: setup-dev
 	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow

@@ -146,8 +146,12 @@ class TestStack:
 class TestBearing:
     @staticmethod
     def ridges(bearing: str) -> Cloth:
-        """A sheet that is folded upwards, held as a whole, and one folded downwards that is pressed
-        on it, edge on edge in the middle: its sides go down by 2 mm."""
+        """Press the ridge of one folded sheet on that of another, which is held as a whole.
+
+        The ridges cross in the middle, edge on edge. The sides of the upper sheet go down by
+        1.7 mm: at 1.8 mm the force of the pair has its maximum, 0.91 mN. Beyond it the upper ridge
+        snaps aside within a step, to one of two equilibria, and rounding decides to which.
+        """
         sheet = meshes.grid(0.02, 0.02, 5, 4)
         folded, height = sheet.rest * [1.0, 0.8], 0.6 * np.abs(sheet.rest[:, 1])
         below = np.column_stack([folded[:, ::-1], -height])
@@ -163,7 +167,7 @@ class TestBearing:
         )
         start = np.concatenate([below, above])
         cloth.set_state(start)
-        for step in range(20):
+        for step in range(17):
             ends = start[held]
             ends[len(below) :, 2] -= 1e-4 * (step + 1)
             cloth.step(0.02, held=ends, damping=5.0)
