@@ -31,7 +31,7 @@ from stickslip_schemas.format.manifest import Contents, Manifest
 from stickslip_schemas.store import open_store
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.client import Client, ClientError, ProblemError, pull, verify
-from stickslip_services.client.http import DamagedError
+from stickslip_services.client.errors import DamagedError
 from stickslip_services.database.opening import connect
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.settings import Settings

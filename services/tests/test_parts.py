@@ -9,7 +9,8 @@ from click.testing import CliRunner, Result
 from stickslip_schemas.format.selection import SELECTION_NAME, Selection
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
-from stickslip_services.client.http import Client, ForeignFilesError, SelectionError
+from stickslip_services.client.errors import ForeignFilesError, SelectionError
+from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
 from stickslip_services.settings import Settings

@@ -9,8 +9,7 @@ import pytest
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import Contents, Manifest, seal_text, with_manifest_digest
 from stickslip_services.app import make_app
-from stickslip_services.client.http import (
-    Client,
+from stickslip_services.client.errors import (
     DamagedError,
     ForeignFilesError,
     ProblemError,
@@ -18,6 +17,7 @@ from stickslip_services.client.http import (
     UnreachableError,
     UnsafePathError,
 )
+from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull, refuse_foreign_files
 from stickslip_services.client.verifying import safe_path, verify
 from stickslip_services.settings import Settings

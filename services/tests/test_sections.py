@@ -14,7 +14,8 @@ from stickslip_schemas.base import JobState, Reason, sha256
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SEALED_NAMES, Contents, Manifest
 from stickslip_schemas.format.selection import Selection
 from stickslip_services.app import make_app
-from stickslip_services.client.http import Client, ForeignFilesError
+from stickslip_services.client.errors import ForeignFilesError
+from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
 from stickslip_services.queue.context import Context

@@ -13,14 +13,14 @@ from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest
 from stickslip_services.app import main, make_app
 from stickslip_services.cli import app as commands
 from stickslip_services.client import Client, pull, signer_of, verify
-from stickslip_services.client.http import (
+from stickslip_services.client.errors import (
     ChangedError,
     ClientError,
     DamagedError,
     UnknownSignerError,
     UnsignedError,
 )
-from stickslip_services.client.verifying import sign
+from stickslip_services.client.signing import sign
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import has_runnable_job
 from stickslip_services.settings import Settings

@@ -181,7 +181,7 @@ def test_what_a_version_shows_is_kept_though_no_database_knows_it(
 def test_jobs_wait_while_the_bucket_is_away(
     in_bucket: Settings, s3: Proxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stickslip_schemas.store.bucket.PROBE_PATIENCE", 0.5)
+    monkeypatch.setattr("stickslip_schemas.store.bucket.PROBE_SECONDS", 0.5)
     clock = ManualClock()
     context = Context.open(in_bucket, clock)
     start(context)
@@ -215,7 +215,7 @@ def test_a_new_coordinator_wants_an_answer_of_its_bucket(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """It must not start an empty queue beside datasets that it cannot see."""
-    monkeypatch.setattr("stickslip_schemas.store.bucket.PATIENCE", 0.5)
+    monkeypatch.setattr("stickslip_schemas.store.bucket.PATIENCE_SECONDS", 0.5)
     words = ["--data", str(tmp_path / "data"), "--port", "0", "--store"]
     assert program.main([*words, "s3://nobody-has-made-this/store"]) == 2
     assert "cannot be asked whether it holds datasets" in capfd.readouterr().err

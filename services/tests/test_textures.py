@@ -15,7 +15,7 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app
 from stickslip_services.client import Client
-from stickslip_services.client.http import ProblemError
+from stickslip_services.client.errors import ProblemError
 from stickslip_services.errors import UnknownFileError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.submit import submit_job

@@ -78,7 +78,7 @@ def bucket(proxy: "Proxy", name: str, monkeypatch: pytest.MonkeyPatch) -> Place:
     from stickslip_testing.s3 import make_bucket, no_fault, variables
 
     proxy.fault = no_fault
-    monkeypatch.setattr(stickslip_schemas.store.bucket, "PATIENCE", 5.0)
+    monkeypatch.setattr(stickslip_schemas.store.bucket, "PATIENCE_SECONDS", 5.0)
     make_bucket(proxy, name)
     for variable, value in variables(proxy).items():
         monkeypatch.setenv(variable, value)
@@ -355,7 +355,8 @@ def test_a_place_is_the_same_for_every_process_of_a_machine(
 
 
 def test_a_bucket_without_obstore_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "stickslip_schemas.store.bucket", raising=False)
+    for name in ("store.bucket", "transport.objects"):
+        monkeypatch.delitem(sys.modules, f"stickslip_schemas.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(
         ValueError,

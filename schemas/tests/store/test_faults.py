@@ -127,7 +127,11 @@ def test_one_conditional_put_of_many_wins(proxy: Proxy, store: BucketStore) -> N
     def put(name: str, number: int) -> int | None:
         try:
             obstore.put(
-                store._objects, name, bytes([number]) * 1000, mode="create", use_multipart=False
+                store._objects._store,
+                name,
+                bytes([number]) * 1000,
+                mode="create",
+                use_multipart=False,
             )
             return number
         except obstore.exceptions.AlreadyExistsError:
@@ -139,7 +143,7 @@ def test_one_conditional_put_of_many_wins(proxy: Proxy, store: BucketStore) -> N
                 writers.map(lambda number, name=f"race-{race}": put(name, number), range(8))
             )
         (winner,) = [number for number in results if number is not None]
-        assert store._get(f"race-{race}") == bytes([winner]) * 1000
+        assert store._objects.get(f"race-{race}") == bytes([winner]) * 1000
 
 
 def test_what_is_there_is_not_sent_again(proxy: Proxy, store: BucketStore) -> None:

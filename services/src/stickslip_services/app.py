@@ -35,8 +35,8 @@ from stickslip_services.api.routes.health import Metrics
 from stickslip_services.api.routes.pages import datasets as dataset_pages
 from stickslip_services.api.routes.pages import jobs as job_pages
 from stickslip_services.api.sse import Feeds
-from stickslip_services.client.http import ClientError
-from stickslip_services.client.verifying import sign
+from stickslip_services.client.errors import ClientError
+from stickslip_services.client.signing import sign
 from stickslip_services.database.database import Clock, Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened

@@ -13,8 +13,8 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from stickslip_schemas.store import open_store, store_place
+from stickslip_schemas.transport.addresses import DEFAULT_PORT, is_loopback
 
-from stickslip_services.addresses import DEFAULT_PORT, is_loopback
 from stickslip_services.errors import SettingsError
 
 R = TypeVar("R")

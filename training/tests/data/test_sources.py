@@ -1,5 +1,7 @@
 """Reading over HTTP, from a real server on a local port."""
 
+import contextlib
+import gzip
 import http.server
 import multiprocessing
 import re
@@ -11,12 +13,7 @@ import numpy as np
 import pytest
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Samples
-from stickslip_training.data.sources import (
-    CorruptDataError,
-    HttpSource,
-    MissingFileError,
-    SourceError,
-)
+from stickslip_training.data.sources import CorruptDataError, MissingFileError, SourceError
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -26,6 +23,10 @@ class _Server(http.server.ThreadingHTTPServer):
     failures = 0  # so many requests are answered 503 first
     key: str | None = None
     cut = 0  # so many bytes less in every body of a range
+    redirect = ""  # a server that every request is sent to
+    fault = ""  # the answers are hostile
+    bytes_sent = 0
+    keys_sent: list[str | None]
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -37,6 +38,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self):
         self.server.requests.append((self.path, self.headers["Range"]))
+        self.server.keys_sent.append(self.headers["Authorization"])
+        if self.server.redirect:
+            return self._answer(302, headers={"Location": self.server.redirect + self.path})
+        if self.server.fault:
+            return self._send_hostile()
         if self.server.failures:
             self.server.failures -= 1
             return self._answer(503)
@@ -66,6 +72,22 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
+    def _send_hostile(self):
+        """Send a body without an end, a compressed one, or one that states a huge size."""
+        self.send_response(200)
+        if self.server.fault == "gzip":
+            self.send_header("Content-Encoding", "gzip")
+        if self.server.fault == "too long":
+            self.send_header("Content-Length", str(10**12))
+        self.send_header("Connection", "close")
+        self.end_headers()
+        block = gzip.compress(bytes(2**24)) if self.server.fault == "gzip" else b" " * 2**16
+        with contextlib.suppress(OSError):
+            while self.server.bytes_sent < 2**30:
+                self.wfile.write(block)
+                self.server.bytes_sent += len(block)
+        self.close_connection = True
+
     def log_message(self, *_):
         pass
 
@@ -75,6 +97,7 @@ def server(seen_rods) -> Iterator[_Server]:
     server = _Server(("127.0.0.1", 0), _Handler)
     server.root = seen_rods.root
     server.requests = []
+    server.keys_sent = []
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
@@ -145,11 +168,11 @@ def test_a_busy_server_is_asked_again(server):
 
 
 def test_a_server_that_stays_away_is_an_error(server, monkeypatch):
-    monkeypatch.setattr(HttpSource, "TRIES", 2)
+    monkeypatch.setattr("stickslip_training.data.sources.READER_PATIENCE_SECONDS", 0.5)
     server.failures = 100
     with pytest.raises(SourceError, match=r"manifest.json answered 503, and 200 was expected"):
         DatasetReader(_url(server))
-    with pytest.raises(SourceError, match="does not answer: ConnectError"):
+    with pytest.raises(SourceError, match=r"does not answer: .*refused"):
         DatasetReader("http://127.0.0.1:9/v1/datasets/ds-x/versions/1")
 
 
@@ -165,8 +188,71 @@ def test_the_key_is_sent(server, monkeypatch):
     with pytest.raises(SourceError, match="answered 401"):
         DatasetReader(_url(server), api_key="wrong")
     monkeypatch.setenv("STICKSLIP_API_KEY", "secret")
+    monkeypatch.setenv("STICKSLIP_URL", _url(server, ""))
     with DatasetReader(_url(server)) as reader:
         assert len(reader) == 6
+
+
+def test_the_key_of_the_environment_goes_only_to_its_coordinator(server, monkeypatch):
+    monkeypatch.setenv("STICKSLIP_API_KEY", "secret")
+    monkeypatch.setenv("STICKSLIP_URL", "https://stick.example.org/lab")
+    server.key = "secret"
+    with pytest.raises(SourceError, match=r"it belongs to the coordinator https://stick"):
+        DatasetReader(_url(server))
+    assert {key for key in server.keys_sent} == {None}
+
+
+@pytest.mark.parametrize("value", ["", " "])
+def test_an_empty_key_is_none(server, monkeypatch, value):
+    monkeypatch.setenv("STICKSLIP_API_KEY", value)
+    monkeypatch.setenv("STICKSLIP_URL", _url(server, ""))
+    with DatasetReader(_url(server)) as reader:
+        assert len(reader) == 6
+    assert set(server.keys_sent) == {None}
+
+
+def test_a_key_does_not_follow_a_redirect_to_another_server(server, monkeypatch):
+    other = _Server(("127.0.0.1", 0), _Handler)
+    other.root = server.root
+    other.requests = []
+    other.keys_sent = []
+    thread = threading.Thread(target=other.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    server.redirect = _url(other, "")[:-1]
+    try:
+        with DatasetReader(_url(server), api_key="secret") as reader:
+            assert len(reader) == 6
+    finally:
+        other.shutdown()
+        thread.join()
+        other.server_close()
+    assert set(server.keys_sent) == {"Bearer secret"}
+    assert set(other.keys_sent) == {None}
+
+
+@pytest.mark.parametrize("name", ["http_proxy", "https_proxy", "all_proxy"])
+def test_a_dead_proxy_does_not_stand_before_this_machine(server, monkeypatch, name):
+    for variable in (name, name.upper()):
+        monkeypatch.setenv(variable, "http://127.0.0.1:9")
+    with DatasetReader(_url(server)) as reader:
+        assert len(reader) == 6
+
+
+def test_a_dead_proxy_before_another_machine_is_named(monkeypatch):
+    monkeypatch.setenv("http_proxy", "http://me:hidden@127.0.0.1:9")
+    with pytest.raises(SourceError) as caught:
+        DatasetReader("http://stick.example.org/v1/datasets/ds-x/versions/1")
+    message = str(caught.value)
+    assert "through the proxy http://127.0.0.1:9 of the variable http_proxy" in message
+    assert "hidden" not in message
+
+
+@pytest.mark.parametrize("fault", ["endless", "gzip", "too long"])
+def test_a_hostile_server_is_read_no_further_than_the_stated_size(server, fault):
+    server.fault = fault
+    with pytest.raises(CorruptDataError, match=r"compressed|accepted"):
+        DatasetReader(_url(server))
+    assert server.bytes_sent < 64 * 2**20
 
 
 def test_a_server_without_ranges_is_refused(server):

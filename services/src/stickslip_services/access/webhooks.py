@@ -20,10 +20,10 @@ from cryptography.fernet import Fernet, InvalidToken
 from sqlalchemy import ColumnElement, Connection, Row, and_, delete, func, insert, select, update
 from standardwebhooks import Webhook as Signer
 from stickslip_schemas.documents.responses import EventName
+from stickslip_schemas.transport.addresses import is_loopback
 
 from stickslip_services.access import audit_log
 from stickslip_services.access.principals import check_project
-from stickslip_services.addresses import is_loopback
 from stickslip_services.database.database import Clock, Database, as_datetime
 from stickslip_services.database.tables import events, jobs, webhooks
 from stickslip_services.errors import NotFoundError, SettingsError

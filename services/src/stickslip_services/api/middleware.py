@@ -20,10 +20,10 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import ProblemCode
+from stickslip_schemas.transport.addresses import is_loopback
 
 from stickslip_services.access.keys import KeyRing
 from stickslip_services.access.principals import Principal, Scope, acting_as
-from stickslip_services.addresses import is_loopback
 from stickslip_services.api.problems import ProblemError
 
 STATIC_PATH = "/static/"

@@ -33,7 +33,7 @@ from stickslip_schemas.format.manifest import (
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
 from stickslip_services.access.principals import is_visible_version
-from stickslip_services.client.verifying import is_signature, sign
+from stickslip_services.client.signing import is_signature, sign
 from stickslip_services.database.database import PageRequest, document_of, read_page
 from stickslip_services.database.tables import dataset_versions, datasets
 from stickslip_services.errors import NotFoundError

@@ -15,6 +15,7 @@ from typing import Any
 import click
 from click.exceptions import Exit
 from sqlalchemy import Connection
+from stickslip_schemas.transport.addresses import DEFAULT_URL
 
 from stickslip_services.access import audit_log as stored_audit_log
 from stickslip_services.access import keys as stored_keys
@@ -22,7 +23,6 @@ from stickslip_services.access import quotas as stored_quotas
 from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.keys import command_transaction
 from stickslip_services.access.principals import Scope
-from stickslip_services.addresses import DEFAULT_URL
 from stickslip_services.cli.common import print_table, say, shows_errors
 from stickslip_services.database.database import Role, as_datetime
 from stickslip_services.database.opening import check
@@ -102,7 +102,7 @@ def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], proj
     key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
     say(
-        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_KEY, or in the header"
+        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_API_KEY, or in the header"
     )
     say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
 

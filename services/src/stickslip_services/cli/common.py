@@ -18,15 +18,15 @@ import click
 from click.exceptions import Exit
 from pydantic import BaseModel
 from stickslip_schemas.documents.problems import FieldError
+from stickslip_schemas.transport.addresses import DEFAULT_URL
 
-from stickslip_services.addresses import DEFAULT_URL
-from stickslip_services.client.http import (
-    Client,
+from stickslip_services.client.errors import (
     ClientError,
     MissingExtraError,
     ProblemError,
     UnreachableError,
 )
+from stickslip_services.client.http import Client
 from stickslip_services.errors import CommandError, StickslipError
 
 P = ParamSpec("P")

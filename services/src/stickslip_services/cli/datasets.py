@@ -13,6 +13,7 @@ from click.exceptions import Exit
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.installation import install_hint
+from stickslip_schemas.transport.addresses import URL_VARIABLE
 
 from stickslip_services.cli.common import (
     FILE,
@@ -24,8 +25,10 @@ from stickslip_services.cli.common import (
     shows_errors,
 )
 from stickslip_services.client import pulling
-from stickslip_services.client.http import Client, ClientError
-from stickslip_services.client.verifying import READS_ARRAYS, sign_directory, signer_of
+from stickslip_services.client.errors import ClientError
+from stickslip_services.client.http import Client
+from stickslip_services.client.signing import sign_directory, signer_of
+from stickslip_services.client.verifying import READS_ARRAYS
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
 
@@ -143,10 +146,9 @@ def export(client: Client) -> None:
             name, version = _resolve(client, argument)
             argument = f"{client.url}/v1/datasets/{name}/versions/{version}"
         arguments.append(argument)
-    key = os.environ.get("STICKSLIP_KEY")
     ended = subprocess.run(
         [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
-        env=os.environ | ({"STICKSLIP_API_KEY": key} if key else {}),
+        env=os.environ | {URL_VARIABLE: client.url},  # the key belongs to this coordinator
         check=False,
     )
     raise Exit(ended.returncode)

@@ -30,7 +30,8 @@ from stickslip_services.cli.common import (
     spec_argument,
 )
 from stickslip_services.cli.specs import check_spec, read_job
-from stickslip_services.client.http import Client, ClientError, UnreachableError
+from stickslip_services.client.errors import ClientError, UnreachableError
+from stickslip_services.client.http import Client
 from stickslip_services.units import duration, size
 
 SHOWN_REJECTS = 50

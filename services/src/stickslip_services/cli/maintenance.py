@@ -13,7 +13,7 @@ from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.principals import acting_as, local_user
 from stickslip_services.cli.common import amount, say, shows_errors
-from stickslip_services.client.http import ClientError
+from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError

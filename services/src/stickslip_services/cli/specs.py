@@ -30,7 +30,7 @@ from stickslip_services.cli.common import (
     say,
     shows_errors,
 )
-from stickslip_services.client.http import ClientError
+from stickslip_services.client.errors import ClientError
 from stickslip_services.errors import CommandError
 from stickslip_services.local import making
 from stickslip_services.units import size

@@ -9,7 +9,8 @@ from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_schemas.spec.jobs import PresetName
 
 from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table
-from stickslip_services.client.http import Client, UnreachableError
+from stickslip_services.client.errors import UnreachableError
+from stickslip_services.client.http import Client
 from stickslip_services.local import making
 from stickslip_services.units import duration
 

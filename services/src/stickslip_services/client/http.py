@@ -1,133 +1,56 @@
-"""The HTTP client of a coordinator: typed answers, problems as exceptions, retries while the
-coordinator restarts.
+"""The client of a coordinator: typed answers, problems as exceptions, retries during restarts."""
 
-Each case that callers tell apart has a `ClientError` of a class of its own.
-"""
-
-import os
-import random
 import secrets
-import ssl
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
 
 import httpx
-from pydantic import TypeAdapter, ValidationError
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.certificate import Certificate
-from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
-from stickslip_schemas.format.manifest import Contents, Manifest
-from stickslip_schemas.installation import install_hint
+from stickslip_schemas.format.manifest import Contents, FileEntry, Manifest
+from stickslip_schemas.transport.addresses import (
+    InvalidKeyError,
+    api_key_of_environment,
+    authorization,
+    coordinator_url,
+    without_password,
+)
+from stickslip_schemas.transport.http import (
+    BUSY_STATUS,
+    PATIENCE_SECONDS,
+    AnswerError,
+    HttpClient,
+    RequestOptions,
+    TransportError,
+    read_bounded,
+)
+from stickslip_schemas.transport.limits import DOCUMENT_BYTES
+from stickslip_schemas.transport.proxies import object_store_options
 
-from stickslip_services.addresses import DEFAULT_URL
+from stickslip_services.client.answers import parse, raise_for_problem
+from stickslip_services.client.errors import (
+    ClientError,
+    DamagedError,
+    MissingExtraError,
+    UnexpectedError,
+    UnreachableError,
+)
+from stickslip_services.client.events import Event, Message, read_event, read_messages
 
 if TYPE_CHECKING:
     import zarr
 
-
-class ClientError(Exception):
-    """Base of all errors that the client raises."""
-
-
-class ProblemError(ClientError):
-    """The coordinator refused the request; `problem` is its problem document [RFC 9457]."""
-
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(problem.detail)
-        self.problem = problem
-
-
-class UnreachableError(ClientError):
-    """The coordinator does not answer."""
-
-
-class UnexpectedError(ClientError):
-    """The answer is not one of a coordinator of this version."""
-
-
-class UnsafePathError(ClientError):
-    """A manifest names a file outside its dataset."""
-
-
-class ForeignFilesError(ClientError):
-    """The directory holds files that do not belong to the dataset."""
-
-
-class DamagedError(ClientError):
-    """Received bytes differ from what the manifest lists."""
-
-
-class UnsignedError(ClientError):
-    """A dataset that must be signed is not."""
-
-
-class ChangedError(ClientError):
-    """A dataset or its signature was changed after it was signed."""
-
-
-class UnknownSignerError(ClientError):
-    """The key that signed a dataset is not that of an allowed signer."""
-
-
-class SelectionError(ClientError):
-    """The dataset has no such array or label."""
-
-
-class MissingExtraError(ClientError):
-    """Packages of an extra are not installed."""
-
-    def __init__(self, extra: str, what: str) -> None:
-        super().__init__(f"{what} is not installed: {install_hint('stickslip', extra)}")
-
-
-def raise_for_problem(response: httpx.Response) -> None:
-    """Raise ProblemError or UnexpectedError unless a response, whose body has been read, reports
-    success.
-    """
-    if response.is_success:
-        return
-    if response.headers.get("content-type", "").startswith(MEDIA_TYPE):
-        try:
-            problem = Problem.model_validate_json(response.content)
-        except ValidationError as error:
-            raise UnexpectedError(
-                f"{response.url} answered with an invalid problem document"
-            ) from error
-        raise ProblemError(problem)
-    raise UnexpectedError(
-        f"{response.url} answered with status {response.status_code}; is it a coordinator?"
-    )
-
-
 T = TypeVar("T")
 
-Event = (
-    responses.JobStateEvent
-    | responses.JobProgressEvent
-    | responses.TaskStateEvent
-    | responses.DatasetPublishedEvent
-)
-
-_EVENTS: Mapping[str, type[Event]] = {
-    responses.EventName.job_state: responses.JobStateEvent,
-    responses.EventName.job_progress: responses.JobProgressEvent,
-    responses.EventName.task_state: responses.TaskStateEvent,
-    responses.EventName.dataset_published: responses.DatasetPublishedEvent,
-}
-
 PAGE_SIZE = "200"
-
-PATIENCE_SECONDS = 60.0
-"""How long a failed request is repeated [s]."""
-PAUSES_SECONDS = (0.25, 0.5, 1.0, 2.0, 3.0)
-"""Longest pauses between tries [s], the last one again and again; a drawn share of them is waited.
-"""
+"""Items of a page: the most that the coordinator sends."""
 SILENCE_SECONDS = 60.0
-"""Read timeout of an event stream [s]; the coordinator sends a keep-alive every 15 s."""
+"""How long an event stream may be silent [s]; the coordinator sends a keep-alive every 15 s."""
+EVENT_PAUSE_SECONDS = 1.0
+"""Pause before a lost event stream is opened again [s]."""
 
 
 class Client:
@@ -150,34 +73,41 @@ class Client:
 
         Args:
             url: Defaults to STICKSLIP_URL, then to this machine.
-            key: Defaults to STICKSLIP_KEY; without either, requests carry no key.
+            key: Defaults to STICKSLIP_API_KEY. If both are empty, requests carry no key.
             patience: How long a failed request is repeated [s].
             transport: Transport of httpx, for tests.
             sleep: Waits between attempts, for tests.
 
         Raises:
-            ClientError: The URL has no scheme.
+            ClientError: The URL has no scheme, or the key cannot be sent.
         """
-        self.url = (url or os.environ.get("STICKSLIP_URL") or DEFAULT_URL).rstrip("/")
+        self.url = (url or coordinator_url()).rstrip("/")
         if not self.url.startswith(("http://", "https://")):
             raise ClientError(
-                f"the URL of the coordinator must begin with http:// or https://: it is {self.url!r}"
+                "the URL of the coordinator must begin with http:// or https://: it is "
+                f"{without_password(self.url)!r}"
             )
-        self.patience = patience
         self._sleep = sleep
-        self._was_answered = False
-        key = key or os.environ.get("STICKSLIP_KEY")
-        # trust_env is off because a proxy of the environment is for the internet. SSL_CERT_FILE
-        # still applies: only this machine may trust the authority of the coordinator's certificate.
-        authorities = os.environ.get("SSL_CERT_FILE") if self.url.startswith("https") else None
-        self._http = httpx.Client(
-            base_url=self.url,
-            timeout=httpx.Timeout(60.0, connect=5.0),
-            headers={} if key is None else {"Authorization": f"Bearer {key}"},
-            verify=ssl.create_default_context(cafile=authorities) if authorities else True,
-            trust_env=False,
-            transport=transport,
-        )
+        self._api_key = key or api_key_of_environment()
+        try:
+            self._http = HttpClient(
+                self.url,
+                api_key=self._api_key,
+                patience=patience,
+                transport=transport,
+                sleep=sleep,
+            )
+        except InvalidKeyError as error:
+            raise ClientError(str(error)) from error
+
+    @property
+    def patience(self) -> float:
+        """How long a failed request is repeated [s]."""
+        return self._http.patience
+
+    @patience.setter
+    def patience(self, seconds: float) -> None:
+        self._http.patience = seconds
 
     def __enter__(self) -> Self:
         return self
@@ -186,6 +116,7 @@ class Client:
         self.close()
 
     def close(self) -> None:
+        """Close the connections."""
         self._http.close()
 
     def validate(self, spec: Mapping[str, Any]) -> responses.Validation:
@@ -222,6 +153,7 @@ class Client:
         return self._call(responses.FileUpload, "POST", "/v1/files", content=data, headers=octets)
 
     def job(self, job_id: str) -> responses.JobDetail:
+        """Return a job."""
         return self._call(responses.JobDetail, "GET", f"/v1/jobs/{job_id}")
 
     def jobs(
@@ -238,6 +170,7 @@ class Client:
     def samples(
         self, job_id: str, *, state: TaskState | None = None
     ) -> Iterator[responses.SampleState]:
+        """Yield the samples of a job by slot, or only the samples in one state."""
         query = {} if state is None else {"state": str(state)}
         return self._items(
             responses.Page[responses.SampleState], f"/v1/jobs/{job_id}/samples", query
@@ -250,6 +183,7 @@ class Client:
         )
 
     def cancel(self, job_id: str) -> responses.JobDetail:
+        """Cancel a job: running tasks are stopped, and results stay cached."""
         return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
 
     def pause(self, job_id: str) -> responses.JobDetail:
@@ -257,57 +191,53 @@ class Client:
         return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
 
     def resume(self, job_id: str) -> responses.JobDetail:
+        """Resume a paused job."""
         return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
-        """Yield the events of a job until it ends, across lost connections and restarts of the
-        coordinator.
+        """Yield the events of a job from its first one until it ends.
+
+        A lost connection or a restart of the coordinator loses no event.
         """
         last_id = ""
         waited = 0.0
         while True:
+            reason = "the event stream ended before the job"
             try:
-                for message in self._stream(job_id, last_id):
+                for message in self._messages(job_id, last_id):
                     waited = 0.0
-                    last_id = message.get("id", last_id)
-                    event = _read_event(message)
+                    last_id = message.id or last_id
+                    event = read_event(message, self.url)
                     if event is not None:
                         yield event
                     if isinstance(event, responses.JobStateEvent) and not event.state.is_open:
                         return
-                reason = "the event stream ended before the job"
-            except httpx.TransportError as error:
-                reason = str(error) or type(error).__name__
+            except TransportError as error:
+                reason = str(error)
+            # Keep-alives and events reset the clock: only silence counts.
             if waited >= self.patience:
-                raise UnreachableError(f"{self.url} does not answer: {reason}")
-            self._sleep(1.0)
-            waited += 1.0
+                raise UnreachableError(f"{without_password(self.url)}: {reason}")
+            self._sleep(EVENT_PAUSE_SECONDS)
+            waited += EVENT_PAUSE_SECONDS
 
     def wait(self, job_id: str) -> responses.JobDetail:
-        """Wait until a job has ended, as `events` does, and return it: its `state` says how it
-        ended.
+        """Wait until a job has ended, as `events` does, and return it.
+
+        Its `state` says how it ended.
         """
         for _ in self.events(job_id):
             pass
         return self.job(job_id)
 
-    def _stream(self, job_id: str, last_id: str) -> Iterator[dict[str, str]]:
-        headers = {"Accept": "text/event-stream"} | ({"Last-Event-ID": last_id} if last_id else {})
-        timeout = httpx.Timeout(SILENCE_SECONDS, connect=5.0)
-        with self._http.stream(
-            "GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout
-        ) as response:
-            if response.status_code == 503:
-                raise httpx.ReadError("the coordinator is busy")
-            if not response.is_success:
-                response.read()
-            raise_for_problem(response)
-            received = ""
-            for text in response.iter_text():
-                *messages, received = (received + text).split("\n\n")
-                for message in messages:
-                    lines = (line.partition(": ") for line in message.split("\n"))
-                    yield {name: value for name, _, value in lines}
+    def _messages(self, job_id: str, last_id: str) -> Iterator[Message]:
+        """Yield the messages of a job's stream that follow the one with the id `last_id`."""
+        headers = {"Accept": "text/event-stream"}
+        if last_id:
+            headers["Last-Event-ID"] = last_id
+        path = f"/v1/jobs/{job_id}/events"
+        with self._http.stream("GET", path, silence=SILENCE_SECONDS, headers=headers) as response:
+            self.check_status(response)
+            yield from read_messages(response.iter_raw())
 
     def datasets(self) -> Iterator[responses.Dataset]:
         """Yield all datasets, newest first."""
@@ -321,16 +251,46 @@ class Client:
             responses.DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}"
         )
 
+    def find_dataset(self, name: str) -> responses.Dataset:
+        """Return the dataset of a name.
+
+        Raises:
+            ClientError: No dataset has this name, or several have.
+        """
+        matches = [dataset for dataset in self.datasets() if dataset.name == name]
+        if not matches:
+            raise ClientError(
+                f"there is no dataset {name!r}, by name or id: `stickslip datasets` lists them"
+            )
+        if len(matches) > 1:
+            ids = ", ".join(dataset.id for dataset in matches)
+            raise ClientError(f"{len(matches)} datasets have the name {name!r}: name one of {ids}")
+        return matches[0]
+
     def contents(self, dataset: str, version: int) -> Contents:
-        """Return what the manifest of a version lists.
+        """Return the contents that the manifest of a version lists.
 
         Sections of a large one are fetched on demand.
         """
         root = f"/v1/datasets/{dataset}/versions/{version}"
         manifest = self._call(Manifest, "GET", f"{root}/manifest")
-        return Contents(
-            manifest, lambda file: self.request("GET", f"{root}/files/{file.path}").content
-        )
+        return Contents(manifest, self.section_reader(f"{root}/files/"))
+
+    def section_reader(self, root: str) -> Callable[[FileEntry], bytes]:
+        """Return a function that fetches a section of the manifest of the files below `root`.
+
+        It raises DamagedError for a section that is larger than any section can be.
+        """
+
+        def read(file: FileEntry) -> bytes:
+            if file.size > DOCUMENT_BYTES:
+                raise DamagedError(
+                    f"{file.path} must have at most {DOCUMENT_BYTES} bytes, and the manifest says "
+                    f"{file.size}"
+                )
+            return self.request("GET", root + file.path, limit=file.size).content
+
+        return read
 
     def newest(self, dataset: str) -> int:
         """Return the number of the newest version of a dataset.
@@ -343,11 +303,10 @@ class Client:
         return versions[-1].version
 
     def open(self, dataset: str, version: int | None = None) -> "zarr.Group":
-        """Open a version of a dataset, the newest by default, as a Zarr group, whose chunks are
-        downloaded when read.
+        """Open a version of a dataset, the newest by default, as a Zarr group.
 
-        A missing chunk reads as the fill value: pull the dataset, or read it with
-        stickslip-training, to get an error.
+        Its chunks are downloaded when they are read. A missing chunk reads as the fill value: pull
+        the dataset, or read it with stickslip-training, to get an error.
 
         Raises:
             MissingExtraError: The extra `arrays` is not installed.
@@ -362,10 +321,15 @@ class Client:
                 "arrays", f"to open a dataset needs zarr and obstore, and {error.name}"
             ) from error
         number = self.newest(dataset) if version is None else version
+        # A version that does not exist is a problem of the coordinator, and not an empty group.
         self.version(dataset, number)
-        files = f"{self.url}/v1/datasets/{dataset}/versions/{number}/files"
-        key = {name: value for name, value in self._http.headers.items() if name == "authorization"}
-        store = HTTPStore(files, client_options={"allow_http": True, "default_headers": key})
+        url = f"{self.url}/v1/datasets/{dataset}/versions/{number}/files"
+        options: Any = {
+            "allow_http": True,
+            "default_headers": authorization(self._api_key),
+            **object_store_options(url),
+        }
+        store = HTTPStore(url, client_options=options)
         return zarr.open_group(ObjectStore(store, read_only=True), mode="r")
 
     def workers(self) -> list[responses.WorkerEntry]:
@@ -378,73 +342,92 @@ class Client:
     def register(self, certificate: Certificate) -> responses.CertificateEntry:
         """Register a certificate. Registering it again changes nothing."""
         headers = {"Content-Type": "application/json"}
-        content = certificate.model_dump_json()
+        content = certificate.model_dump_json().encode()
         return self._call(
             responses.CertificateEntry, "POST", "/v1/certificates", content=content, headers=headers
         )
 
-    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        limit: int = DOCUMENT_BYTES,
+        **options: Unpack[RequestOptions],
+    ) -> httpx.Response:
         """Send a request, and repeat it while the connection fails or the coordinator is busy.
 
         Repeating is safe: requests that change something are idempotent or carry an idempotency
-        key. Raises ClientError.
+        key.
+
+        Args:
+            method: `GET` for example.
+            path: Path below the URL of the coordinator.
+            limit: Largest body that is accepted [bytes].
+            options: Query, headers and body.
+
+        Raises:
+            ProblemError: The coordinator refused the request.
+            UnreachableError: It does not answer.
+            UnexpectedError: The answer is not one of a coordinator.
         """
-        until = time.monotonic() + self.patience
-        for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):
-            last = time.monotonic() >= until
-            try:
-                response = self._http.request(method, path, **options)
-            except httpx.TransportError as error:
-                # A coordinator that has answered before may be restarting.
-                if last or (isinstance(error, httpx.ConnectError) and not self._was_answered):
-                    raise UnreachableError(
-                        f"{self.url} does not answer: {error or type(error).__name__}"
-                    ) from error
-            else:
-                self._was_answered = True
-                if last or response.status_code != 503:
-                    raise_for_problem(response)
-                    return response
-            self._sleep(pause * random.random())
-        raise AssertionError
+        try:
+            response = self._http.request(method, path, limit=limit, **options)
+        except TransportError as error:
+            raise UnreachableError(f"{without_password(self.url)} {error}") from error
+        except AnswerError as error:
+            raise UnexpectedError(str(error)) from error
+        raise_for_problem(response)
+        return response
 
     def stream(
         self, path: str, headers: Mapping[str, str]
     ) -> AbstractContextManager[httpx.Response]:
-        """Open a download; the caller handles connection errors."""
+        """Open a download, whose body the caller reads with `iter_raw`.
+
+        The caller handles TransportError and AnswerError.
+        """
         return self._http.stream("GET", path, headers=headers)
 
-    def _call(self, answer: type[T], method: str, path: str, **options: Any) -> T:
-        return parsed(answer, self.request(method, path, **options))
+    def check_status(self, response: httpx.Response) -> None:
+        """Raise an error unless a response that is open reports success.
+
+        Raises:
+            TransportError: The coordinator is busy: the caller may try again.
+            ProblemError: The coordinator refused the request.
+            UnexpectedError: The answer is not one of a coordinator.
+        """
+        if response.is_success:
+            return
+        if response.status_code == BUSY_STATUS:
+            raise TransportError("is busy")
+        try:
+            body = read_bounded(response, DOCUMENT_BYTES)
+        except AnswerError as error:
+            raise UnexpectedError(str(error)) from error
+        raise_for_problem(
+            httpx.Response(
+                response.status_code,
+                headers=response.headers,
+                content=body,
+                request=response.request,
+            )
+        )
+
+    def _call(
+        self, answer: type[T], method: str, path: str, **options: Unpack[RequestOptions]
+    ) -> T:
+        response = self.request(method, path, **options)
+        return parse(answer, response.content, str(response.url))
 
     def _items(
         self, answer: type[responses.Page[T]], path: str, query: Mapping[str, str] | None = None
     ) -> Iterator[T]:
-        token: str | None = ""
-        while token is not None:
-            params = {"page_size": PAGE_SIZE, **(query or {})} | (
-                {"page_token": token} if token else {}
-            )
+        """Yield the items of all pages of a list."""
+        params = {"page_size": PAGE_SIZE, **(query or {})}
+        while True:
             page = self._call(answer, "GET", path, params=params)
             yield from page.items
-            token = page.next_page_token
-
-
-def parsed(answer: type[T], response: httpx.Response) -> T:
-    """Return the document of a response; raise UnexpectedError."""
-    try:
-        return TypeAdapter(answer).validate_json(response.content)
-    except ValidationError as error:
-        raise UnexpectedError(f"{response.url} sent an unexpected answer: {error}") from error
-
-
-def _read_event(message: Mapping[str, str]) -> Event | None:
-    """Return an event, None for one that only newer versions know; raise UnexpectedError."""
-    name = message.get("event", "")
-    model = _EVENTS.get(name)
-    if model is None:
-        return None
-    try:
-        return model.model_validate_json(message.get("data", ""))
-    except ValueError as error:
-        raise UnexpectedError(f"the event {name} has unexpected data: {error}") from error
+            if page.next_page_token is None:
+                return
+            params["page_token"] = page.next_page_token

@@ -1,26 +1,28 @@
 """Downloads of dataset versions to a directory.
 
-The manifest lists the files and their digests. Only listed files are written, and a file gets its
-name after its digest has been checked. An interrupted download continues: a `.part` file holds the
-first bytes of a file, and the rest is requested by range.
+The manifest lists the files and their digests. Only listed files are written, and none is larger
+than the manifest states. The manifest itself is written last, so a directory with a manifest is
+complete.
 """
 
+import shutil
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-import httpx
 from pydantic import ValidationError
-from stickslip_schemas.base import Sha256, sha256
+from stickslip_schemas.base import sha256
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
     MANIFEST_NAME,
     SEAL_NAME,
     SIGNATURE_NAME,
     BrokenSealError,
+    BrokenSectionError,
     Contents,
     FileEntry,
     Manifest,
@@ -28,42 +30,63 @@ from stickslip_schemas.format.manifest import (
     layout,
 )
 from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection, part_files
-from stickslip_schemas.store import sync, write_durably
+from stickslip_schemas.store import write_durably
 
-from stickslip_services.client.http import (
-    Client,
+from stickslip_services.client.answers import parse
+from stickslip_services.client.downloads import Downloader, Target
+from stickslip_services.client.errors import (
+    ClientError,
     DamagedError,
     ForeignFilesError,
     ProblemError,
     SelectionError,
-    UnreachableError,
-    parsed,
-    raise_for_problem,
 )
+from stickslip_services.client.http import Client
+from stickslip_services.client.signing import check_signature
 from stickslip_services.client.verifying import (
-    CONNECTIONS,
     EVERYTHING,
-    OWN_NAMES,
-    PART,
-    check_signature,
+    PART_SUFFIX,
+    RESERVED_NAMES,
+    check_counts,
     fault_of,
-    file_digest,
     files_below,
     read_label,
     read_part,
     safe_path,
 )
 
-TRIES = 5
+SIGNATURE_BYTES = 2**16
+"""Largest signature that is read [bytes]; one of a key of 16,384 bits has 6 kB."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pulled:
     """Counts of a finished pull; `files` includes the files that were already there."""
 
+    samples: int
+    """Valid samples of the version, or of the chosen part."""
     files: int
     downloaded_files: int
     downloaded_bytes: int
+
+
+class _Sealed(NamedTuple):
+    """A version whose seal holds."""
+
+    contents: Contents
+    files: dict[str, bytes]
+    """The three files that vouch for all others, by name, the manifest last."""
+
+
+class _Part(NamedTuple):
+    """The files of a chosen part of a version."""
+
+    targets: list[Target]
+    samples: int
+    """Chosen samples."""
+    label_files: int
+    """Files of labels that had to be downloaded to choose the samples."""
+    label_bytes: int
 
 
 def pull(
@@ -79,53 +102,64 @@ def pull(
 ) -> Pulled:
     """Download a version, or the part that `selection` chooses, to `target`.
 
-    Intact files are not downloaded again.
+    Intact files are not downloaded again. A part has all labels and, of the other arrays, the
+    shards that hold a chosen sample; `selection.json` describes it.
 
-    A part has all labels and, of the other arrays, the shards that hold a chosen sample;
-    `selection.json` describes it. The manifest is written last, so a directory with a manifest is
-    complete.
+    Args:
+        client: A client of the coordinator that has the dataset.
+        dataset: Id of the dataset.
+        version: Number of the version.
+        target: Directory to write to.
+        selection: Part to download.
+        allowed_signers: File of the signers to trust [ssh-keygen(1)]; without it, signatures are
+            not checked.
+        on_bytes: Called with the number of bytes of each received block.
+        on_plan: Called once, with the number of files and bytes to download.
 
-    Args: client: A client of the coordinator that has the dataset. dataset: Id of the dataset.
-        version: Number of the version. target: Directory to write to. selection: Part to download.
-        allowed_signers: File of the signers to trust [ssh-keygen(1)]; without, signatures are not
-        checked. on_bytes: Called with the number of bytes of each received block. on_plan: Called
-        once, with the number of files and bytes to download.
-
-    Raises: ForeignFilesError: `target` holds other files. Nothing was written. SelectionError: The
-        dataset has no such array or label. DamagedError: Received bytes differ from what the
-        manifest lists. UnsignedError, ChangedError, UnknownSignerError: No allowed signer signed
-        the version. Nothing was written. ClientError: The coordinator refused, or does not answer.
+    Raises:
+        ForeignFilesError: `target` holds other files. Nothing was written.
+        SelectionError: The dataset has no such array or label, or no sample is chosen.
+        DamagedError: Received bytes differ from those that the manifest lists.
+        UnsignedError: Nobody signed the version. Nothing was written.
+        ChangedError: The signature is not that of the version. Nothing was written.
+        UnknownSignerError: No allowed signer signed the version. Nothing was written.
+        ClientError: The coordinator refused, or does not answer; or the disk is too small.
     """
-    contents, sealed = _fetch_sealed(client, dataset, version)
-    manifest = contents.manifest
     root = f"/v1/datasets/{dataset}/versions/{version}/files/"
+    sealed = _fetch_sealed(client, dataset, version)
+    contents = sealed.contents
     signature = _fetch_signature(client, root)
     if allowed_signers is not None:
-        check_signature(sealed[SEAL_NAME], signature, allowed_signers)
+        check_signature(sealed.files[SEAL_NAME], signature, allowed_signers)
+
+    # All that can be refused is refused before the first byte is written.
     with _selecting():
-        selection.choose_arrays(layout(manifest.spec))
-    files = _with_paths(target, part_files(contents, selection, None))
+        selection.choose_arrays(layout(contents.manifest.spec))
+    targets = _targets(target, part_files(contents, selection, None))
     refuse_foreign_files(target, contents, f"{dataset}:v{version}")
     refuse_other_part(target, selection)
     target.mkdir(parents=True, exist_ok=True)
-    labels_done = (0, 0)
+
+    downloader = Downloader(client, root, on_bytes, threading.Event())
+    part = _Part(targets, contents.manifest.valid_count, 0, 0)
     if not selection.is_everything:
-        labels = [(file, path) for file, path in files if fault_of(target, file)]
-        _download_all(client, root, labels, lambda _: None)
-        labels_done = (len(labels), sum(file.size for file, _ in labels))
-        with _selecting():
-            wanted = part_files(
-                contents, selection, lambda name: read_label(target, manifest, name)
-            )
-        files = _with_paths(target, wanted)
-        document = PartDocument(manifest=sha256(sealed[MANIFEST_NAME]), selection=selection)
+        quiet = Downloader(client, root, lambda _: None, threading.Event())
+        part = _choose_part(quiet, target, contents, selection, targets)
+        manifest_digest = sha256(sealed.files[MANIFEST_NAME])
+        document = PartDocument(manifest=manifest_digest, selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
-    missing = [(file, path) for file, path in files if fault_of(target, file)]
-    changed = {name: content for name, content in sealed.items() if _read(target / name) != content}
+
+    missing = _missing(target, part.targets)
+    changed = {
+        name: content for name, content in sealed.files.items() if _read(target / name) != content
+    }
     count = len(missing) + len(changed)
-    size = sum(file.size for file, _ in missing) + sum(map(len, changed.values()))
+    size = _total_size(missing) + sum(len(content) for content in changed.values())
+    _refuse_small_disk(target, size)
     on_plan(count, size)
-    _download_all(client, root, missing, on_bytes)
+    downloader.download_all(missing)
+
+    # The manifest comes last: it says that the directory is complete.
     if signature is not None and _read(target / SIGNATURE_NAME) != signature:
         write_durably(target / SIGNATURE_NAME, signature)
     for name, content in changed.items():
@@ -133,32 +167,58 @@ def pull(
         on_bytes(len(content))
     if selection.is_everything:
         (target / SELECTION_NAME).unlink(missing_ok=True)
-    return Pulled(len(files) + len(sealed), count + labels_done[0], size + labels_done[1])
+    return Pulled(
+        samples=part.samples,
+        files=len(part.targets) + len(sealed.files),
+        downloaded_files=count + part.label_files,
+        downloaded_bytes=size + part.label_bytes,
+    )
 
 
-def _with_paths(target: Path, files: list[FileEntry]) -> list[tuple[FileEntry, Path]]:
-    return [(file, safe_path(target, file.path)) for file in files]
+def _choose_part(
+    downloader: Downloader,
+    target: Path,
+    contents: Contents,
+    selection: Selection,
+    label_targets: list[Target],
+) -> _Part:
+    """Download the labels of a version, and return the files of the samples that they choose."""
+    missing = _missing(target, label_targets)
+    _refuse_small_disk(target, _total_size(missing))
+    downloader.download_all(missing)
+    labels = partial(read_label, target, contents.manifest)
+    with _selecting():
+        chosen = selection.choose_samples(layout(contents.manifest.spec), labels)
+        files = part_files(contents, selection, labels)
+    return _Part(
+        targets=_targets(target, files),
+        samples=int(chosen.sum()),
+        label_files=len(missing),
+        label_bytes=_total_size(missing),
+    )
 
 
-def _download_all(
-    client: Client,
-    root: str,
-    missing: list[tuple[FileEntry, Path]],
-    on_bytes: Callable[[int], None],
-) -> None:
-    stop = threading.Event()
-    with ThreadPoolExecutor(CONNECTIONS) as pool:
-        downloads = [
-            pool.submit(_download, client, root, file, path, on_bytes, stop)
-            for file, path in missing
-        ]
-        try:
-            for download in as_completed(downloads):
-                download.result()
-        except BaseException:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-            raise
+def _targets(target: Path, files: list[FileEntry]) -> list[Target]:
+    return [Target(file, safe_path(target, file.path)) for file in files]
+
+
+def _missing(target: Path, targets: list[Target]) -> list[Target]:
+    """Return the files that a directory does not hold, or holds damaged."""
+    return [entry for entry in targets if fault_of(target, entry.file) is not None]
+
+
+def _total_size(targets: list[Target]) -> int:
+    return sum(entry.file.size for entry in targets)
+
+
+def _refuse_small_disk(target: Path, size: int) -> None:
+    """Raise ClientError if the disk has not so many free bytes."""
+    free = shutil.disk_usage(target).free
+    if size > free:
+        raise ClientError(
+            f"{target} has {free} bytes free, and the files have {size}: choose another directory, "
+            "or a part of the dataset"
+        )
 
 
 @contextmanager
@@ -166,6 +226,8 @@ def _selecting() -> Iterator[None]:
     """Turn the ValueError of a wrong selection into a SelectionError."""
     try:
         yield
+    except BrokenSectionError as error:
+        raise DamagedError(str(error)) from error
     except ValueError as error:
         raise SelectionError(str(error)) from error
 
@@ -176,68 +238,71 @@ def refuse_other_part(target: Path, selection: Selection) -> None:
     A whole version replaces any part.
     """
     with suppress(FileNotFoundError):
-        there = read_part(target).selection
-        if not selection.is_everything and there != selection:
+        present = read_part(target).selection
+        if not selection.is_everything and present != selection:
             raise ForeignFilesError(
-                f"{target} holds another part of the dataset, {there.model_dump_json()}: pull all of it, or pull into "
-                "a new directory"
+                f"{target} holds another part of the dataset, {present.model_dump_json()}: pull "
+                "all of it, or pull into a new directory"
             )
 
 
 def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
-    """Raise ForeignFilesError if `target` holds files that `contents`, of the version `name`, does
-    not list.
+    """Raise ForeignFilesError if `target` holds files that are not of the version `name`.
 
     A directory that already holds this version may have other files beside it.
     """
-    found = sorted(files_below(target))  # by array and shard, so that each section is read once
-    foreign = [
-        path
-        for path in found
-        if (name_ := path.removesuffix(PART)) not in OWN_NAMES and contents.file(name_) is None
-    ]
-    there = ""
+    foreign = []
+    # In the order of arrays and shards, so that each section is read once.
+    for path in sorted(files_below(target)):
+        listed_path = path.removesuffix(PART_SUFFIX)
+        if listed_path not in RESERVED_NAMES and contents.file(listed_path) is None:
+            foreign.append(path)
+    present = ""
     with suppress(OSError, ValidationError):
         manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
-        there = f"{manifest.dataset}:v{manifest.version}"
-    if not foreign or there == name:
+        present = f"{manifest.dataset}:v{manifest.version}"
+    if not foreign or present == name:
         return
     number = "1 file is" if len(foreign) == 1 else f"{len(foreign)} files are"
-    holds = f" It holds {there}." if there else ""
+    holds = f" It holds {present}." if present else ""
     raise ForeignFilesError(
-        f"{target} is not empty, and {number} not part of {name}: {min(foreign)}, for example.{holds} Nothing was "
-        "written; pull into a new directory"
+        f"{target} is not empty, and {number} not part of {name}: {min(foreign)}, for example."
+        f"{holds} Nothing was written; pull into a new directory"
     )
 
 
-def _fetch_sealed(client: Client, dataset: str, version: int) -> tuple[Contents, dict[str, bytes]]:
-    """Return the contents of a version, and the bytes of its three sealed files by name, the
-    manifest last.
-    """
-    promised = client.version(dataset, version)
-    answer = client.request("GET", f"/v1/datasets/{dataset}/versions/{version}/manifest")
-    content, root = answer.content, f"/v1/datasets/{dataset}/versions/{version}/files/"
-    group, seal = (client.request("GET", root + name).content for name in (GROUP_NAME, SEAL_NAME))
-    if (sha256(content), sha256(group)) != (promised.manifest, promised.group):
+def _fetch_sealed(client: Client, dataset: str, version: int) -> _Sealed:
+    """Return a version; its manifest, metadata, seal and the coordinator's record must agree."""
+    base = f"/v1/datasets/{dataset}/versions/{version}"
+    record = client.version(dataset, version)
+    answer = client.request("GET", f"{base}/manifest")
+    content = answer.content
+    group = client.request("GET", f"{base}/files/{GROUP_NAME}").content
+    seal = client.request("GET", f"{base}/files/{SEAL_NAME}").content
+    if (sha256(content), sha256(group)) != (record.manifest, record.group):
         raise DamagedError(
-            f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, does not have the committed digest"
+            f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, does not have the "
+            "committed digest"
         )
     try:
         check_seal(content, group, seal)
     except BrokenSealError as error:
         raise DamagedError(f"{dataset}, version {version}: {error}") from error
-    manifest = parsed(Manifest, answer)
+    manifest = parse(Manifest, content, str(answer.url))
     if (manifest.dataset, manifest.version) != (dataset, version):
         raise DamagedError(
-            f"the manifest of {dataset}:v{version} is that of {manifest.dataset}:v{manifest.version}"
+            f"the manifest of {dataset}:v{version} is that of "
+            f"{manifest.dataset}:v{manifest.version}"
         )
-    contents = Contents(manifest, lambda file: client.request("GET", root + file.path).content)
-    return contents, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content}
+    check_counts(manifest)
+    contents = Contents(manifest, client.section_reader(f"{base}/files/"))
+    return _Sealed(contents, {GROUP_NAME: group, SEAL_NAME: seal, MANIFEST_NAME: content})
 
 
 def _fetch_signature(client: Client, root: str) -> bytes | None:
+    """Return the signature of a version; None if nobody signed it."""
     try:
-        return client.request("GET", root + SIGNATURE_NAME).content
+        return client.request("GET", root + SIGNATURE_NAME, limit=SIGNATURE_BYTES).content
     except ProblemError as error:
         if error.problem.status != 404:
             raise
@@ -245,75 +310,8 @@ def _fetch_signature(client: Client, root: str) -> bytes | None:
 
 
 def _read(path: Path) -> bytes | None:
+    """Return the bytes of a file; None if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError:
         return None
-
-
-def _download(
-    client: Client,
-    root: str,
-    file: FileEntry,
-    path: Path,
-    on_bytes: Callable[[int], None],
-    stop: threading.Event,
-) -> None:
-    """Download a file to its `.part` file, check it, and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + PART)
-    if part.is_symlink():
-        part.unlink()
-    on_bytes(part.stat().st_size if part.exists() else 0)
-    reason = ""
-    for attempt in range(TRIES):
-        if stop.wait(0 if attempt == 0 else min(2.0**attempt / 4, client.patience)):
-            return
-        try:
-            _fetch(client, root + file.path, file.sha256, part, on_bytes, stop)
-        except httpx.TransportError as error:
-            reason = str(error) or type(error).__name__
-            continue  # the part keeps the received bytes
-        if stop.is_set():
-            return
-        if part.stat().st_size == file.size and file_digest(part) == file.sha256:
-            sync(part)
-            part.replace(path)
-            return
-        part.unlink()  # a part of another file, or damaged in transit: start again
-        reason = "it arrived damaged"
-    if reason == "it arrived damaged":
-        raise DamagedError(
-            f"{file.path} arrived {TRIES} times with other bytes than the manifest promises"
-        )
-    raise UnreachableError(f"{file.path} could not be downloaded in {TRIES} tries: {reason}")
-
-
-def _fetch(
-    client: Client,
-    url: str,
-    digest: Sha256,
-    part: Path,
-    on_bytes: Callable[[int], None],
-    stop: threading.Event,
-) -> None:
-    have = part.stat().st_size if part.exists() else 0
-    etag = f'"{digest}"'
-    headers = {"Accept-Encoding": "identity"} | (
-        {"Range": f"bytes={have}-", "If-Range": etag} if have else {}
-    )
-    with client.stream(url, headers) as response:
-        if response.status_code == 416:  # the part is at least as long as the file
-            return
-        if response.status_code == 503:
-            raise httpx.ReadError("the coordinator is busy")
-        if response.status_code not in (200, 206):
-            response.read()
-            raise_for_problem(response)
-        mode = "ab" if response.status_code == 206 else "wb"
-        with part.open(mode) as target:
-            for block in response.iter_raw():
-                target.write(block)
-                on_bytes(len(block))
-                if stop.is_set():
-                    return

@@ -32,7 +32,7 @@ from stickslip_services.catalog.versions import (
     read_version,
     sign_version,
 )
-from stickslip_services.client.http import ClientError
+from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Prepared, RowQuery, batches
 from stickslip_services.database.tables import (
     job_counts,

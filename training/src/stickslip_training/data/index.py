@@ -51,7 +51,7 @@ class Index:
         self.manifest = manifest
         self.arrays = arrays
         self._check_shards = check_shards
-        self._contents = Contents(manifest, source.read)
+        self._contents = Contents(manifest, source.read_section)
         self._checked_sections: set[int] = set()
         self._shard_indexes: dict[tuple[str, int], Array] = {}
         self._labels: dict[str, Array] = {}
@@ -67,7 +67,7 @@ class Index:
     def __setstate__(self, state: dict[str, Any]) -> None:
         manifest = Manifest.model_validate_json(state["manifest"])
         self.__dict__.update(
-            state, manifest=manifest, _contents=Contents(manifest, state["source"].read)
+            state, manifest=manifest, _contents=Contents(manifest, state["source"].read_section)
         )
 
     # --- files

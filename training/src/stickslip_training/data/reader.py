@@ -304,9 +304,9 @@ def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
     against one another.
     """
     manifest = source.read_manifest()
-    group = source.fetch(GROUP_NAME)[0]
+    group = source.fetch(GROUP_NAME).data
     try:
-        digest = check_seal(manifest, group, source.fetch(SEAL_NAME)[0])
+        digest = check_seal(manifest, group, source.fetch(SEAL_NAME).data)
     except BrokenSealError as error:
         raise CorruptDataError(f"{source}/{error}") from None
     return digest, _parse_metadata(group, f"{source}/{GROUP_NAME}"), manifest
@@ -319,7 +319,7 @@ def _read_selection(source: Source, manifest: str) -> Selection:
     if not isinstance(source, DirectorySource):
         return Selection()  # servers have whole versions
     try:
-        data = source.fetch(SELECTION_NAME)[0]
+        data = source.fetch(SELECTION_NAME).data
     except MissingFileError:
         return Selection()
     try:

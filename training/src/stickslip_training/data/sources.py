@@ -1,31 +1,40 @@
-"""Where a dataset's bytes come from: a directory, a bucket, or an HTTP server that answers range
-requests; what can be wrong with them.
+"""Sources of a dataset's bytes: a directory, a bucket, or an HTTP server that answers ranges.
 
-A source keeps nothing open that two processes could fight over: a file is opened for each read, and
-an HTTP client belongs to the process that made it. So a source can be pickled and survives a fork.
+A source keeps nothing open that two processes could share by accident. A file is opened for each
+read, and a client belongs to the process that made it. So a source can be pickled and survives a
+fork.
 """
 
 import hashlib
 import os
 import re
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.format.manifest import MANIFEST_NAME, FileEntry
 from stickslip_schemas.installation import install_hint
+from stickslip_schemas.transport.addresses import (
+    API_KEY_VARIABLE,
+    URL_VARIABLE,
+    api_key_for,
+    api_key_of_environment,
+    coordinator_url,
+)
+from stickslip_schemas.transport.limits import DOCUMENT_BYTES
+from stickslip_schemas.transport.proxies import through
 
-API_KEY_VARIABLE = "STICKSLIP_API_KEY"
-"""Environment variable with the key that is sent to a server where none is given."""
+if TYPE_CHECKING:
+    from stickslip_schemas.transport.objects import ObjectClient
+
+READER_PATIENCE_SECONDS = 10.0
+"""How long a failed request of a reader is repeated [s]: a server that restarts costs no epoch."""
 
 
 class DatasetError(Exception):
-    """The base of everything that reading a dataset raises on purpose."""
+    """The base of every error that reading a dataset raises on purpose."""
 
 
 class InvalidDatasetError(DatasetError, ValueError):
@@ -33,11 +42,11 @@ class InvalidDatasetError(DatasetError, ValueError):
 
 
 class MissingFileError(DatasetError, FileNotFoundError):
-    """A file that belongs to the dataset is not there."""
+    """A file that belongs to the dataset does not exist."""
 
 
 class CorruptDataError(DatasetError, CorruptChunkError):
-    """Bytes are not what a size, a checksum or a digest says they are."""
+    """Bytes do not have the size, the checksum or the digest that they should have."""
 
 
 class RejectedSampleError(DatasetError, LookupError):
@@ -48,60 +57,98 @@ class SourceError(DatasetError, OSError):
     """The server does not answer, or not with the requested data."""
 
 
+class Fetched(NamedTuple):
+    """Bytes of a file."""
+
+    data: bytes
+    file_size: int | None
+    """Size of the whole file [bytes]; None if the source did not say it."""
+
+
 class Source(ABC):
     """The files of one dataset version."""
 
     @abstractmethod
-    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
-        """Return the bytes of a file, or those of a part of it, and the size of the file if it is
-        known.
+    def fetch(
+        self, path: str, part: range | None = None, *, limit: int = DOCUMENT_BYTES
+    ) -> Fetched:
+        """Return the bytes of a file, or of a part of it.
 
-        Raises MissingFileError where there is no such file.
+        Args:
+            path: Path of the file in the version.
+            part: Bytes to return; None for the whole file.
+            limit: Largest file that is read whole [bytes].
+
+        Raises:
+            MissingFileError: There is no such file.
+            CorruptDataError: The file ends before the part, or is larger than `limit`.
+            SourceError: The server does not answer.
         """
 
     def read_manifest(self) -> bytes:
         """Return the manifest's bytes."""
         try:
-            return self.fetch(MANIFEST_NAME)[0]
+            return self.fetch(MANIFEST_NAME).data
         except MissingFileError as error:
             raise MissingFileError(f"{error}: this is no committed dataset version") from None
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
-        """Return `length` bytes from `offset`, or all of the file, whose size must be that of the
-        manifest.
+        """Return `length` bytes from `offset`, or the rest of the file.
+
+        Raises:
+            CorruptDataError: The file has another size than the manifest says.
         """
-        length = file.size - offset if length is None else length
+        count = file.size - offset if length is None else length
+        is_whole = count == file.size
+        part = None if is_whole else range(offset, offset + count)
         try:
-            data, size = self.fetch(
-                file.path, None if length == file.size else range(offset, offset + length)
-            )
+            fetched = self.fetch(file.path, part, limit=file.size)
         except MissingFileError as error:
             raise MissingFileError(f"{error}, and the manifest says it is") from None
-        if size not in (None, file.size):
+        if fetched.file_size not in (None, file.size):
             raise CorruptDataError(
-                f"{self}/{file.path} has {size} bytes, and the manifest says {file.size}"
+                f"{self}/{file.path} has {fetched.file_size} bytes, and the manifest says "
+                f"{file.size}"
             )
-        if len(data) != length:
+        if len(fetched.data) != count:
             raise CorruptDataError(
-                f"{self}/{file.path} sent {len(data)} bytes, and {length} were expected"
+                f"{self}/{file.path} sent {len(fetched.data)} bytes, and {count} were expected"
             )
-        return data
+        return fetched.data
+
+    def read_section(self, file: FileEntry) -> bytes:
+        """Return a section of the manifest.
+
+        Raises:
+            CorruptDataError: It is larger than any section can be.
+        """
+        if file.size > DOCUMENT_BYTES:
+            raise CorruptDataError(
+                f"{self}/{file.path} has {file.size} bytes, and a section of a manifest has at "
+                f"most {DOCUMENT_BYTES}"
+            )
+        return self.read(file)
 
     def digest(self, file: FileEntry) -> str | None:
         """Return the SHA-256 of the file; None if the whole file would have to be fetched."""
         return None
 
-    def close(self) -> None:  # noqa: B027
+    @abstractmethod
+    def close(self) -> None:
         """Close connections; the source can be read again afterwards."""
 
 
-def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -> "Source":
-    """Return the source that a path or a URL means."""
+def open_source(source: str | os.PathLike[str], *, api_key: str | None = None) -> Source:
+    """Return the source that a path or a URL means.
+
+    Args:
+        source: A directory, `http://...`, `https://...` or `s3://...`.
+        api_key: Key for the server of the URL. Without it, the key of the environment is sent, but
+            only to the coordinator that it belongs to.
+    """
     text = os.fspath(source)
     if re.match(r"https?://", text):
-        return HttpSource(
-            text, api_key=api_key if api_key is not None else os.environ.get(API_KEY_VARIABLE)
-        )
+        return HttpSource(text, api_key=api_key)
     if text.startswith("s3://"):
         return BucketSource(text)
     return DirectorySource(Path(text))
@@ -116,17 +163,31 @@ class DirectorySource(Source):
     def __str__(self) -> str:
         return self._root
 
-    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
+    def fetch(
+        self, path: str, part: range | None = None, *, limit: int = DOCUMENT_BYTES
+    ) -> Fetched:
+        """Return the bytes of a file, or of a part of it; see `Source`."""
         try:
             with Path(self._root, path).open("rb") as file:
-                file.seek(0 if part is None else part.start)
-                return file.read(-1 if part is None else len(part)), os.fstat(file.fileno()).st_size
+                size = os.fstat(file.fileno()).st_size
+                if part is not None:
+                    file.seek(part.start)
+                    return Fetched(file.read(len(part)), size)
+                if size > limit:
+                    raise CorruptDataError(
+                        f"{self}/{path} has {size} bytes, and at most {limit} are expected"
+                    )
+                return Fetched(file.read(), size)
         except (FileNotFoundError, NotADirectoryError):
             raise MissingFileError(f"{self}/{path} is not there") from None
 
     def digest(self, file: FileEntry) -> str | None:
-        with Path(self._root, file.path).open("rb", buffering=0) as opened:
-            return hashlib.file_digest(opened, "sha256").hexdigest()
+        """Return the SHA-256 of the file."""
+        with Path(self._root, file.path).open("rb", buffering=0) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
 
 
 class _RemoteSource(Source):
@@ -147,38 +208,53 @@ class _RemoteSource(Source):
 class BucketSource(_RemoteSource):
     """A dataset version in an S3 bucket: `s3://BUCKET/PREFIX/datasets/<id>/v<n>`.
 
-    Region, endpoint and credentials are those of the variables `AWS_...` of the environment. A read
-    is one request. The client has threads, which a fork does not have: a DataLoader with workers
-    needs `multiprocessing_context="spawn"`.
+    Region, endpoint and credentials are read from the variables `AWS_...` of the environment. A
+    read is one request. The client has threads, which a fork does not have: a DataLoader with
+    workers needs `multiprocessing_context="spawn"`.
     """
 
-    PATIENCE = timedelta(seconds=60)
+    PATIENCE_SECONDS = 60.0
+    """How long a request is repeated while the bucket's server is busy or away [s]."""
 
     def __init__(self, url: str) -> None:
+        """Make a source; nothing is asked yet.
+
+        Raises:
+            ValueError: The URL has no bucket, or has a query.
+        """
         parts = urlsplit(url)
         if not parts.netloc or parts.query or parts.fragment:
             raise ValueError(
-                f"a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is {url!r}"
+                "a version in a bucket is s3://BUCKET/PREFIX/datasets/ID/vN, and the source is "
+                f"{url!r}"
             )
         super().__init__(url)
-        self._bucket, self._prefix = parts.netloc, unquote(parts.path).strip("/")
+        self._bucket = parts.netloc
+        self._prefix = unquote(parts.path).strip("/")
 
-    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
-        if part is None:
-            return self._asked(
-                path, lambda obstore, objects: obstore.get(objects, path).bytes().to_bytes()
-            ), None
-        within = {"start": part.start, "end": part.stop}
-        return self._asked(
-            path, lambda obstore, objects: obstore.get_range(objects, path, **within).to_bytes()
-        ), None
+    def fetch(
+        self, path: str, part: range | None = None, *, limit: int = DOCUMENT_BYTES
+    ) -> Fetched:
+        """Return the bytes of an object, or of a part of it; see `Source`."""
+        objects = self._objects()
+        try:
+            if part is None:
+                data = objects.get(path, limit=limit)
+            else:
+                data = objects.get_range(path, part.start, len(part))
+        except FileNotFoundError:
+            raise MissingFileError(f"{self}/{path} is not there") from None
+        except OSError as error:
+            raise SourceError(f"{self}/{path} cannot be read: {error.strerror}") from error
+        return Fetched(data, None)
 
     def close(self) -> None:
+        """Forget the client, which closes its connections."""
         self._client = None
 
-    def _asked(self, name: str, request: Callable[[Any, Any], bytes]) -> bytes:
+    def _objects(self) -> "ObjectClient":
         try:
-            import obstore
+            from stickslip_schemas.transport.objects import ObjectClient
         except ModuleNotFoundError as error:
             raise SourceError(
                 f"{self} needs obstore, which is not installed: "
@@ -186,22 +262,13 @@ class BucketSource(_RemoteSource):
             ) from error
         if self._client is not None and self._pid != os.getpid():
             raise SourceError(
-                f'{self} cannot be read after a fork: give the DataLoader multiprocessing_context="spawn"'
+                f"{self} cannot be read after a fork: give the DataLoader "
+                'multiprocessing_context="spawn"'
             )
-        try:
-            if self._client is None:
-                retries: Any = {"retry_timeout": self.PATIENCE}
-                self._client = obstore.store.S3Store(
-                    self._bucket, prefix=self._prefix or None, retry_config=retries
-                )
-                self._pid = os.getpid()
-            return bytes(request(obstore, self._client))
-        except FileNotFoundError:
-            raise MissingFileError(f"{self}/{name} is not there") from None
-        except obstore.exceptions.BaseError as error:
-            raise SourceError(
-                f"{self}/{name} cannot be read: {str(error).splitlines()[0]}"
-            ) from error
+        if self._client is None:
+            self._client = ObjectClient(self._bucket, self._prefix, patience=self.PATIENCE_SECONDS)
+            self._pid = os.getpid()
+        return self._client  # type: ignore[no-any-return]  # one attribute for both sources
 
 
 class HttpSource(_RemoteSource):
@@ -211,64 +278,80 @@ class HttpSource(_RemoteSource):
     or `/manifest`), or any URL below which the dataset's files lie, `manifest.json` among them.
     """
 
-    TRIES = 4
-    _RETRIED_STATUSES = frozenset({429, 500, 502, 503, 504})
-
     def __init__(self, url: str, *, api_key: str | None = None) -> None:
         url = url.rstrip("/")
         version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
         super().__init__(f"{version[1]}/files" if version else url)
-        self._api_key = api_key
+        self._api_key = api_key or api_key_for(self._url)
 
-    def fetch(self, path: str, part: range | None = None) -> tuple[bytes, int | None]:
-        url, asked = f"{self}/{path}", "" if part is None else f"{part.start}-{part.stop - 1}"
-        response = self._get(url, {"Range": f"bytes={asked}"} if asked else {})
-        status, expected = response.status_code, 206 if asked else 200
-        if status == 404:
-            raise MissingFileError(f"{url} is not there")
-        if status == 416:
-            raise CorruptDataError(f"{url} ends before bytes {asked}")
-        if status != expected:
-            hint = ": it does not serve ranges" if status == 200 else ""
-            raise SourceError(f"{url} answered {status}, and {expected} was expected{hint}")
-        data = bytes(response.content)
-        if not asked:
-            return data, len(data)
-        sent = re.fullmatch(r"bytes (\d+-\d+)/(\d+)", response.headers.get("Content-Range", ""))
-        if sent is None or sent[1] != asked:
+    def fetch(
+        self, path: str, part: range | None = None, *, limit: int = DOCUMENT_BYTES
+    ) -> Fetched:
+        """Return the bytes of a file, or of a part of it; see `Source`."""
+        url = f"{self}/{path}"
+        if part is None:
+            response = self._get(url, {}, limit)
+            self._check_status(url, response.status_code, expected=200)
+            return Fetched(response.content, len(response.content))
+
+        # The answer says in its header which part it is, and how large the file is.
+        bounds = f"{part.start}-{part.stop - 1}"
+        response = self._get(url, {"Range": f"bytes={bounds}"}, len(part))
+        if response.status_code == 416:
+            raise CorruptDataError(f"{url} ends before bytes {bounds}")
+        self._check_status(url, response.status_code, expected=206)
+        header = response.headers.get("Content-Range", "")
+        content_range = re.fullmatch(r"bytes (\d+-\d+)/(\d+)", header)
+        if content_range is None or content_range[1] != bounds:
             raise CorruptDataError(
-                f"{url} sent {sent and sent[0]}, and bytes {asked} were expected"
+                f"{url} sent the range {header[:100]!r}, and bytes {bounds} were expected"
             )
-        return data, int(sent[2])
+        return Fetched(response.content, int(content_range[2]))
 
     def close(self) -> None:
+        """Close the connections of this process."""
         if self._client is not None and self._pid == os.getpid():
             self._client.close()
         self._client = None
 
-    def _get(self, url: str, headers: dict[str, str]) -> Any:
-        """GET with a few tries: a server that restarts or is busy is no reason to lose an epoch."""
-        import httpx  # only who reads over HTTP needs it
+    def _check_status(self, url: str, status: int, *, expected: int) -> None:
+        """Raise an error unless the server answered with the status of success."""
+        if status == expected:
+            return
+        if status == 404:
+            raise MissingFileError(f"{url} is not there")
+        hint = through(url)
+        if status == 200:
+            hint += ": it does not serve ranges"
+        if status == 401:
+            hint += self._hint_of_key()
+        raise SourceError(f"{url} answered {status}, and {expected} was expected{hint}")
+
+    def _hint_of_key(self) -> str:
+        """Return words on the key of the environment, if it was not sent."""
+        if self._api_key is not None or api_key_of_environment() is None:
+            return ""
+        return (
+            f". The key of {API_KEY_VARIABLE} was not sent, because it belongs to the coordinator "
+            f"{coordinator_url()}: name another with {URL_VARIABLE}, or pass api_key"
+        )
+
+    def _get(self, url: str, headers: dict[str, str], limit: int) -> Any:
+        """Return the answer to a GET, which is repeated while the server is busy or restarts."""
+        # Only who reads over HTTP waits for the import of httpx.
+        from stickslip_schemas.transport.http import AnswerError, HttpClient, TransportError
 
         if self._client is None or self._pid != os.getpid():
             # A fork shares the parent's sockets: the child must not use them, nor close them.
-            headers_of_all = {
-                "Accept-Encoding": "identity"
-            }  # ranges are of the file, not of a compressed form of it
-            if self._api_key:
-                headers_of_all["Authorization"] = f"Bearer {self._api_key}"
-            self._client = httpx.Client(headers=headers_of_all, timeout=30.0, follow_redirects=True)
+            self._client = HttpClient(
+                api_key=self._api_key, patience=READER_PATIENCE_SECONDS, follow_redirects=True
+            )
             self._pid = os.getpid()
-        for attempt in range(self.TRIES):
-            try:
-                response = self._client.get(url, headers=headers)
-            except httpx.TransportError as error:
-                if attempt == self.TRIES - 1:
-                    raise SourceError(f"{url} does not answer: {error!r}") from error
-            except httpx.InvalidURL as error:
-                raise SourceError(f"{url} is no URL: {error}") from error
-            else:
-                if response.status_code not in self._RETRIED_STATUSES or attempt == self.TRIES - 1:
-                    return response
-            time.sleep(0.1 * 4**attempt)
-        raise AssertionError("unreachable")
+        try:
+            return self._client.request("GET", url, limit=limit, headers=headers)
+        except TransportError as error:
+            raise SourceError(f"{url}: {error}") from error
+        except AnswerError as error:
+            # A server without ranges sends all of the file, which is too much.
+            self._check_status(url, error.status, expected=206 if headers else 200)
+            raise CorruptDataError(str(error)) from error

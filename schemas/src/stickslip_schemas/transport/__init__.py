@@ -1,0 +1,1 @@
+"""Requests to coordinators, servers of datasets and buckets: addresses, proxies, keys, limits."""

@@ -1,0 +1,131 @@
+"""Downloads of the files of a manifest.
+
+A file gets its name after its digest has been checked. An interrupted download continues: a `.part`
+file holds the first bytes of a file, and the rest is requested by range. Nothing is written beyond
+the size that the manifest states.
+"""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from stickslip_schemas.format.manifest import FileEntry
+from stickslip_schemas.store import sync
+from stickslip_schemas.transport.http import AnswerError, TransportError
+
+from stickslip_services.client.errors import DamagedError, UnexpectedError, UnreachableError
+from stickslip_services.client.http import Client
+from stickslip_services.client.verifying import CONNECTIONS, PART_SUFFIX, file_digest
+
+ATTEMPTS = 5
+"""How often a file is requested before its download fails."""
+
+
+class Target(NamedTuple):
+    """A file of a manifest, and the path that it is written to."""
+
+    file: FileEntry
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Downloader:
+    """Downloads files of one version."""
+
+    client: Client
+    root: str
+    """Path of the files in the API, with a slash at the end."""
+    on_bytes: Callable[[int], None]
+    """Called with the number of bytes of each received block, by several threads."""
+    stop: threading.Event
+
+    def download_all(self, targets: list[Target]) -> None:
+        """Download files, several at once; the first error stops all.
+
+        Raises:
+            DamagedError: A file arrives with other bytes than the manifest states.
+            ClientError: The coordinator refused, or does not answer.
+        """
+        with ThreadPoolExecutor(CONNECTIONS) as pool:
+            downloads = [pool.submit(self._download, target) for target in targets]
+            try:
+                for download in as_completed(downloads):
+                    download.result()
+            except BaseException:
+                self.stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    def _download(self, target: Target) -> None:
+        """Download a file to its `.part` file, check it, and rename it."""
+        file, path = target
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(path.name + PART_SUFFIX)
+        # A link could lead out of the directory.
+        if part.is_symlink():
+            part.unlink()
+        self.on_bytes(_size(part))
+        fault = ""
+        for attempt in range(ATTEMPTS):
+            pause = 0.0 if attempt == 0 else min(2.0**attempt / 4, self.client.patience)
+            if self.stop.wait(pause):
+                return
+            try:
+                fault = self._fetch(file, part)
+            except TransportError as error:
+                fault = str(error)
+                continue  # the part keeps the received bytes
+            except AnswerError as error:
+                raise UnexpectedError(str(error)) from error
+            if self.stop.is_set():
+                return
+            if not fault and _size(part) == file.size and file_digest(part) == file.sha256:
+                sync(part)
+                part.replace(path)
+                return
+            # A part of another file, or damaged on its way: start again.
+            part.unlink(missing_ok=True)
+            fault = fault or "it has other bytes than the manifest states"
+        if part.exists():
+            raise UnreachableError(
+                f"{file.path} could not be downloaded in {ATTEMPTS} attempts: {fault}"
+            )
+        raise DamagedError(f"{file.path} arrived damaged {ATTEMPTS} times: {fault}")
+
+    def _fetch(self, file: FileEntry, part: Path) -> str:
+        """Append the bytes of a file that its part lacks; return what is wrong with them, or ''.
+
+        Raises:
+            TransportError: The connection failed.
+        """
+        received = _size(part)
+        headers = {}
+        if received:
+            headers = {"Range": f"bytes={received}-", "If-Range": f'"{file.sha256}"'}
+        with self.client.stream(self.root + file.path, headers) as response:
+            if response.status_code == 416:  # the part is at least as long as the file
+                return ""
+            self.client.check_status(response)
+            is_rest = response.status_code == 206
+            room = file.size - (received if is_rest else 0)
+            with part.open("ab" if is_rest else "wb") as stream:
+                for block in response.iter_raw():
+                    if len(block) > room:
+                        return f"it has more than the {file.size} bytes that the manifest states"
+                    stream.write(block)
+                    room -= len(block)
+                    self.on_bytes(len(block))
+                    if self.stop.is_set():
+                        break
+        return ""
+
+
+def _size(path: Path) -> int:
+    """Return the size of a file [bytes]; 0 if it does not exist."""
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
