@@ -127,8 +127,8 @@ def test_a_bad_spec_is_refused_with_its_place(
 BAD_BODIES = {
     "cut": b'{"kind": "rod_hang"',
     "empty": b"",
-    "nested": b"[" * 100_000,
-    "nested objects": b'{"a":' * 50_000 + b"1" + b"}" * 50_000,
+    "nested": b"[" * 19_000,
+    "nested objects": b'{"a":' * 19_000 + b"1" + b"}" * 19_000,
     "digits": b'{"seed": 1' + b"0" * 5000 + b"}",
     "latin-1": b'{"name": "\xe9"}',
     "surrogate": b'{"name": "\\ud800"}',
@@ -184,14 +184,14 @@ def test_a_report_with_nan_in_its_labels_is_refused(client: httpx.Client) -> Non
     ("body", "rule"),
     [
         (
-            json.dumps({"kind": "rod_hang"} | {f"key-{n}": 1 for n in range(150_000)}),
+            json.dumps({"kind": "rod_hang"} | {f"key-{n}": 1 for n in range(60_000)}),
             "there is no such field",
         ),
         (
-            "{" + ",".join(f'"key-{n}": 1' for n in range(150_000)) + ', "key-149999": 2}',
-            "'key-149999' is there twice",
+            "{" + ",".join(f'"key-{n}": 1' for n in range(60_000)) + ', "key-59999": 2}',
+            "'key-59999' is there twice",
         ),
-        ('{"axes":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
+        ('{"axes":' * 19_000 + "1" + "}" * 19_000, "nested too deeply"),
     ],
     ids=["unknown", "doubled", "nested"],
 )

@@ -6,7 +6,7 @@ The short forms are `0.5` for one value and `[0.1, 0.2]` for a list.
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVar
 
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, Strict, model_validator
+from pydantic import BeforeValidator, FailFast, Field, GetJsonSchemaHandler, Strict, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -51,7 +51,9 @@ class ListAxis(_Axis[T], Generic[T]):
     """The values themselves; only axes that are zipped may have one twice."""
 
     type: Literal["list"]
-    values: tuple[T, ...] = Field(min_length=1, max_length=MAX_SAMPLES)
+    # After the first wrong value the others are not checked: a megabyte has 300,000 of them, and
+    # each error takes a kilobyte.
+    values: Annotated[tuple[T, ...], FailFast()] = Field(min_length=1, max_length=MAX_SAMPLES)
 
     @property
     def num(self) -> int:

@@ -4,6 +4,7 @@ This module holds what all kinds have in common. A kind itself is one module of
 `stickslip_schemas.kinds`.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from functools import cached_property
@@ -366,7 +367,7 @@ class JobSpec(Document):
             raise ValueError(f"axes that are zipped must have one length, and theirs are {sizes}")
         for name, axis in self.named_axes.items() if self.combine == "product" else ():
             if isinstance(axis, ListAxis) and len(set(axis.values)) < axis.num:
-                twice = next(value for value in axis.values if axis.values.count(value) > 1)
+                twice, _ = Counter(axis.values).most_common(1)[0]
                 rule = "values must differ unless axes are zipped, and {twice} is there twice"
                 broken = PydanticCustomError("value_error", rule, {"twice": repr(twice)})
                 details = InitErrorDetails(type=broken, loc=("axes", name), input=axis.values)

@@ -113,16 +113,11 @@ def custom_fabric(
     """Return a fabric from measured numbers: a stretching table with bending, or Young's modulus
     with thickness.
 
-    Args:
-        name: For messages.
-        density: Mass per area [kg/m^2].
-        stretching: (6, 4) [N/m], as `Fabric.stretching`; or `young`.
-        young: Young's modulus [Pa], of an isotropic fabric with `poisson` and `thickness`.
-        poisson: Poisson's ratio, in [0, 0.5]; None is 0.
-        thickness: [m]
+    Args: name: For messages. density: Mass per area [kg/m^2]. stretching: (6, 4) [N/m], as
+        `Fabric.stretching`; or `young`. young: Young's modulus [Pa], of an isotropic fabric with
+        `poisson` and `thickness`. poisson: Poisson's ratio, in [0, 0.5]; None is 0. thickness: [m]
         bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). Without it, the
-            plate's of `young`, E h^3 / (12 (1 - poisson^2)).
-        damping: Proportional to mass [1/s].
+        plate's of `young`, E h^3 / (12 (1 - poisson^2)). damping: Proportional to mass [1/s].
 
     Raises:
         ValueError: A number breaks its rule, or there are too many or too few.

@@ -58,19 +58,15 @@ B, 3, 4) [m].
 class Cloth:
     """Cloth with its state and solver settings: a sheet, or several in one mesh.
 
-    Args:
-        mesh: The cloth at rest; `meshes.together` puts several sheets into one.
-        fabric: Material of the cloth, or of each sheet. Sheets are the connected pieces of the
-            mesh, in the order of their first vertices.
-        preset: Solver settings.
-        held: (K,) vertices whose positions are prescribed.
-        self_contact: Contact within and between sheets. None: off, the cloth passes through itself.
-        surfaces: Triangles that it touches.
-        force_scale: Force that residuals are measured in [N]; None is the weight of 25 mm^2 of the
-            lightest fabric.
-        kernel: Level of the kernels, one of `_sim_core.kernels()`: levels differ in the last
-            digits. None takes that of the environment variable STICKSLIP_CLOTH_KERNEL, or else the
-            widest that this processor runs.
+    Args: mesh: The cloth at rest; `meshes.together` puts several sheets into one. fabric: Material
+        of the cloth, or of each sheet. Sheets are the connected pieces of the mesh, in the order of
+        their first vertices. preset: Solver settings. held: (K,) vertices whose positions are
+        prescribed. self_contact: Contact within and between sheets. None: off, the cloth passes
+        through itself. surfaces: Triangles that it touches. force_scale: Force that residuals are
+        measured in [N]; None is the weight of 25 mm^2 of the lightest fabric. kernel: Level of the
+        kernels, one of `_sim_core.kernels()`: levels differ in the last digits. None takes that of
+        the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor
+        runs.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -239,9 +235,8 @@ class Cloth:
 
         Without `bodies`, those of this time, they do not move in the next step.
 
-        Raises:
-            ValueError: The cloth crosses a surface, or, with self-contact, itself; a free vertex is
-                more than 1 um inside a body; or an array has another shape.
+        Raises: ValueError: The cloth crosses a surface, or, with self-contact, itself; a free
+            vertex is more than 1 um inside a body; or an array has another shape.
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)

@@ -146,9 +146,8 @@ def stick_slip(strain: ArrayLike) -> Floats:
     Beyond `stick_slip_triple_point` there is no answer: the strip lies on the wall with more than
     its tip.
 
-    Args:
-        strain: Displacement of the wall over the length of the strip [-], > 0 and at most that of
-            the triple point (to 1e-9), any shape.
+    Args: strain: Displacement of the wall over the length of the strip [-], > 0 and at most that of
+        the triple point (to 1e-9), any shape.
 
     Raises:
         ValueError: A strain is outside its range.
@@ -167,9 +166,8 @@ def stick_slip_strain(friction: ArrayLike) -> Floats:
     """Return the strain at which a strip pressed end-on against a wall of this friction slips:
     stick_slip's inverse.
 
-    Args:
-        friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to
-            1e-9), any shape. At a higher one the strip never slips.
+    Args: friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to
+        1e-9), any shape. At a higher one the strip never slips.
 
     Raises:
         ValueError: A friction is outside its range.

@@ -122,16 +122,13 @@ def fit_parameters(
     The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may
     leave the ranges.
 
-    Args:
-        centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
-            length, z up, shape (P, 3), P >= 8.
-        gamma: Weight against bending if it is known; None: fitted.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
+    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
+        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
+        fitted. stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
-        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
+        equilibrium.
     """
     data = _centerline(centerline)
     model = _Model.of(len(data), stiffness, intervals=None)
@@ -174,18 +171,15 @@ def fit_natural_curvature(
     natural curvature is returned. What two such rods share, the natural shape, does not depend on
     that choice for a rod that bends equally about d2 and d3.
 
-    Args:
-        centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
-            length, z up, shape (P, 3), P >= 8.
-        gamma: Weight against bending if it is known; None: fitted.
-        noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it is known.
-            Give it when the noise is correlated along the rod: cross validation takes it for white.
-        stiffness: As for `fit_parameters`.
+    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
+        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
+        fitted. noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it
+        is known. Give it when the noise is correlated along the rod: cross validation takes it for
+        white. stiffness: As for `fit_parameters`.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
-        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
+        equilibrium.
     """
     data = _centerline(centerline)
     if noise is not None and not noise > 0:

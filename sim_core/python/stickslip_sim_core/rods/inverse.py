@@ -61,19 +61,16 @@ def natural_curvature(
     It is done interval by interval with t, t' and t'' (error (kappa h)^6 / 100800 of the
     integrand).
 
-    Args:
-        curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4
-            points of uniform arc length, clamp and free end included, shape (..., P, 3).
-        frame: Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (...,
-            P, 3, 3). None: integrated from `clamp_frame` by R' = R [kappa]x, with the error of the
-            curvature in them.
-        gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3).
-        clamp_frame: R(0), used without `frame` only, shape (3, 3) or (..., 3, 3).
+    Args: curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4
+        points of uniform arc length, clamp and free end included, shape (..., P, 3). frame:
+        Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (..., P, 3,
+        3). None: integrated from `clamp_frame` by R' = R [kappa]x, with the error of the curvature
+        in them. gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0. stiffness:
+        K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3). clamp_frame: R(0), used without
+        `frame` only, shape (3, 3) or (..., 3, 3).
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     shape = np.shape(curvature)
     if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 4:

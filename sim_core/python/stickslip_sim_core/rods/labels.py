@@ -146,9 +146,8 @@ def other_minima(
         gamma, phi0, phi1, poisson, elements, points: As for `solve_rods`.
         solution: What `solve_rods` returned for exactly these arguments, to save solving again.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     weight = finite_array("gamma", gamma, (None,))
     n = len(weight)

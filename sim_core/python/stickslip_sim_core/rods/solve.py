@@ -100,19 +100,14 @@ def solve_rods(
     2006; Bertails-Descoubes et al. 2018, Sec. 3]. A rod's bits depend on its own three numbers and
     the settings only, not on the batch.
 
-    Args:
-        gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a
-            single rod.
-        phi0: Natural twist times L [rad], shape (n,).
-        phi1: Natural bend about d3 times L [rad], shape (n,).
-        poisson: Poisson's ratio [-], in (-1, 0.5].
-        elements: Elements of the finest level, a multiple of 4. Largest centreline error over gamma
-            100 ... 1300, phi0 0.2 ... 12, phi1 6 ... 20: see the README.
-        points: Output points per rod, >= 2.
+    Args: gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a
+        single rod. phi0: Natural twist times L [rad], shape (n,). phi1: Natural bend about d3 times
+        L [rad], shape (n,). poisson: Poisson's ratio [-], in (-1, 0.5]. elements: Elements of the
+        finest level, a multiple of 4. Largest centreline error over gamma 100 ... 1300, phi0 0.2
+        ... 12, phi1 6 ... 20: see the README. points: Output points per rod, >= 2.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     fields = {"gamma": gamma, "phi0": phi0, "phi1": phi1}
     gamma, phi0, phi1 = (
@@ -176,23 +171,18 @@ def solve_general_rods(
     sample it finely enough for that. What the fields of the solution mean, and its units, is the
     same; the clamp's frame is `clamp_frame`.
 
-    Args:
-        natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of
-            uniform arc length (clamp ... free end, both included), shape (n, m, 3). m = 1: constant
-            along the rod.
-        gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness EI [-], shape
-            (n,), >= 0.
-        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all rods or (n, 3).
-        clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z up), shape (3, 3)
-            or (n, 3, 3).
-        start_curvature: Curvature of the shape from which the search starts [1/L], shape (n, m',
-            3); None: the natural curvature. Another start may reach another minimum.
-        elements: Elements of the finest level, a multiple of 4.
-        points: Output points per rod, >= 2.
+    Args: natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of
+        uniform arc length (clamp ... free end, both included), shape (n, m, 3). m = 1: constant
+        along the rod. gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness
+        EI [-], shape (n,), >= 0. stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all
+        rods or (n, 3). clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z
+        up), shape (3, 3) or (n, 3, 3). start_curvature: Curvature of the shape from which the
+        search starts [1/L], shape (n, m', 3); None: the natural curvature. Another start may reach
+        another minimum. elements: Elements of the finest level, a multiple of 4. points: Output
+        points per rod, >= 2.
 
-    Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
-            value.
+    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
+        value.
     """
     natural = finite_array("natural_curvature", natural_curvature, (None, None, 3))
     n = len(natural)

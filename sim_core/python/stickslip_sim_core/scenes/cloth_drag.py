@@ -105,16 +105,12 @@ def scene(
     one side of the cloth than on the other, both drawn from `seed`, until the drop ends, and set
     upright within the second after.
 
-    Args:
-        material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge.
-        mu: Coefficient of friction between cloth and floor, 0 ... 10.
-        self_friction: Coefficient of friction of the cloth with itself, 0 ... 10; None turns
-            self-contact off.
-        preset: Solver settings, or their name.
-        mesh: Vertices a side of a grid, at least 5; or a mesh of the square of side `SIDE`.
-        frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
-        seed: Of the bias.
-        kernel: Level of the kernels, see `Cloth`.
+    Args: material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge. mu:
+        Coefficient of friction between cloth and floor, 0 ... 10. self_friction: Coefficient of
+        friction of the cloth with itself, 0 ... 10; None turns self-contact off. preset: Solver
+        settings, or their name. mesh: Vertices a side of a grid, at least 5; or a mesh of the
+        square of side `SIDE`. frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
+        seed: Of the bias. kernel: Level of the kernels, see `Cloth`.
 
     Raises:
         ValueError: An argument breaks its rule.

@@ -68,13 +68,12 @@ class DatasetReader:
     ) -> None:
         """Open a version.
 
-        Args:
-            source: Directory of the version, or its URL (see `sources`).
-            api_key: Key for a server; the default is the environment variable `STICKSLIP_API_KEY`.
-            verify: Read every file first, and check it against the manifest.
-            check_shards: Check a shard in a directory before its first sample is read. Over HTTP
-                only `verify` checks shards, for samples are parts of them.
-            cache_bytes: Memory for decoded chunks of curves, which hold many samples.
+        Args: source: Directory of the version, or its URL (see `sources`). api_key: Key for a
+            server; the default is the environment variable `STICKSLIP_API_KEY`. verify: Read every
+            file first, and check it against the manifest. check_shards: Check a shard in a
+            directory before its first sample is read. Over HTTP only `verify` checks shards, for
+            samples are parts of them. cache_bytes: Memory for decoded chunks of curves, which hold
+            many samples.
 
         Raises:
             DatasetError: The version is damaged, or contradicts the contract.

@@ -100,13 +100,10 @@ class Samples(Dataset[Item]):
     ) -> None:
         """Open `split` of a dataset, or all of it.
 
-        Args:
-            source: A directory, a URL or an open reader.
-            split: The split; None takes all samples.
-            arrays: Arrays of an item; by default the video, or all curves of a dataset without
-                videos.
-            labels: Labels of an item; by default all that are one number.
-            ring: Buffers that are used in turn; 0 makes a new one for each batch.
+        Args: source: A directory, a URL or an open reader. split: The split; None takes all
+            samples. arrays: Arrays of an item; by default the video, or all curves of a dataset
+            without videos. labels: Labels of an item; by default all that are one number. ring:
+            Buffers that are used in turn; 0 makes a new one for each batch.
 
         Raises:
             ValueError: The dataset has no such array, or `ring` is negative.

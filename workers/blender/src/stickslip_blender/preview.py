@@ -41,12 +41,10 @@ Array = npt.NDArray[Any]
 def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> list[str]:
     """Draw a scene; return the names of the pictures.
 
-    Args:
-        scene: `scene`: `Staged`, as JSON; `sheet`: the sheet that takes the texture; `segments`:
-            names of the codes; `cameras`: those of the scene, as JSON, none where cameras frame
-            what moves. Files are paths.
-        record: Arrays of the scene at the instants of the animation.
-        out: Directory for the pictures.
+    Args: scene: `scene`: `Staged`, as JSON; `sheet`: the sheet that takes the texture; `segments`:
+        names of the codes; `cameras`: those of the scene, as JSON, none where cameras frame what
+        moves. Files are paths. record: Arrays of the scene at the instants of the animation. out:
+        Directory for the pictures.
     """
 
     def picture(name: str) -> npt.NDArray[np.uint8]:

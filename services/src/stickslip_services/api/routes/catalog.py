@@ -19,20 +19,25 @@ from stickslip_schemas.format.pictures import UnfitPictureError
 from stickslip_schemas.scene.files import UnfitFileError
 from stickslip_schemas.store import Store
 
+from stickslip_services.api.artifacts import picture_format, serve
+from stickslip_services.api.bodies import (
+    CERTIFICATE_BYTES,
+    JsonBody,
+    content_type,
+    whole_body,
+    wrong_media_type,
+)
 from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import (
     BODY_PROBLEMS,
     ContextDep,
-    JsonBody,
     PageDep,
+    StrictRoute,
     Version,
     json_content,
-    picture_format,
     problem_responses,
     reads,
-    serve,
     serves,
-    whole_body,
 )
 from stickslip_services.catalog.inputs import (
     find_certificate,
@@ -48,7 +53,7 @@ from stickslip_services.queue.jobs import is_preview
 
 T = TypeVar("T")
 
-router = APIRouter()
+router = APIRouter(route_class=StrictRoute)
 
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _PICTURES = {"image/png": b"\x89PNG", "image/jpeg": b"\xff\xd8\xff"}
@@ -57,7 +62,7 @@ _PICTURE_BODY = {"requestBody": {"required": True, "content": dict.fromkeys(_PIC
 _FILE_BODY = {"requestBody": {"required": True, "content": {"application/octet-stream": _BINARY}}}
 
 
-@router.get("/v1/datasets", responses=problem_responses(422))
+@router.get("/v1/datasets", responses=problem_responses())
 def get_datasets(page: PageDep, context: ContextDep) -> responses.Page[responses.Dataset]:
     """List datasets, newest first."""
     with context.database.read() as connection:
@@ -71,7 +76,7 @@ def get_dataset(dataset: str, context: ContextDep) -> responses.Dataset:
         return find_dataset(connection, dataset)
 
 
-@router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404, 422))
+@router.get("/v1/datasets/{dataset}/versions/{version}", responses=problem_responses(404))
 def get_version(dataset: str, version: Version, context: ContextDep) -> responses.DatasetVersion:
     """Return a version."""
     with context.database.read() as connection:
@@ -79,7 +84,7 @@ def get_version(dataset: str, version: Version, context: ContextDep) -> response
 
 
 @router.get(
-    "/v1/datasets/{dataset}/versions/{version}/manifest", **serves(json_content("Manifest"), 422)
+    "/v1/datasets/{dataset}/versions/{version}/manifest", **serves(json_content("Manifest"))
 )
 @router.head("/v1/datasets/{dataset}/versions/{version}/manifest", include_in_schema=False)
 def get_manifest(dataset: str, version: Version, request: Request, context: ContextDep) -> Response:
@@ -99,7 +104,7 @@ def get_file(
     return _serve(request, context, dataset, version, path)
 
 
-@router.get("/v1/previews/{digest}", **serves({"image/png": _BINARY, "image/webp": _BINARY}, 422))
+@router.get("/v1/previews/{digest}", **serves({"image/png": _BINARY, "image/webp": _BINARY}))
 def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     """Return the picture of a sample."""
     with context.database.read() as connection:
@@ -128,7 +133,9 @@ def _serve(
 
 @router.post("/v1/certificates", status_code=201, **reads("Certificate"))
 def post_certificate(
-    certificate: Annotated[Certificate, Depends(JsonBody(Certificate))],
+    certificate: Annotated[
+        Certificate, Depends(JsonBody(Certificate, max_bytes=CERTIFICATE_BYTES))
+    ],
     context: ContextDep,
     response: Response,
 ) -> responses.CertificateEntry:
@@ -141,7 +148,7 @@ def post_certificate(
     return entry
 
 
-@router.get("/v1/certificates", responses=problem_responses(422))
+@router.get("/v1/certificates", responses=problem_responses())
 def get_certificates(
     page: PageDep, context: ContextDep
 ) -> responses.Page[responses.CertificateEntry]:
@@ -171,10 +178,9 @@ async def post_texture(request: Request, context: ContextDep) -> responses.Textu
 
     A picture that no job names is deleted by `stickslip gc` after a day.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    media_type = content_type(request)
     if media_type not in _PICTURES:
-        detail = f"Content-Type must be {' or '.join(_PICTURES)}, and it is {media_type[:100]!r}"
-        raise ProblemError(415, ProblemCode.malformed_body, detail)
+        raise wrong_media_type(" or ".join(_PICTURES), media_type)
     data = await whole_body(request)
     if not data.startswith(_PICTURES[media_type]):
         raise _refused(

@@ -23,7 +23,7 @@ from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 
 from stickslip_services import __version__
 from stickslip_services.access.principals import refuse_projects
-from stickslip_services.api.routes.common import ContextDep, problem_responses
+from stickslip_services.api.routes.common import ContextDep, StrictRoute, problem_responses
 from stickslip_services.database.tables import dataset_versions, jobs, task_counts
 from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
@@ -124,6 +124,7 @@ class Metrics:
 
 
 router = APIRouter()
+strict = APIRouter(route_class=StrictRoute)
 
 
 class Health(Document):
@@ -146,7 +147,7 @@ def get_readyz(context: ContextDep) -> Health:
     return Health(version=__version__)
 
 
-@router.get(
+@strict.get(
     "/metrics",
     response_class=Response,
     responses={
@@ -159,3 +160,7 @@ def get_metrics(request: Request) -> Response:
     refuse_projects("metrics")
     metrics: Metrics = request.app.state.metrics
     return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+
+# Probes add parameters of their own against caches; they are the only requests that may.
+router.routes += strict.routes

@@ -16,11 +16,13 @@ from stickslip_schemas.documents.responses import (
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
 
+from stickslip_services.api.bodies import SMALL_BYTES, SPEC_BYTES, JsonBody
+from stickslip_services.api.problems import EVENT_ID_PATTERN
 from stickslip_services.api.routes.common import (
     ContextDep,
-    JsonBody,
     PageDep,
     Responses,
+    StrictRoute,
     problem_responses,
     reads,
 )
@@ -30,9 +32,9 @@ from stickslip_services.queue import control
 from stickslip_services.queue.jobs import find_job, list_jobs, list_previews, list_samples, show_job
 from stickslip_services.queue.submit import Replay, submit_job, validate_spec
 
-router = APIRouter()
+router = APIRouter(route_class=StrictRoute)
 
-SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec))]
+SpecBody = Annotated[JobSpec, Depends(JsonBody(AnyJobSpec, max_bytes=SPEC_BYTES))]
 
 _LOCATION = {"Location": {"description": "The job", "schema": {"type": "string"}}}
 _CHANGED: Responses = {
@@ -67,7 +69,9 @@ def post_job(
         Header(
             min_length=1,
             max_length=255,
-            description="idempotency key: repeated requests with the same key make one job. Kept forever.",
+            description=(
+                "idempotency key: repeated requests with the same key make one job. Kept forever."
+            ),
         ),
     ] = None,
     priority: Annotated[
@@ -95,7 +99,7 @@ def validate_job(spec: SpecBody, context: ContextDep) -> Validation:
     return validate_spec(context, spec)
 
 
-@router.get("/v1/jobs", responses=problem_responses(422))
+@router.get("/v1/jobs", responses=problem_responses())
 def get_jobs(
     page: PageDep,
     context: ContextDep,
@@ -119,7 +123,9 @@ def get_job(job_id: str, context: ContextDep) -> JobDetail:
 
 @router.patch("/v1/jobs/{job_id}", **reads("JobPatch", answers=_CHANGED))
 def patch_job(
-    job_id: str, patch: Annotated[JobPatch, Depends(JsonBody(JobPatch))], context: ContextDep
+    job_id: str,
+    patch: Annotated[JobPatch, Depends(JsonBody(JobPatch, max_bytes=SMALL_BYTES))],
+    context: ContextDep,
 ) -> JobDetail:
     """Set the priority of a job, from its next task on. 409: it has ended."""
     return control.prioritise_job(context, job_id, patch.priority)
@@ -143,7 +149,7 @@ def resume_job(job_id: str, context: ContextDep) -> JobDetail:
     return control.resume_job(context, job_id)
 
 
-@router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404, 422))
+@router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404))
 def get_samples(
     job_id: str,
     page: PageDep,
@@ -171,13 +177,13 @@ def get_previews(job_id: str, context: ContextDep) -> list[Preview]:
     responses={
         200: {
             "description": (
-                "Server-sent events: `job.state`, `task.state`, `dataset.published` with increasing ids, and "
-                "`job.progress` (about once a second, with the id of the event before it). After the `job.state` that "
-                "ends the job the stream ends."
+                "Server-sent events: `job.state`, `task.state`, `dataset.published` with "
+                "increasing ids, and `job.progress` (about once a second, with the id of the event "
+                "before it). After the `job.state` that ends the job the stream ends."
             ),
             "content": {"text/event-stream": STREAM},
         },
-        **problem_responses(404, 422, 429),
+        **problem_responses(404, 429),
     },
 )
 def get_events(
@@ -186,7 +192,7 @@ def get_events(
     context: ContextDep,
     last_event_id: Annotated[
         str | None,
-        Header(pattern=r"^[0-9]{0,18}$", description="id of the last event that you have"),
+        Header(pattern=EVENT_ID_PATTERN, description="id of the last event that you have"),
     ] = None,
 ) -> Response:
     """Stream the events of a job."""

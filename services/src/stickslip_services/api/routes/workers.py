@@ -4,19 +4,20 @@ Tasks can be read, too.
 """
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from inspect import iscoroutinefunction
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
-from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from stickslip_schemas.documents import worker_api
 from stickslip_schemas.documents.responses import WorkerEntry
 
+from stickslip_services.api.bodies import SMALL_BYTES, JsonBody
 from stickslip_services.api.routes.common import (
     ContextDep,
-    JsonBody,
+    Handler,
+    StrictRoute,
     json_content,
     problem_responses,
     reads,
@@ -32,31 +33,40 @@ from stickslip_services.queue.workers import show_workers
 T = TypeVar("T")
 U = TypeVar("U")
 
-MOST_ON_LOOP = 64 * 2**10
-"""Heartbeats of at most so many bytes are read by the event loop, in 2 ms; longer ones by a thread.
+MAX_BYTES_ON_LOOP = 64 * 2**10
+"""The event loop itself reads heartbeats up to this size [bytes], in 2 ms; a thread reads longer
+ones.
 """
-MOST_TOGETHER = 64
+
+MAX_BATCH = 64
 """Heartbeats that are answered with one statement: about 5 ms."""
 
+# A heartbeat or a report names thousands of tasks, so only its bytes are limited.
 _LEASE_REQUEST: JsonBody[worker_api.LeaseRequest] = JsonBody(
-    worker_api.LeaseRequest, from_workers=True
+    worker_api.LeaseRequest, max_bytes=SMALL_BYTES, from_workers=True
 )
-_HEARTBEAT: JsonBody[worker_api.Heartbeat] = JsonBody(worker_api.Heartbeat, from_workers=True)
+_HEARTBEAT: JsonBody[worker_api.Heartbeat] = JsonBody(
+    worker_api.Heartbeat, max_containers=None, from_workers=True
+)
 _REPORT_BATCH: JsonBody[worker_api.ReportBatch] = JsonBody(
-    worker_api.ReportBatch, from_workers=True
+    worker_api.ReportBatch, max_containers=None, from_workers=True
 )
 
 
-class _Plain(APIRoute):
-    """A route for which FastAPI resolves nothing if its function is asynchronous: that takes the
-    request itself.
+class _WorkerRoute(StrictRoute):
+    """A route whose function, if asynchronous, takes the request itself.
+
+    FastAPI resolves nothing for it: that would take longer than answering a heartbeat.
     """
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        return self.endpoint if iscoroutinefunction(self.endpoint) else super().get_route_handler()
+    def plain_handler(self) -> Handler:
+        """Return the function of the route if it is asynchronous."""
+        if iscoroutinefunction(self.endpoint):
+            return self.endpoint
+        return super().plain_handler()
 
 
-router = APIRouter(route_class=_Plain)
+router = APIRouter(route_class=_WorkerRoute)
 
 
 @router.get("/v1/workers", responses=problem_responses())
@@ -69,7 +79,8 @@ def get_workers(context: ContextDep) -> list[WorkerEntry]:
 @router.post("/v1/workers", status_code=201, **reads("WorkerRegistration"))
 def post_worker(
     registration: Annotated[
-        worker_api.WorkerRegistration, Depends(JsonBody(worker_api.WorkerRegistration))
+        worker_api.WorkerRegistration,
+        Depends(JsonBody(worker_api.WorkerRegistration, max_bytes=SMALL_BYTES)),
     ],
     context: ContextDep,
 ) -> worker_api.WorkerSession:
@@ -81,8 +92,9 @@ def post_worker(
     "/v1/worker/lease", response_model=worker_api.LeaseBatch, **reads("LeaseRequest", 404, 409)
 )
 async def post_lease(request: Request) -> Response:
-    """Lease tasks. 404 `unknown_worker`: register again. 409: a newer session of the name has taken
-    over.
+    """Lease tasks.
+
+    404 `unknown_worker`: register again. 409: a newer session of the name has taken over.
     """
     return await _answer(request, _LEASE_REQUEST, lease_tasks)
 
@@ -92,19 +104,27 @@ async def post_lease(request: Request) -> Response:
 )
 async def post_heartbeat(request: Request) -> Response:
     """Renew leases and learn which tasks to drop."""
-    body = await _HEARTBEAT.received(request)
-    is_long = len(body) > MOST_ON_LOOP
-    message = await asyncio.to_thread(_HEARTBEAT.read, body) if is_long else _HEARTBEAT.read(body)
-    left = await request.app.state.renewals.add(message)
-    answer = worker_api.HeartbeatAnswer(drop=())
-    if left is not None:
-        answer = await asyncio.to_thread(reconcile_leases, request.app.state.context, message, left)
+    body = await _HEARTBEAT.receive(request)
+    if len(body) > MAX_BYTES_ON_LOOP:
+        heartbeat = await asyncio.to_thread(_HEARTBEAT.read, body)
+    else:
+        heartbeat = _HEARTBEAT.read(body)
+
+    # Most heartbeats only renew leases: one statement does that for many workers. The others name
+    # a lease that the worker has lost, and are sorted out one by one.
+    disputed = await request.app.state.renewals.add(heartbeat)
+    if disputed is None:
+        answer = worker_api.HeartbeatAnswer(drop=())
+    else:
+        context: Context = request.app.state.context
+        answer = await asyncio.to_thread(reconcile_leases, context, heartbeat, disputed)
     return Response(answer.model_dump_json(), media_type="application/json")
 
 
 class Batcher(Generic[T, U]):
-    """Calls a function in a thread: once for all items that have come while its last call was
-    running.
+    """Calls a function once for all items that have come while its last call was running.
+
+    The function runs in a thread, and returns a result for each item.
     """
 
     def __init__(self, call: Callable[[list[T]], list[U]]) -> None:
@@ -113,25 +133,30 @@ class Batcher(Generic[T, U]):
         self._task: asyncio.Task[None] | None = None
 
     async def add(self, item: T) -> U:
+        """Return the result of an item; raise what the call for its batch raised."""
         future: asyncio.Future[U] = asyncio.get_running_loop().create_future()
         self._waiting.append((item, future))
         if self._task is None:
-            self._task = asyncio.create_task(self._work())
+            self._task = asyncio.create_task(self._run())
         return await future
 
-    async def _work(self) -> None:
+    async def _run(self) -> None:
         while self._waiting:
-            batch, self._waiting = self._waiting[:MOST_TOGETHER], self._waiting[MOST_TOGETHER:]
-            try:
-                results = await asyncio.to_thread(self._call, [item for item, _ in batch])
-            except Exception as error:
-                for _, future in batch:
-                    if not future.cancelled():
-                        future.set_exception(error)
-                continue
-            for (_, future), result in zip(batch, results, strict=True):
-                if not future.cancelled():
-                    future.set_result(result)
+            batch = self._waiting[:MAX_BATCH]
+            self._waiting = self._waiting[MAX_BATCH:]
+            items = [item for item, _ in batch]
+            call = asyncio.create_task(asyncio.to_thread(self._call, items))
+            await asyncio.wait([call])
+            # An error belongs to the requests of this batch; the next batch may succeed.
+            error = call.exception()
+            results = [] if error is not None else call.result()
+            for position, (_, future) in enumerate(batch):
+                if future.cancelled():
+                    continue  # the client has gone
+                if error is not None:
+                    future.set_exception(error)
+                else:
+                    future.set_result(results[position])
         self._task = None
 
 
@@ -171,14 +196,13 @@ def get_task(task_id: str, context: ContextDep) -> Response:
 async def _answer(
     request: Request, document: JsonBody[T], verb: Callable[[Context, T], BaseModel]
 ) -> Response:
-    """Read a document, call a verb with it, and serialise the answer, all in one call of one
-    thread.
+    """Read a document, call a verb with it, and serialise the answer, in one call of one thread.
 
     Workers ask many times a second. The answer, which may have megabytes, is not validated a second
     time.
     """
     context: Context = request.app.state.context
-    body = await document.received(request)
+    body = await document.receive(request)
 
     def work() -> str:
         return verb(context, document.read(body)).model_dump_json()

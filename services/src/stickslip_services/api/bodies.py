@@ -1,0 +1,220 @@
+"""Bodies of requests: limits that are checked before anything is decoded, and strict JSON.
+
+A body is limited in bytes while it arrives, and in lists and objects before it is parsed. Both
+keep the time and memory of a hostile document small: a model takes microseconds and a kilobyte for
+each wrong item, of which a megabyte of `[],[],[]` has 300,000.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from math import isfinite
+from typing import Any, Generic, TypeVar
+
+from fastapi import Request
+from pydantic import TypeAdapter, ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+from stickslip_schemas.documents.problems import FieldError, ProblemCode, field_errors
+from typing_extensions import TypeForm
+
+from stickslip_services.api.problems import ProblemError
+
+T = TypeVar("T")
+
+SPEC_BYTES = 2**20
+"""Largest spec [bytes]. A list of 50,000 values has about 0.9 MB; larger grids have ranges."""
+
+CERTIFICATE_BYTES = 4 * 2**20
+"""Largest certificate [bytes]. A full one of all protocols has about 0.4 MB."""
+
+SMALL_BYTES = 256 * 2**10
+"""Largest body of a request that changes or registers one thing [bytes]."""
+
+MAX_CONTAINERS = 20_000
+"""Lists and objects in a document: of a scene with 10 motions of 1,000 keys each."""
+
+SHOWN_ERRORS = 20
+"""Wrong fields that an answer lists."""
+
+SUMMARISED_ERRORS = 3
+"""Wrong fields in the sentence of an answer."""
+
+
+class JsonBody(Generic[T]):
+    """A dependency that reads the body of a request as a document."""
+
+    def __init__(
+        self,
+        document_type: TypeForm[T],
+        *,
+        max_bytes: int | None = None,
+        max_containers: int | None = MAX_CONTAINERS,
+        from_workers: bool = False,
+    ) -> None:
+        """Read documents of a type: a model, or a union of models.
+
+        `max_bytes` is the largest body; None: the setting `body_limit`. Documents of workers are
+        mostly written by pydantic.
+        """
+        self._type = document_type
+        self._max_bytes = max_bytes
+        self._max_containers = max_containers
+        self._from_workers = from_workers
+        self._adapter: TypeAdapter[T] = TypeAdapter(document_type)
+
+    async def __call__(self, request: Request) -> T:
+        """Return the document in the body of a request; raise ProblemError."""
+        body = await self.receive(request)
+        # A body of many kilobytes keeps a thread busy, and not the event loop.
+        document: T = await run_in_threadpool(self.read, body)
+        return document
+
+    async def receive(self, request: Request) -> bytes:
+        """Return the raw body; raise ProblemError if its Content-Type is not JSON."""
+        media_type = content_type(request)
+        if media_type != "application/json" and not media_type.endswith("+json"):
+            raise wrong_media_type("application/json", media_type)
+        return await whole_body(request, self._max_bytes)
+
+    def read(self, body: bytes) -> T:
+        """Return the document in a body; raise ProblemError.
+
+        The body must be JSON [RFC 8259] in UTF-8, without duplicate keys and without NaN.
+        """
+        if self._from_workers:
+            # Most messages of workers are in the very form that pydantic writes, and pydantic
+            # reads them five times faster. If it writes the same bytes again, no key is duplicate.
+            with suppress(ValidationError):
+                document = self._adapter.validate_json(body)
+                if self._adapter.dump_json(document) == body:
+                    return document
+        self._check_containers(body)
+        values, not_finite = _parse(body)
+        try:
+            document = self._adapter.validate_python(values)
+        except ValidationError as error:
+            raise self._refusal(error, values) from error
+        except RecursionError as error:
+            raise _too_deep() from error
+        # Models refuse NaN and name its field; this covers parts of free form.
+        if not_finite:
+            raise malformed(f"{not_finite[0]} is no number")
+        return document
+
+    def _check_containers(self, body: bytes) -> None:
+        """Raise ProblemError if a document has too many lists and objects.
+
+        Brackets in strings count too: they are few, and finding them costs a parser.
+        """
+        count = body.count(b"[") + body.count(b"{")
+        if self._max_containers is None or count <= self._max_containers:
+            return
+        rule = f"must have at most {self._max_containers} lists and objects, and has {count}"
+        field = FieldError(pointer="", rule=rule, value="")
+        detail = f"the document {rule}"
+        raise ProblemError(422, ProblemCode.validation_failed, detail, fields=[field])
+
+    def _refusal(self, error: ValidationError, values: object) -> ProblemError:
+        """Return the problem that lists the first wrong fields of a document."""
+        fields = field_errors(error, values, self._type, at_most=SHOWN_ERRORS)
+        sentences = [
+            f"{field.pointer or 'the document'}: {field.rule}"
+            for field in fields[:SUMMARISED_ERRORS]
+        ]
+        detail = "; ".join(sentences)
+        others = error.error_count() - SUMMARISED_ERRORS
+        if others > 0:
+            detail += f" (and {others} more)"
+        return ProblemError(422, ProblemCode.validation_failed, detail, fields=fields)
+
+
+def malformed(reason: str) -> ProblemError:
+    """Return the refusal of a body that is not JSON."""
+    detail = f"the body is not JSON: {reason}"[:500]
+    return ProblemError(400, ProblemCode.malformed_body, detail)
+
+
+def _too_deep() -> ProblemError:
+    return ProblemError(400, ProblemCode.malformed_body, "the document is nested too deeply")
+
+
+def _parse(body: bytes) -> tuple[Any, list[str]]:
+    """Return the values of a JSON document, and the numbers that are not finite.
+
+    Raise ProblemError if it is not JSON, or names a key twice.
+    """
+    not_finite: list[str] = []
+
+    def to_float(text: str) -> float:
+        number = float(text)
+        if not isfinite(number):
+            not_finite.append(text)
+        return number
+
+    try:
+        text = body.decode("utf-8")
+        values = json.loads(
+            text,
+            object_pairs_hook=_object_without_duplicates,
+            parse_float=to_float,
+            parse_constant=to_float,
+        )
+        if "\\u" in text:
+            # Escapes can spell lone surrogates, which have no UTF-8 form and fit in no column.
+            json.dumps(values, ensure_ascii=False).encode("utf-8")
+    except RecursionError as error:
+        raise _too_deep() from error
+    # Bytes that are not UTF-8 are a ValueError, too, and integers of more than 4,300 digits.
+    except ValueError as error:
+        raise malformed(str(error)) from error
+    return values, not_finite
+
+
+def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        key, count = counts.most_common(1)[0]
+        raise ValueError(f"the key {key[:100]!r} is there {'twice' if count == 2 else count}")
+    return values
+
+
+def content_type(request: Request) -> str:
+    """Return the media type of a body without its parameters, in lower case."""
+    media_type: str = request.headers.get("content-type", "").partition(";")[0]
+    return media_type.strip().lower()
+
+
+def wrong_media_type(expected: str, media_type: str) -> ProblemError:
+    """Return the refusal of a body by its Content-Type."""
+    actual = f"it is {media_type[:100]!r}" if media_type else "there is none"
+    detail = f"Content-Type must be {expected}, and {actual}"
+    return ProblemError(415, ProblemCode.malformed_body, detail)
+
+
+async def whole_body(request: Request, max_bytes: int | None = None) -> bytes:
+    """Return the raw body; raise ProblemError if it is too large, or ends too soon.
+
+    No route accepts more than the setting `body_limit`.
+    """
+    limit: int = request.app.state.context.settings.body_limit
+    if max_bytes is not None:
+        limit = min(limit, max_bytes)
+    # The client may still be sending: it must not send another request on this connection.
+    headers = {"Connection": "close"}
+    detail = f"the body of this request may have at most {limit} bytes"
+    too_large = ProblemError(413, ProblemCode.body_too_large, detail, headers=headers)
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal() and (len(declared) > 15 or int(declared) > limit):
+        raise too_large
+    body = bytearray()
+    try:
+        async for block in request.stream():
+            body += block
+            if len(body) > limit:
+                raise too_large
+    except ClientDisconnect as error:
+        raise ProblemError(400, ProblemCode.malformed_body, "the body ends too soon") from error
+    return bytes(body)
