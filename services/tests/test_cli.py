@@ -131,7 +131,7 @@ def test_a_cancelled_job_is_no_success(
 def test_a_bad_file_is_refused_in_words(
     cli: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, words: list[str]
 ) -> None:
-    monkeypatch.setattr("stickslip_services.cli.specs.MAX_VALUES", 5000)
+    monkeypatch.setattr("stickslip_services.cli.documents.MAX_VALUES", 5000)
     (tmp_path / "spec.yaml").write_text(text)
     result = cli("submit", tmp_path / "spec.yaml")
     assert result.exit_code == 1

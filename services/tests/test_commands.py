@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
-from stickslip_services.cli import _COMMANDS, _Commands, _loaded, app, common
+from stickslip_services.cli import _COMMANDS, _Commands, _loaded, app, output
 
 SCRIPT = Path(sys.executable).with_name("stickslip")
 
@@ -54,20 +54,20 @@ def test_a_client_without_the_server_says_what_is_missing() -> None:
 def test_narrow_terminals_show_fewer_columns_and_break_no_word(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(common, "room", lambda: 40)
+    monkeypatch.setenv("COLUMNS", "40")
     rows = [
         ("ds-0123456789abcdef:v1", "a-long-name", "succeeded"),
-        ("ds-1", "b", click.style("failed", fg="red")),
+        ("ds-1", "b", output.Styled("failed", "red")),
     ]
-    common.print_table(("dataset", "name", "state"), rows)
+    output.print_table(("dataset", "name", "state"), rows)
     shown = capsys.readouterr()
     assert [line.split() for line in click.unstyle(shown.out).splitlines()] == [
         ["dataset", "name"],
         ["ds-0123456789abcdef:v1", "a-long-name"],
         ["ds-1", "b"],
     ]
-    assert "not shown in 40 columns: state; --json shows all" in shown.err
-    common.print_table(
+    assert "not shown in 40 columns: state; --json shows all" in " ".join(shown.err.split())
+    output.print_table(
         ("slot", "message"),
         [("3", "its centreline leaves the frame by 12 px at the left")],
         sentences=True,

@@ -8,10 +8,11 @@ import pytest
 from click.testing import CliRunner
 from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason, Stage
-from stickslip_schemas.documents.responses import Progress
+from stickslip_schemas.documents.responses import JobStateEvent, Progress
 from stickslip_services.app import make_app
 from stickslip_services.cli import app
-from stickslip_services.cli.jobs import planned_so_far
+from stickslip_services.cli.progress import planned_so_far
+from stickslip_services.client import Client
 from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job, start, sweep
@@ -405,7 +406,11 @@ def test_people_see_how_far_the_plan_is(
         worker.work()
         watched = CliRunner().invoke(app, ["watch", job["id"], "--url", url])
         assert watched.exit_code == 0
-        places = [watched.stdout.index(state) for state in ("planning", "queued", "succeeded")]
+        assert watched.stdout.endswith(": succeeded\n")  # of an ended job only the end is shown
+        with Client(url) as events_client:
+            events = list(events_client.events(job["id"]))
+        states = [str(event.state) for event in events if isinstance(event, JobStateEvent)]
+        places = [states.index(state) for state in ("planning", "queued", "succeeded")]
         assert places == sorted(places)
 
 

@@ -197,7 +197,7 @@ FLAGS: list[tuple[str, int, str]] = [
     (
         "validate DATE",
         1,
-        "name must be a number, a word, a list or a mapping, and it is datetime.date",
+        "name must be a number, a word, a list or a mapping, and it is the date 2026-01-01: write it in",
     ),
     ("validate TWICE", 1, "the key 'kind' is there twice"),
     ("validate BROKEN", 1, "is not YAML"),

@@ -1,5 +1,6 @@
-"""Running a service on this machine, and administering it: API keys, projects, webhooks and the
-audit log.
+"""Commands that run a service on this machine, and administer it.
+
+They manage API keys, projects, webhooks and the audit log.
 
 The commands of administration open the database of a data directory, also while the coordinator
 runs. They need no API key: users who may write the data directory may make keys.
@@ -10,12 +11,11 @@ import re
 import time
 from collections.abc import Callable
 from socket import gethostname
-from typing import Any
 
 import click
 from click.exceptions import Exit
 from sqlalchemy import Connection
-from stickslip_schemas.transport.addresses import DEFAULT_URL
+from stickslip_schemas.transport.addresses import API_KEY_VARIABLE, DEFAULT_URL
 
 from stickslip_services.access import audit_log as stored_audit_log
 from stickslip_services.access import keys as stored_keys
@@ -23,11 +23,15 @@ from stickslip_services.access import quotas as stored_quotas
 from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.keys import command_transaction
 from stickslip_services.access.principals import Scope
-from stickslip_services.cli.common import print_table, say, shows_errors
+from stickslip_services.cli.common import CommandGroup, shows_errors
+from stickslip_services.cli.output import print_json_line, print_table, say, tell
 from stickslip_services.database.database import Role, as_datetime
 from stickslip_services.database.opening import check
 from stickslip_services.local import supervisor
 from stickslip_services.settings import SERVER, Settings, options
+
+NAME_LETTERS = 63
+"""Most letters of the name of a dispatcher."""
 
 
 @click.command()
@@ -44,23 +48,36 @@ def up(settings: Settings, name: str | None, slots: int | None, workers: str | N
     data = settings.data
     settings = settings.model_copy(update={"data": data.absolute()})
     check(settings, Role.coordinator, with_store=True)
-    if name is None:  # a second dispatcher of one name would take over its tasks
-        own = re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname()).lstrip("_.-")[:63]
-        name = "local" if settings.database is None else own
+
+    def announce(url: str) -> None:
+        option = "" if url == DEFAULT_URL else f" --url {url}"
+        tell(
+            f"stickslip is up. Dashboard: {url}\n"
+            f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch{option}\n"
+            f"Data are in {data}, logs in {data / 'logs'}. Ctrl-C stops the service; jobs go on "
+            "when you start it again."
+        )
+
     status = supervisor.run(
         settings,
-        name=name,
+        name=name or _dispatcher_name(settings),
         slots=slots,
         workers=workers,
-        on_ready=lambda url: click.echo(
-            f"stickslip is up. Dashboard: {click.style(url, bold=True)}\n"
-            f"To submit a job from another terminal: stickslip submit SPEC.yaml --watch"
-            f"{'' if url == DEFAULT_URL else f' --url {url}'}\n"
-            f"Data are in {data}, logs in {data / 'logs'}. "
-            "Ctrl-C stops the service; jobs go on when you start it again."
-        ),
+        on_ready=announce,
     )
     raise Exit(status)
+
+
+def _dispatcher_name(settings: Settings) -> str:
+    """Return the name of this machine's dispatcher.
+
+    Machines that share a database need different ones: a second dispatcher of one name would take
+    over the tasks of the first.
+    """
+    if settings.database is None:
+        return "local"
+    machine = re.sub(r"[^A-Za-z0-9_.-]", "-", gethostname())
+    return machine.lstrip("_.-")[:NAME_LETTERS]
 
 
 webhook_argument = click.argument("webhook", help="id, as `stickslip webhooks list` shows it")
@@ -70,14 +87,14 @@ def administers(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command a write transaction on a coordinator's database, and show its errors."""
 
     @functools.wraps(command)
-    def run(settings: Settings, **given: Any) -> None:
+    def run(settings: Settings, **arguments: object) -> None:
         with command_transaction(settings) as connection:
-            command(connection, **given)
+            command(connection, **arguments)
 
     return shows_errors(options("data", "database")(run))
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def keys() -> None:
     """Make, list and revoke API keys."""
 
@@ -98,13 +115,14 @@ def keys() -> None:
 )
 @administers
 def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], project: str) -> None:
-    """Make a key and print it. It is shown only once, because the database keeps only its digest."""
+    """Make a key and print it, once: the database keeps only its digest."""
     key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
     click.echo(secret)
     say(
-        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as STICKSLIP_API_KEY, or in the header"
+        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as {API_KEY_VARIABLE}, "
+        "or in the header Authorization: Bearer KEY. Browsers send it as the password of any user "
+        "name"
     )
-    say("Authorization: Bearer KEY. Browsers send it as the password of any user name")
 
 
 @keys.command("list")
@@ -113,10 +131,16 @@ def list_keys(connection: Connection) -> None:
     """List all keys, newest first, including revoked ones."""
     rows = []
     for key in stored_keys.list_keys(connection):
-        revoked = "" if key.revoked_at is None else f"{as_datetime(key.revoked_at):%Y-%m-%d %H:%M}"
-        made = f"{as_datetime(key.created_at):%Y-%m-%d %H:%M}"
-        rows.append((key.id, key.name, revoked, key.scopes.replace(" ", ", "), key.project, made))
+        revoked_at = "" if key.revoked_at is None else _minute(key.revoked_at)
+        scopes = key.scopes.replace(" ", ", ")
+        created_at = _minute(key.created_at)
+        rows.append((key.id, key.name, revoked_at, scopes, key.project, created_at))
     print_table(("key", "name", "revoked", "scopes", "project", "made"), rows)
+
+
+def _minute(seconds: float) -> str:
+    """Return a time since 1970 [s] as a date and a time of day."""
+    return f"{as_datetime(seconds):%Y-%m-%d %H:%M}"
 
 
 @keys.command("revoke")
@@ -128,7 +152,7 @@ def revoke_key(connection: Connection, key_id: str) -> None:
     click.echo(f"{key_id} is revoked")
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def projects() -> None:
     """List projects, and set their quotas."""
 
@@ -136,19 +160,16 @@ def projects() -> None:
 @projects.command("list")
 @administers
 def list_projects(connection: Connection) -> None:
-    """List projects with their quotas, and the jobs and samples in progress that count against
-    them.
-    """
+    """List projects with their quotas, and the jobs and samples that count against them."""
     rows = []
     for project in stored_quotas.list_projects(connection):
-        limits = _limit(project.max_jobs), _limit(project.max_samples)
         rows.append(
             (
                 project.name or "(none)",
                 f"{project.jobs:,}",
-                limits[0],
+                _limit(project.max_jobs),
                 f"{project.samples:,}",
-                limits[1],
+                _limit(project.max_samples),
             )
         )
     print_table(("project", "jobs", "at most", "samples", "at most"), rows)
@@ -167,16 +188,14 @@ def set_quota(connection: Connection, name: str, samples: int | None, jobs: int 
     """Set the quota of a project from its next submission on. Submitted jobs are not affected."""
     stored_quotas.set_quota(connection, name, max_samples=samples, max_jobs=jobs, now=time.time())
     whose = f"the project {name}" if name else "requests without a project"
-    click.echo(
-        f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended"
-    )
+    tell(f"{whose}: at most {_limit(jobs)} jobs and {_limit(samples)} samples that have not ended")
 
 
 def _limit(value: int | None) -> str:
     return "any number" if value is None else f"{value:,}"
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def webhooks() -> None:
     """Send job events to other programs."""
 
@@ -197,7 +216,8 @@ def create_webhook(settings: Settings, url: str, project: str) -> None:
         )
     click.echo(secret)
     say(
-        f"{webhook_id} is made. The receiver verifies messages with the secret, as standardwebhooks.com describes"
+        f"{webhook_id} is made. The receiver verifies messages with the secret, as "
+        "standardwebhooks.com describes"
     )
 
 
@@ -208,8 +228,9 @@ def list_webhooks(connection: Connection) -> None:
     rows = []
     for webhook in stored_webhooks.list_webhooks(connection, time.time()):
         fault = f"given up: {webhook.fault}" if webhook.is_given_up else webhook.fault
-        made = f"{as_datetime(webhook.created_at):%Y-%m-%d %H:%M}"
-        rows.append((webhook.id, webhook.url, str(webhook.failures), webhook.project, made, fault))
+        failures = str(webhook.failures)
+        created_at = _minute(webhook.created_at)
+        rows.append((webhook.id, webhook.url, failures, webhook.project, created_at, fault))
     print_table(
         ("webhook", "url", "failed tries", "project", "made", "fault"), rows, sentences=True
     )
@@ -250,12 +271,11 @@ def audit_log(connection: Connection, subject: str | None, limit: int, as_json: 
     entries = stored_audit_log.read(connection, subject=subject, limit=limit)
     if as_json:
         for entry in entries:
-            click.echo(entry.model_dump_json())
+            print_json_line(entry.model_dump(mode="json"))
         return
     rows = []
     for entry in entries:
         details = ", ".join(f"{name} {value}" for name, value in entry.details.items())
-        rows.append(
-            (f"{entry.at:%Y-%m-%d %H:%M:%S}", entry.actor, entry.action, entry.subject, details)
-        )
+        moment = f"{entry.at:%Y-%m-%d %H:%M:%S}"
+        rows.append((moment, entry.actor, entry.action, entry.subject, details))
     print_table(("when", "who", "what", "to what", "details"), rows, sentences=True)

@@ -7,30 +7,30 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
+from typing import NamedTuple
 
 import click
 from click.exceptions import Exit
+from stickslip_schemas.documents.responses import Dataset, DatasetVersion
 from stickslip_schemas.format.manifest import SIGNATURE_NAME
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.installation import install_hint
 from stickslip_schemas.transport.addresses import URL_VARIABLE
 
-from stickslip_services.cli.common import (
-    FILE,
-    asks,
-    json_option,
-    print_json,
-    print_table,
-    say,
-    shows_errors,
-)
+from stickslip_services.cli.common import FILE, asks, json_option, shows_errors
+from stickslip_services.cli.output import print_json, print_table, say, tell
 from stickslip_services.client import pulling
-from stickslip_services.client.errors import ClientError
+from stickslip_services.client.answers import printable
+from stickslip_services.client.errors import ClientError, SelectionError
 from stickslip_services.client.http import Client
 from stickslip_services.client.signing import sign_directory, signer_of
 from stickslip_services.client.verifying import READS_ARRAYS
 from stickslip_services.client.verifying import verify as find_faults
 from stickslip_services.units import size
+
+DATASET_ID = re.compile(r"ds-[0-9a-f]{16}")
+VERSION_DIGITS = 9
+"""Most digits of the number of a version."""
 
 allowed_signers_option = click.option(
     "--allowed-signers",
@@ -39,24 +39,65 @@ allowed_signers_option = click.option(
 )
 
 
+class VersionName(NamedTuple):
+    """A version of a dataset by its id and number."""
+
+    dataset: str
+    version: int
+
+    def __str__(self) -> str:
+        return f"{self.dataset}:v{self.version}"
+
+
 @click.command()
+@click.option("--latest", is_flag=True, help="print only the name of the newest version")
 @json_option
 @asks
-def datasets(client: Client, as_json: bool) -> None:
-    """List datasets and their versions, newest first."""
-    found = list(client.datasets())
+def datasets(client: Client, latest: bool, as_json: bool) -> None:
+    """List datasets and their versions, newest first.
+
+    `stickslip pull "$(stickslip datasets --latest)" DEST` downloads the newest one.
+    """
+    if latest:
+        newest = _newest(client)
+        if as_json:
+            print_json(newest)
+        else:
+            click.echo(VersionName(newest.id, newest.versions[-1].version))
+        return
+    all_datasets = list(client.datasets())
     if as_json:
-        return print_json(found)
+        print_json(all_datasets)
+        return
     rows = []
-    for dataset, version in ((each, version) for each in found for version in each.versions):
-        name, made = f"{dataset.id}:v{version.version}", f"{version.created_at:%Y-%m-%d %H:%M} UTC"
-        sizes = str(version.sample_count), str(version.valid_count), size(version.bytes)
-        rows.append((name, dataset.name or "", *sizes, dataset.kind, made))
-    return print_table(("dataset", "name", "samples", "valid", "size", "kind", "made"), rows)
+    for dataset in all_datasets:
+        for version in dataset.versions:
+            rows.append(_dataset_row(dataset, version))
+    print_table(("dataset", "name", "samples", "valid", "size", "kind", "made"), rows)
+
+
+def _newest(client: Client) -> Dataset:
+    """Return the dataset whose newest version was published last."""
+    published = [dataset for dataset in client.datasets() if dataset.versions]
+    if not published:
+        raise ClientError("there is no dataset yet: `stickslip submit` makes one")
+    return max(published, key=lambda dataset: dataset.versions[-1].created_at)
+
+
+def _dataset_row(dataset: Dataset, version: DatasetVersion) -> tuple[str, ...]:
+    return (
+        str(VersionName(dataset.id, version.version)),
+        dataset.name or "",
+        str(version.sample_count),
+        str(version.valid_count),
+        size(version.bytes),
+        dataset.kind,
+        f"{version.created_at:%Y-%m-%d %H:%M} UTC",
+    )
 
 
 @click.command()
-@click.argument("dataset", metavar="DATASET[:vN]", help="without :vN, the newest version")
+@click.argument("dataset", metavar="DATASET[:vN]", help="id or name; without :vN, the newest")
 @click.argument("target", metavar="DEST", type=FILE, help="directory to write to")
 @click.option(
     "--arrays", help="arrays to take, with commas between; labels always come; without, all"
@@ -89,34 +130,35 @@ def pull(
     try:
         selection = Selection.of_options(arrays, split, where)
     except ValueError as error:
-        raise ClientError(str(error)) from error
-    name, version = _resolve(client, dataset)
-    counting = Lock()  # files are downloaded by several threads
+        raise SelectionError(str(error)) from error
+    name = _resolve(client, dataset)
+    lock = Lock()  # several threads download
     with click.progressbar(
         length=0, label="pull", hidden=not sys.stderr.isatty(), file=sys.stderr
     ) as bar:
 
         def on_bytes(count: int) -> None:
-            with counting:
+            with lock:
                 bar.update(count)
 
-        done = pulling.pull(
+        result = pulling.pull(
             client,
-            name,
-            version,
+            name.dataset,
+            name.version,
             target,
             selection=selection,
             allowed_signers=allowed_signers,
             on_plan=lambda _files, count: setattr(bar, "length", count),
             on_bytes=on_bytes,
         )
-    there = done.files - done.downloaded_files
-    click.echo(
-        f"{name}:v{version} is in {target}: {done.downloaded_files} files downloaded "
-        f"({size(done.downloaded_bytes)}), {there} already there"
+    samples = "1 sample" if result.samples == 1 else f"{result.samples} samples"
+    tell(
+        f"{name} is in {target}: {samples}, {result.downloaded_files} files downloaded "
+        f"({size(result.downloaded_bytes)}), {result.files - result.downloaded_files} already there"
     )
     say(
-        f"{target / 'README.md'} describes the dataset and how to read it. To check it: stickslip verify {target}"
+        f"{target / 'README.md'} describes the dataset and how to read it. To check it: "
+        f"stickslip verify {target}"
     )
 
 
@@ -139,28 +181,31 @@ def export(client: Client) -> None:
             "`stickslip export` needs the training package: "
             + install_hint("stickslip-training", "export")
         )
-    given = click.get_current_context().args
     arguments = []
-    for argument in given:
-        if re.match(r"ds-[0-9a-f]{16}(:|$)", argument):
-            name, version = _resolve(client, argument)
-            argument = f"{client.url}/v1/datasets/{name}/versions/{version}"
+    for argument in click.get_current_context().args:
+        if DATASET_ID.fullmatch(argument.partition(":")[0]):
+            name = _resolve(client, argument)
+            argument = f"{client.url}/v1/datasets/{name.dataset}/versions/{name.version}"
         arguments.append(argument)
-    ended = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
         env=os.environ | {URL_VARIABLE: client.url},  # the key belongs to this coordinator
         check=False,
     )
-    raise Exit(ended.returncode)
+    raise Exit(process.returncode)
 
 
-def _resolve(client: Client, dataset: str) -> tuple[str, int]:
-    name, colon, version = dataset.partition(":v")
+def _resolve(client: Client, text: str) -> VersionName:
+    """Return the version that `DATASET` or `DATASET:vN` means, DATASET being an id or a name."""
+    dataset, colon, number = text.rpartition(":v")
     if not colon:
-        return name, client.newest(name)
-    if not version.isdecimal() or len(version) > 9:
-        raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {dataset!r}")
-    return name, int(version)
+        dataset = text
+    is_number = number.isascii() and number.isdecimal() and len(number) <= VERSION_DIGITS
+    if colon and not is_number:
+        raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {text!r}")
+    if DATASET_ID.fullmatch(dataset) is None:
+        dataset = client.find_dataset(dataset).id
+    return VersionName(dataset, int(number) if colon else client.newest(dataset))
 
 
 @click.command()
@@ -180,7 +225,7 @@ def sign(target: Path, key: Path) -> None:
     The signature, manifest.sha256.sig, covers all of its files.
     """
     sign_directory(target, key)
-    click.echo(f"{target / SIGNATURE_NAME} is written")
+    tell(f"{target / SIGNATURE_NAME} is written")
 
 
 @click.command()
@@ -192,24 +237,22 @@ def verify(target: Path, allowed_signers: Path | None) -> None:
 
     Exit with 1 if anything is wrong.
     """
-    signed = "" if allowed_signers is None else f", signed by {signer_of(target, allowed_signers)}"
+    signer = "" if allowed_signers is None else printable(signer_of(target, allowed_signers))
     faults = find_faults(target)
     if not faults:
-        click.echo(f"{target}: all files are present and unchanged{signed}")
+        signed = f", signed by {signer}" if signer else ""
+        tell(f"{target}: all files are present and unchanged{signed}")
         if not READS_ARRAYS:
             say(
                 "sample keys were not compared with the manifest, which needs more packages: "
                 + install_hint("stickslip", "arrays")
             )
         return
-    print_table(
-        ("file", "fault", "detail"),
-        ((each.path, each.fault, each.detail) for each in faults),
-        sentences=True,
-    )
+    rows = [(fault.path, fault.fault, fault.detail) for fault in faults]
+    print_table(("file", "fault", "detail"), rows, sentences=True)
     files = "1 file is" if len(faults) == 1 else f"{len(faults)} files are"
-    click.secho(
-        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` again.",
-        fg="red",
+    tell(
+        f"{files} missing, damaged or not part of the dataset. To repair it, run `stickslip pull` "
+        "again."
     )
     raise Exit(1)

@@ -1,10 +1,6 @@
-"""Commands for jobs and their textures: validate, upload, submit, list, watch, pause, prioritise
-and cancel.
-"""
+"""Commands for jobs: validate, upload, submit, list, watch, pause, prioritise and cancel."""
 
-import json
 import os
-import sys
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
@@ -14,38 +10,32 @@ from click.exceptions import Exit
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents import responses
 from stickslip_schemas.format.manifest import bytes_estimate
-from stickslip_schemas.plan.costs import Counts, Estimate, Interval, count, estimated
+from stickslip_schemas.plan.costs import Counts, Estimate, count, estimated
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.cli.common import (
-    FILE,
-    asks,
-    job_argument,
-    json_option,
-    print_fields,
-    print_json,
-    print_table,
-    room,
-    say,
-    spec_argument,
+from stickslip_services.cli.common import FILE, asks, job_argument, json_option, spec_argument
+from stickslip_services.cli.documents import check_spec, read_job
+from stickslip_services.cli.output import Cell, print_fields, print_json, print_table, say, tell
+from stickslip_services.cli.progress import (
+    SUCCEEDED,
+    interval,
+    planned_so_far,
+    stage_counts,
+    state_cell,
+    time_left,
+    version_name,
+    watch_job,
 )
-from stickslip_services.cli.specs import check_spec, read_job
+from stickslip_services.client.answers import printable
 from stickslip_services.client.errors import ClientError, UnreachableError
 from stickslip_services.client.http import Client
 from stickslip_services.units import duration, size
 
-SHOWN_REJECTS = 50
-GOOD = (JobState.succeeded, JobState.succeeded_with_rejects)
-
-_COLORS = {
-    **dict.fromkeys(
-        (JobState.planning, JobState.queued, JobState.cancelling, JobState.cancelled), "yellow"
-    ),
-    **dict.fromkeys(GOOD, "green"),
-    JobState.running: "cyan",
-    JobState.failed: "red",
-}
-_NOTED = (TaskState.rejected, TaskState.soft_failed, TaskState.failed, TaskState.cancelled)
+LISTED_REJECTS = 50
+"""Most rejected samples that `show` lists."""
+TEXTURE_NAME_LETTERS = 60
+"""Most letters of the name of a texture in a spec."""
+SCENE_FILE_SUFFIXES = (".obj", ".npz", ".csv")
 
 PRIORITY = click.IntRange(-100, 100)
 PRIORITY_HELP = (
@@ -58,9 +48,9 @@ PRIORITY_HELP = (
 @json_option
 @asks
 def validate(client: Client, file: Path, as_json: bool) -> None:
-    """Check a spec, count its samples and tell what they cost; exit with 1 if it would be refused.
+    """Check a spec, count its samples and tell what they cost.
 
-    Works offline.
+    Exit with 1 if a job of it would be refused. Works offline.
     """
     document, files = read_job(file)
     spec = check_spec(document, file)
@@ -68,54 +58,61 @@ def validate(client: Client, file: Path, as_json: bool) -> None:
         _upload(client, spec, files)
         answer = client.validate(document)
     except UnreachableError:
-        return _validate_offline(spec, client.url, as_json=as_json)
-    refused = answer.refusal is not None
+        _validate_offline(spec, client.url, as_json=as_json)
+        return
+    is_refused = answer.refusal is not None
     if as_json:
         print_json(answer)
-        raise Exit(int(refused))
-    cached = "unknown" if answer.cached_count is None else f"{answer.cached_count}"
-    fields = [*_counts(answer, spec), ("tasks cached", f"{cached} of {answer.task_count}")]
-    if answer.stored_bytes_estimate is not None:
-        fields.append(("size of the files, about", size(answer.stored_bytes_estimate)))
-    print_fields([*fields, *_costs(answer.estimate), ("certificate", answer.certificate or "none")])
-    if refused:
-        say(f"the spec is valid, but a job of it would be refused now: {answer.refusal}")
+        raise Exit(int(is_refused))
+    print_fields(_validation_fields(answer, spec))
+    if is_refused:
+        refusal = printable(answer.refusal or "")
+        say(f"the spec is valid, but a job of it would be refused now: {refusal}")
         raise Exit(1)
-    return say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
+    say(f"the spec is valid. To make the dataset: stickslip submit {file} --watch")
+
+
+def _validation_fields(answer: responses.Validation, spec: JobSpec) -> Iterator[tuple[str, str]]:
+    yield from _counts(answer, spec)
+    cached = "unknown" if answer.cached_count is None else str(answer.cached_count)
+    yield "tasks cached", f"{cached} of {answer.task_count}"
+    if answer.stored_bytes_estimate is not None:
+        yield "size of the files, about", size(answer.stored_bytes_estimate)
+    yield from _costs(answer.estimate)
+    yield "certificate", answer.certificate or "none"
 
 
 def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
     counts = count(spec)
     costs = estimated(spec, counts, {}, os.cpu_count() or 1)
     if as_json:
-        return click.echo(json.dumps({"estimate": costs.model_dump(mode="json")}, indent=2))
+        print_json({"estimate": costs.model_dump(mode="json")})
+        return
     print_fields([*_counts(counts, spec), *_costs(costs)])
-    return say(
-        f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are unknown, and the "
-        "wall time is that of all cores of this machine. To start one here: stickslip up"
+    say(
+        f"the spec is valid. No coordinator answers at {url}, so cached tasks and certificates are "
+        "unknown, and the wall time is that of all cores of this machine. To start one here: "
+        "stickslip up"
     )
 
 
 def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
-    for stage, interval in costs.stages.items():
-        source = (
-            "measured by this service" if stage in costs.measured else "by the package's records"
-        )
-        yield f"CPU time, {stage}", f"{_interval(interval)}, {source}"
-    yield "CPU time, all", _interval(costs.cpu_seconds)
-    wall = (
-        "unknown: no worker is there"
-        if costs.wall_seconds is None
-        else _interval(costs.wall_seconds)
-    )
-    yield f"wall time, {costs.slots} at once", wall
+    for stage, seconds in costs.stages.items():
+        is_measured = stage in costs.measured
+        source = "measured by this service" if is_measured else "by the package's records"
+        yield f"CPU time, {stage}", f"{interval(seconds)}, {source}"
+    yield "CPU time, all", interval(costs.cpu_seconds)
+    if costs.wall_seconds is None:
+        yield f"wall time, {costs.slots} at once", "unknown: no worker is there"
+    else:
+        yield f"wall time, {costs.slots} at once", interval(costs.wall_seconds)
 
 
 def _counts(counts: Counts | responses.Validation, spec: JobSpec) -> Iterator[tuple[str, str]]:
-    shares = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
-    yield "samples", f"{counts.sample_count} ({shares}, about)"
-    yield "simulations", f"{counts.simulation_count}"
-    yield "renders", f"{counts.render_count}"
+    splits = ", ".join(f"{split} {number}" for split, number in counts.expected_splits.items())
+    yield "samples", f"{counts.sample_count} ({splits}, about)"
+    yield "simulations", str(counts.simulation_count)
+    yield "renders", str(counts.render_count)
     yield "arrays before compression", size(bytes_estimate(spec))
     yield "digest of the spec", spec.content_digest
 
@@ -137,11 +134,15 @@ def submit(
     if files:
         _upload(client, check_spec(document, file), files)
     job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
-    click.echo(job.id)
-    if not then_watch:
-        say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
-    else:
-        raise Exit(0 if _watched(client, job.id) in GOOD else 1)
+    click.echo(printable(job.id))
+    if then_watch:
+        state = watch_job(client, job.id, as_json=False)
+        raise Exit(_exit_status(state))
+    say(f"watch it: stickslip watch {job.id}, or in a browser: {client.url}/jobs/{job.id}")
+
+
+def _exit_status(state: JobState) -> int:
+    return 0 if state in SUCCEEDED else 1
 
 
 @click.command()
@@ -155,31 +156,26 @@ def jobs(
     client: Client, as_json: bool, limit: int, search: str, state: JobState | None, project: str
 ) -> None:
     """List jobs, newest first."""
-    found = list(islice(client.jobs(search=search, state=state, project=project), limit))
+    listed = list(islice(client.jobs(search=search, state=state, project=project), limit))
     if as_json:
-        return print_json(found)
-    rows = []
-    for job in found:
-        left = "" if job.progress.eta is None else duration(job.progress.eta.seconds)
-        progress = (
-            _coloured(job.state),
-            f"{job.progress.done}/{job.progress.total}",
-            left,
-            _version(job.dataset),
-        )
-        rows.append(
-            (
-                job.id,
-                *progress,
-                job.name or "",
-                job.kind,
-                str(job.sample_count),
-                str(job.rejected_count),
-            )
-        )
-    return print_table(
-        ("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected"),
-        rows,
+        print_json(listed)
+        return
+    heads = ("job", "state", "tasks", "time left", "dataset", "name", "kind", "samples", "rejected")
+    print_table(heads, [_job_row(job) for job in listed])
+
+
+def _job_row(job: responses.Job) -> tuple[Cell, ...]:
+    eta = job.progress.eta
+    return (
+        job.id,
+        state_cell(job.state),
+        f"{job.progress.done}/{job.progress.total}",
+        "" if eta is None else duration(eta.seconds),
+        version_name(job.dataset),
+        job.name or "",
+        job.kind,
+        str(job.sample_count),
+        str(job.rejected_count),
     )
 
 
@@ -191,115 +187,65 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
     """Show the state and progress of a job, and its rejected samples with reasons."""
     job = client.job(job_id)
     if as_json:
-        return print_json(job)
-    rejects = client.samples(job_id, state=TaskState.rejected) if job.rejected_count else iter(())
-    shown = list(islice(rejects, SHOWN_REJECTS))
-    print_fields(_fields(job))
-    if shown:
-        click.secho(f"rejected samples ({job.rejected_count})", italic=True)
-        rows = []
-        for reject in shown:
-            parameters = ", ".join(f"{name}={value}" for name, value in reject.labels.items())
-            rows.append((str(reject.slot), str(reject.reason), parameters, reject.message))
-        print_table(("slot", "reason", "parameters", "message"), rows, sentences=True)
-        if job.rejected_count > len(shown):
-            click.echo(
-                f"... and {job.rejected_count - len(shown)} more: GET /v1/jobs/{job.id}/samples?state=rejected"
-            )
-    return None
+        print_json(job)
+        return
+    print_fields(_job_fields(job))
+    if job.rejected_count:
+        _print_rejects(client, job)
 
 
-def _fields(job: responses.JobDetail) -> Iterator[tuple[str, str]]:
-    yield "job", f"{job.id}{f' ({job.name})' if job.name else ''}, {job.kind}"
-    yield "state", _coloured(job.state)
+def _print_rejects(client: Client, job: responses.JobDetail) -> None:
+    rejects = list(islice(client.samples(job.id, state=TaskState.rejected), LISTED_REJECTS))
+    if not rejects:
+        return
+    click.secho(f"rejected samples ({job.rejected_count})", italic=True)
+    rows = []
+    for reject in rejects:
+        parameters = ", ".join(f"{name}={value}" for name, value in reject.labels.items())
+        rows.append((str(reject.slot), str(reject.reason), parameters, reject.message))
+    print_table(("slot", "reason", "parameters", "message"), rows, sentences=True)
+    rest = job.rejected_count - len(rejects)
+    if rest > 0:
+        tell(f"... and {rest} more: GET /v1/jobs/{job.id}/samples?state=rejected")
+
+
+def _job_fields(job: responses.JobDetail) -> Iterator[tuple[str, Cell]]:
+    name = f" ({job.name})" if job.name else ""
+    yield "job", f"{job.id}{name}, {job.kind}"
+    yield "state", state_cell(job.state)
     if job.message:
         yield "", job.message
     if job.priority:
         yield "priority", str(job.priority)
-    yield "tasks", _stages(job.progress)
-    if planned := planned_so_far(job.progress, job.sample_count):
+    yield "tasks", stage_counts(job.progress)
+    planned = planned_so_far(job.progress, job.sample_count)
+    if planned:
         yield "", planned
     if job.state.is_open:
-        yield "time left", _left(job.progress.eta)
+        yield "time left", time_left(job.progress.eta)
     yield "CPU time", duration(sum(stage.cpu_seconds for stage in job.progress.stages.values()))
-    if job.state in GOOD:
-        rate = 1 - job.rejected_count / job.sample_count
-        yield (
-            "accepted",
-            f"{job.sample_count - job.rejected_count} of {job.sample_count} samples ({rate:.1%})",
-        )
+    if job.state in SUCCEEDED:
+        accepted = job.sample_count - job.rejected_count
+        # Rounded down: 100 % means that no sample was rejected.
+        permille = 1000 * accepted // job.sample_count
+        yield "accepted", f"{accepted} of {job.sample_count} samples ({permille / 10:.1f}%)"
     else:
         yield "samples", f"{job.sample_count}, {job.rejected_count} rejected so far"
     if job.dataset is not None:
-        yield "dataset", _version(job.dataset)
+        yield "dataset", version_name(job.dataset)
         yield "manifest", job.dataset.manifest
 
 
 @click.command()
 @job_argument
+@click.option("--json", "as_json", is_flag=True, help="print one JSON document for each event")
 @asks
-def watch(client: Client, job_id: str) -> None:
-    """Watch a job until it ends; exit with 0 if it succeeded, else 1."""
-    raise Exit(0 if _watched(client, job_id) in GOOD else 1)
+def watch(client: Client, job_id: str, as_json: bool) -> None:
+    """Watch a job until it ends; exit with 0 if it succeeded, else 1.
 
-
-def _watched(client: Client, job_id: str) -> JobState:
-    """Show the progress of a job until it ends; return its final state."""
-    job = client.job(job_id)
-    view, state = _Lines(job.sample_count), job.state
-    try:
-        for event in client.events(job_id):
-            match event:
-                case responses.JobProgressEvent():
-                    view.progress(event.progress)
-                case responses.JobStateEvent():
-                    state = event.state
-                    view.line(f"{job_id}: {_coloured(state)}{_because(event.message)}")
-                case responses.TaskStateEvent():
-                    view.line(
-                        f"{event.task_id[:20]}... {event.state}: {event.reason}{_because(event.message)}"
-                    )
-                case responses.DatasetPublishedEvent():
-                    name = _version(event.dataset)
-                    view.line(f"published {click.style(name, bold=True)}")
-                    view.line(f"download it: stickslip pull {name} DIRECTORY --url {client.url}")
-                    view.line(
-                        f"its page: {client.url}/datasets/{event.dataset.dataset}/v{event.dataset.version}"
-                    )
-    except KeyboardInterrupt:
-        say(
-            f"\nthe job goes on. To watch it again: stickslip watch {job_id}. To cancel it: stickslip cancel {job_id}"
-        )
-        raise Exit(130) from None
-    return state
-
-
-def _because(message: str) -> str:
-    return f": {message}" if message else ""
-
-
-class _Lines:
-    """Prints a line for each event; on a terminal, the last one is the progress and changes."""
-
-    def __init__(self, sample_count: int) -> None:
-        self._sample_count = sample_count
-        self._last = ""
-        self._clear = "\r\x1b[K" if sys.stdout.isatty() else ""
-
-    def line(self, text: str) -> None:
-        click.echo(f"{self._clear}{text}")
-
-    def progress(self, progress: responses.Progress) -> None:
-        text = ", ".join(
-            filter(None, [planned_so_far(progress, self._sample_count), _stages(progress)])
-        )
-        if progress.eta is not None:
-            text += f"; {_left(progress.eta)} left"
-        if text != self._last:
-            click.echo(
-                f"{self._clear}{text[: room() - 1]}" if self._clear else text, nl=not self._clear
-            )
-        self._last = text
+    Of a job that has ended, only the end is shown.
+    """
+    raise Exit(_exit_status(watch_job(client, job_id, as_json=as_json)))
 
 
 @click.command()
@@ -308,9 +254,7 @@ class _Lines:
 def cancel(client: Client, job_id: str) -> None:
     """Cancel a job. Finished tasks stay cached, and published datasets stay."""
     job = client.cancel(job_id)
-    click.echo(
-        f"{job.id} is {_coloured(job.state)}. To run it again, submit its spec: results are cached"
-    )
+    tell(f"{job.id} is {job.state}. To run it again, submit its spec: results are cached")
 
 
 @click.command()
@@ -319,9 +263,8 @@ def cancel(client: Client, job_id: str) -> None:
 def pause(client: Client, job_id: str) -> None:
     """Pause a job: no further task is started, and running tasks finish."""
     job = client.pause(job_id)
-    click.echo(
-        f"{job.id} is {_coloured(job.state)}: {job.message}. To go on: stickslip resume {job.id}"
-    )
+    message = printable(job.message)
+    tell(f"{job.id} is {job.state}: {message}. To go on: stickslip resume {job.id}")
 
 
 @click.command()
@@ -330,7 +273,7 @@ def pause(client: Client, job_id: str) -> None:
 def resume(client: Client, job_id: str) -> None:
     """Resume a paused job."""
     job = client.resume(job_id)
-    click.echo(f"{job.id} is {_coloured(job.state)}. To watch it: stickslip watch {job.id}")
+    tell(f"{job.id} is {job.state}. To watch it: stickslip watch {job.id}")
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -1 is a priority
@@ -340,15 +283,17 @@ def resume(client: Client, job_id: str) -> None:
 def priority(client: Client, job_id: str, priority: int) -> None:
     """Change the priority of a job, from its next task on. Running tasks continue."""
     job = client.prioritise(job_id, priority)
-    click.echo(f"{job.id} has priority {job.priority}")
+    tell(f"{job.id} has priority {job.priority}")
 
 
 def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
     """Upload the files that a scene names, by digest."""
     for pointer, digest in spec.artifacts.items():
-        if digest in files and pointer.startswith("/scene/looks/"):
+        if digest not in files:
+            continue
+        if pointer.startswith("/scene/looks/"):
             client.upload_texture(files[digest])
-        elif digest in files:
+        else:
             client.upload_file(files[digest])
 
 
@@ -363,86 +308,41 @@ def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
 
     Print the references that specs use.
     """
-    found: list[responses.TextureEntry | responses.FileUpload] = []
-    for file in files:
-        try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
-        is_scene_file = file.suffix.lower() in (".obj", ".npz", ".csv")
-        try:
-            found.append(client.upload_file(data) if is_scene_file else client.upload_texture(data))
-        except ClientError as error:
-            raise ClientError(f"{file} was refused: {error}") from error
+    entries = [_upload_file(client, file) for file in files]
     if as_json:
-        return print_json(found)
+        print_json(entries)
+        return
     say("In a spec, under any names:")
-    pictures = [
-        (file, entry)
-        for file, entry in zip(files, found, strict=True)
-        if isinstance(entry, responses.TextureEntry)
-    ]
-    for number, (file, picture) in enumerate(pictures):
-        click.echo(("" if number else "textures:\n") + f"  {_name(file)}: {picture.texture}")
-    for entry in found:
-        if isinstance(entry, responses.FileUpload):
-            click.echo(
-                f"file: {entry.file}"
-                + (f"  # counts: {list(entry.counts)}" if entry.counts else "")
-            )
-    return None
+    textures = []
+    references = []
+    for file, entry in zip(files, entries, strict=True):
+        if isinstance(entry, responses.TextureEntry):
+            textures.append(f"  {_texture_name(file)}: {entry.texture}")
+        else:
+            counts = f"  # counts: {list(entry.counts)}" if entry.counts else ""
+            references.append(f"file: {entry.file}{counts}")
+    if textures:
+        click.echo("textures:")
+    for line in (*textures, *references):
+        click.echo(line)
 
 
-def _name(file: Path) -> str:
+def _upload_file(client: Client, file: Path) -> responses.TextureEntry | responses.FileUpload:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
+    try:
+        if file.suffix.lower() in SCENE_FILE_SUFFIXES:
+            return client.upload_file(data)
+        return client.upload_texture(data)
+    except ClientError as error:
+        raise ClientError(f"{file} was refused: {error}") from error
+
+
+def _texture_name(file: Path) -> str:
     """Return the name of a texture, from the name of its file."""
-    word = "".join(
+    letters = [
         letter if letter.isascii() and letter.isalnum() else "-" for letter in file.stem.lower()
-    )
-    return word.strip("-")[:60] or "custom"
-
-
-def _left(value: responses.Eta | None) -> str:
-    if value is None:
-        return "unknown"
-    return _interval(Interval(median=value.seconds, low=value.low, high=value.high))
-
-
-def _interval(value: Interval) -> str:
-    return f"about {duration(value.median)} ({duration(value.low)} to {duration(value.high)})"
-
-
-def _coloured(value: JobState) -> str:
-    return click.style(str(value), fg=_COLORS.get(value))
-
-
-def _version(value: responses.DatasetRef | None) -> str:
-    """Return a dataset version as `stickslip pull` reads it."""
-    return "" if value is None else f"{value.dataset}:v{value.version}"
-
-
-def planned_so_far(progress: responses.Progress, sample_count: int) -> str:
-    """Return the number of planned samples; empty when all are planned."""
-    return (
-        ""
-        if progress.planned == sample_count
-        else f"{progress.planned:,} of {sample_count:,} samples are planned"
-    )
-
-
-def _stages(progress: responses.Progress) -> str:
-    """Return a line of counts: `simulate 12/40 (3 cached, 1 rejected), render 0/40`."""
-    shown = [
-        f"{stage} {counted.done}/{counted.total}"
-        + (f" ({', '.join(found)})" if (found := _notes(counted)) else "")
-        for stage, counted in progress.stages.items()
-        if counted.total
     ]
-    return ", ".join(shown) or "not planned yet"
-
-
-def _notes(counted: responses.StageProgress) -> list[str]:
-    """Return counts of tasks of a stage that need a word: `3 cached`, `1 rejected`."""
-    cached = [f"{counted.cached} cached"] if counted.cached else []
-    return cached + [
-        f"{counted.counts[state]} {state}" for state in _NOTED if counted.counts.get(state)
-    ]
+    return "".join(letters).strip("-")[:TEXTURE_NAME_LETTERS] or "custom"

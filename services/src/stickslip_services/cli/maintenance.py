@@ -1,9 +1,6 @@
-"""Maintenance of a stopped coordinator's data: removing versions and unused files, and recovering a
-lost database.
-"""
+"""Commands that maintain a coordinator's data: remove versions and files, recover, and check."""
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
@@ -12,7 +9,8 @@ from click.exceptions import Exit
 from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.access.principals import acting_as, local_user
-from stickslip_services.cli.common import amount, say, shows_errors
+from stickslip_services.cli.common import amount, shows_errors
+from stickslip_services.cli.output import say, tell
 from stickslip_services.client.errors import ClientError
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
@@ -23,6 +21,8 @@ from stickslip_services.queue.control import scrub as scrubbed
 from stickslip_services.queue.upkeep import reindex as reindexed
 from stickslip_services.queue.upkeep import remove, unused
 from stickslip_services.settings import Settings, options
+
+BYTES_A_MEGABYTE = 1e6
 
 
 def keeps(command: Callable[..., None]) -> Callable[..., None]:
@@ -41,10 +41,13 @@ def _refuse_none(settings: Settings, role: Role) -> None:
 
 @contextmanager
 def _owned(settings: Settings) -> Iterator[tuple[Database, Store]]:
-    """Open the database and the store of a coordinator that is stopped, and keep others from
-    starting one.
+    """Open the database and the store of a coordinator that is stopped.
 
-    Raise DatabaseRefusedError if one runs.
+    Nobody can start one in the meantime.
+
+    Raises:
+        DatabaseRefusedError: A coordinator runs.
+        CommandError: A manifest in the store is damaged.
     """
     with locked(settings.data), acting_as(local_user()), opened(settings, Role.upkeep) as database:
         try:
@@ -67,10 +70,8 @@ def rm(settings: Settings, version: str) -> None:
     _refuse_none(settings, Role.upkeep)
     with _owned(settings) as (database, files):
         jobs, tasks = remove(database, files, parts[1], int(parts[2]))
-    click.echo(
-        f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs"
-    )
-    click.echo("to free the space: stickslip gc --delete --older-than 0")
+    tell(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
+    tell("to free the space: stickslip gc --delete --older-than 0")
 
 
 @click.command()
@@ -85,16 +86,19 @@ def rm(settings: Settings, version: str) -> None:
 @keeps
 def gc(settings: Settings, older_than: float, delete: bool) -> None:
     """Find the files of the store that nothing refers to, and delete them with --delete."""
-    count = size = 0
+    count = 0
+    total_bytes = 0
     _refuse_none(settings, Role.upkeep)
     with _owned(settings) as (database, files):
         for file in unused(database, files, older_than=3600 * older_than):
             count += 1
-            size += file.bytes
+            total_bytes += file.bytes
             if delete:
                 files.delete(file.name)
-    done = "were deleted" if delete else "may be deleted: add --delete"
-    click.echo(f"{count} files, {size / 1e6:,.1f} MB, that nothing refers to {done}")
+    outcome = "were deleted" if delete else "may be deleted: add --delete"
+    tell(
+        f"{count} files, {total_bytes / BYTES_A_MEGABYTE:,.1f} MB, that nothing refers to {outcome}"
+    )
 
 
 @click.command()
@@ -104,21 +108,25 @@ def reindex(settings: Settings) -> None:
 
     Known datasets stay as they are.
     """
-    counts = Counter[str]()
+    added = 0
+    known = 0
+    faulty = 0
     with _owned(settings) as (database, files):
-        for found in reindexed(database, files):
-            if found.fault:
-                say(f"left out: {found.name}: {found.fault}")
-            elif found.is_new:
-                click.echo(f"{found.name}  {found.samples} samples")
-            counts["bad" if found.fault else "new" if found.is_new else "known"] += 1
+        for version in reindexed(database, files):
+            if version.fault:
+                faulty += 1
+                say(f"left out: {version.name}: {version.fault}")
+            elif version.is_new:
+                added += 1
+                tell(f"{version.name}  {version.samples} samples")
+            else:
+                known += 1
+    say(f"{added} versions found again, {known} known before, {faulty} left out")
     say(
-        f"{counts['new']} versions found again, {counts['known']} known before, {counts['bad']} left out"
+        "certificates are not found again: run `stickslip register` with each of them, or "
+        "`stickslip certify`"
     )
-    say(
-        "certificates are not found again: run `stickslip register` with each of them, or `stickslip certify`"
-    )
-    raise Exit(1 if counts["bad"] else 0)
+    raise Exit(1 if faulty else 0)
 
 
 @click.command()
@@ -136,17 +144,21 @@ def scrub(settings: Settings, rate: float) -> None:
     Workers recompute damaged files. With STICKSLIP_SIGNING_KEY, versions without a good signature
     are signed again. Versions that were read longest ago come first, also after a stop.
     """
-    count = bad = 0
+    count = 0
+    damaged_count = 0
     _refuse_none(settings, Role.visitor)
     with acting_as(local_user()), closing(Context.open(settings, role=Role.visitor)) as context:
         began = context.clock()
-        while (found := scrubbed(context, before=began, rate=1e6 * rate)) is not None:
-            version, damaged = found
-            count, bad = count + 1, bad + bool(damaged)
-            for path in damaged:
-                click.echo(f"{version}  {path}")
-    say(
-        f"{count} versions read, {bad} damaged"
-        + (": a service with workers recomputes their files" if bad else "")
-    )
-    raise Exit(1 if bad else 0)
+        while True:
+            # One version at a time, so that a stop loses little.
+            checked = scrubbed(context, before=began, rate=BYTES_A_MEGABYTE * rate)
+            if checked is None:
+                break
+            version, damaged_paths = checked
+            count += 1
+            damaged_count += bool(damaged_paths)
+            for path in damaged_paths:
+                tell(f"{version}  {path}")
+    repair = ": a service with workers recomputes their files" if damaged_count else ""
+    say(f"{count} versions read, {damaged_count} damaged{repair}")
+    raise Exit(1 if damaged_count else 0)

@@ -1,44 +1,27 @@
-"""Spec and scene files, YAML or JSON, and the commands for scenes: check, preview and simulate one."""
+"""Commands for scenes: check, preview and simulate one."""
 
-import json
-import math
-import re
-from collections.abc import Iterator
-from itertools import count
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
-import yaml
 from click.exceptions import Exit
-from pydantic import ValidationError
-from stickslip_schemas.documents.problems import field_errors
+from pydantic import JsonValue
 from stickslip_schemas.format.manifest import layout
-from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
-from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
-from stickslip_schemas.scene.library import load_scene, parse_yaml
+from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
-from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.names import MATERIAL_NAME
 
-from stickslip_services.cli.common import (
-    FILE,
-    field_line,
-    json_option,
-    print_table,
-    say,
-    shows_errors,
-)
-from stickslip_services.client.errors import ClientError
-from stickslip_services.errors import CommandError
+from stickslip_services.cli.common import FILE, CommandGroup, json_option, shows_errors
+from stickslip_services.cli.documents import find_scene
+from stickslip_services.cli.output import print_json, print_table, say, tell
 from stickslip_services.local import making
 from stickslip_services.units import size
 
-SCENE_SUFFIXES = (".yaml", ".yml", ".json")
-"""Of a `scene` that is a file; other names are those of built-in scenes."""
-MAX_VALUES = 10_000_000
-"""Of a file."""
+CERTIFICATES = Path("certificates")
+"""Folder that `stickslip certify` writes to, unless it is told another."""
+SAMPLE_FRAMES = 30
+"""Most frames of a sample that is simulated or checked."""
 
 scene_argument = click.argument(
     "scene", help="a scene, YAML or JSON, or the name of a built-in one"
@@ -50,6 +33,7 @@ scene_argument = click.argument(
 @click.argument("out", metavar="DIR", type=FILE, help="a new directory for the trajectories")
 @click.option(
     "--certificate",
+    "certificate_folder",
     metavar="DIR",
     type=FILE,
     help="what `stickslip certify` wrote (certificates/PRESET, if it is there)",
@@ -65,34 +49,36 @@ scene_argument = click.argument(
 def simulate(
     scene: str,
     out: Path,
-    certificate: Path | None,
+    certificate_folder: Path | None,
     allow_uncertified: bool,
     obj: bool,
     as_json: bool,
 ) -> None:
-    """Simulate one sample of a scene on this machine, by the stages of the queue, with its default
-    parameters.
+    """Simulate one sample of a scene on this machine, with its default parameters.
 
-    Writes trajectory.npz and scene.json; exits with 1 if the sample is not valid. No coordinator is
-    needed.
+    It runs the stages of the queue. Writes trajectory.npz and scene.json; exits with 1 if the
+    sample is not valid. No coordinator is needed.
     """
-    given, files = _scene(scene)
-    usual = Path("certificates") / given.preset.value
-    directory = certificate or (usual if usual.is_dir() else None)
-    found = None if directory is None else making.read_certificate(directory)
-    spec = spec_of(given, allow_uncertified=allow_uncertified)
-    result = making.simulate(spec, files, out, certificate=found, obj=obj)
+    document, files = find_scene(scene)
+    usual_folder = CERTIFICATES / document.preset.value
+    if certificate_folder is None and usual_folder.is_dir():
+        certificate_folder = usual_folder
+    certificate = None
+    if certificate_folder is not None:
+        certificate = making.read_certificate(certificate_folder)
+    spec = spec_of(document, allow_uncertified=allow_uncertified)
+    result = making.simulate(spec, files, out, certificate=certificate, obj=obj)
     if as_json:
-        click.echo(json.dumps(result, indent=2))
+        print_json(result)
     else:
-        click.echo(f"{spec.instants} frames of {len(given.sheets)} sheets: {out}")
+        tell(f"{spec.instants} frames of {len(document.sheets)} sheets: {out}")
         say("certified" if result["certified"] else f"NOT certified: {result['why_not_certified']}")
         if not result["valid"]:
             say(f"NOT valid: {result['reason']}")
     raise Exit(0 if result["valid"] else 1)
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def scene() -> None:
     """Check and preview scenes."""
 
@@ -106,59 +92,74 @@ def check(scene: str, as_json: bool) -> None:
 
     List its axes, the arrays of a dataset of it, and costs.
     """
-    given, files = _scene(scene)
-    spec = spec_of(given)
-    arrays: list[dict[str, Any]] = [
-        {
-            "name": each.name,
-            "dtype": each.dtype,
-            "shape": list(each.shape),
-            "description": each.description,
-        }
-        for each in layout(spec)
-    ]
-    axes: dict[str, dict[str, Any]] = {
-        name: {
-            "default": given.default(name),
+    document, files = find_scene(scene)
+    spec = spec_of(document)
+    if as_json:
+        print_json(
+            {
+                "scene": document.name,
+                "digest": document.digest,
+                "axes": _axes(document),
+                "arrays": _arrays(spec),
+                "cost": _cost(document, spec, files),
+            }
+        )
+        return
+    axis_rows = []
+    for name, parameter in document.parameters.items():
+        axis_rows.append((name, str(document.default(name)), str(parameter.range)))
+    print_table(("axis", "default", "values"), axis_rows, sentences=True)
+    array_rows = []
+    for array in layout(spec):
+        shape = " x ".join(str(extent) for extent in array.shape) or "one number"
+        array_rows.append((array.name, str(array.dtype), shape, array.description))
+    print_table(("array", "type", "shape", "meaning"), array_rows, sentences=True)
+    cost = _cost(document, spec, files)
+    least, most = cost["cpu_seconds_a_sample"]
+    say(
+        f"{cost['vertices']} vertices, {cost['frames']} frames. A sample has "
+        f"{size(cost['bytes_a_sample'])} before compression, and its simulation most likely takes "
+        f"{least:.2g} to {most:.2g} CPU s. Digest {document.digest}"
+    )
+
+
+def _axes(document: Scene) -> dict[str, JsonValue]:
+    axes: dict[str, JsonValue] = {}
+    for name, parameter in document.parameters.items():
+        axes[name] = {
+            "default": document.default(name),
             "values": parameter.range,
             "unit": parameter.unit,
             "sets": list(parameter.sets),
             "description": parameter.description,
         }
-        for name, parameter in given.parameters.items()
+    return axes
+
+
+def _arrays(spec: ClothSceneSpec) -> list[JsonValue]:
+    arrays: list[JsonValue] = []
+    for array in layout(spec):
+        arrays.append(
+            {
+                "name": array.name,
+                "dtype": array.dtype,
+                "shape": list(array.shape),
+                "description": array.description,
+            }
+        )
+    return arrays
+
+
+def _cost(document: Scene, spec: ClothSceneSpec, files: Mapping[str, bytes]) -> dict[str, Any]:
+    """Return the size of a sample, and an interval of the CPU time that it takes."""
+    costs = spec.usual_costs
+    return {
+        "vertices": sum(sheet.mesh.shape[0] for sheet in document.sheets.values()),
+        "frames": document.frames,
+        "cpu_seconds_a_sample": [costs.simulate / costs.unsure, costs.simulate * costs.unsure],
+        "bytes_a_sample": sum(array.sample_bytes for array in layout(spec)),
+        "files_bytes": sum(len(data) for data in files.values()),
     }
-    usual = spec.usual_costs
-    said: dict[str, Any] = {
-        "scene": given.name,
-        "digest": given.digest,
-        "axes": axes,
-        "arrays": arrays,
-        "cost": {
-            "vertices": sum(sheet.mesh.shape[0] for sheet in given.sheets.values()),
-            "frames": given.frames,
-            "cpu_seconds_a_sample": [usual.simulate / usual.unsure, usual.simulate * usual.unsure],
-            "bytes_a_sample": sum(each.sample_bytes for each in layout(spec)),
-            "files_bytes": sum(map(len, files.values())),
-        },
-    }
-    if as_json:
-        return click.echo(json.dumps(said, indent=2))
-    print_table(
-        ("axis", "default", "values"),
-        ((n, str(a["default"]), a["values"]) for n, a in axes.items()),
-    )
-    rows = (
-        (each["name"], each["dtype"], str(tuple(each["shape"])), each["description"])
-        for each in arrays
-    )
-    print_table(("array", "type", "shape", "meaning"), rows, sentences=True)
-    cost = said["cost"]
-    least, most = cost["cpu_seconds_a_sample"]
-    say(
-        f"{cost['vertices']} vertices, {cost['frames']} frames. A sample has {size(cost['bytes_a_sample'])} before "
-        f"compression, and its simulation most likely takes {least:.2g} to {most:.2g} CPU s. Digest {given.digest}"
-    )
-    return None
 
 
 @scene.command()
@@ -171,165 +172,29 @@ def preview(scene: str, out: Path, as_json: bool) -> None:
 
     Writes CAMERA.png and motion.webp. No coordinator is needed, but the environment of Blender is.
     """
-    pictures = making.preview(*_scene(scene), out)
+    document, files = find_scene(scene)
+    pictures = making.preview(document, files, out)
     if as_json:
-        click.echo(json.dumps({"pictures": pictures}))
+        print_json({"pictures": list(pictures)})
     else:
         say(f"{', '.join(pictures)} in {out}")
 
 
-def _scene(name: str) -> tuple[Scene, dict[str, bytes]]:
-    """Return a built-in scene, or that of a file, and the files that it names by digest."""
-    if Path(name).exists():
-        return read_scene(Path(name))
-    try:
-        return load_scene(name), {}
-    except ValueError as error:
-        raise ClientError(f"scene {error}, in a file; it is {name!r}") from None
-
-
 def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
-    """Return the spec of one sample of a scene: its default parameters, seen by its first camera."""
+    """Return the spec of one sample of a scene: default parameters, seen by its first camera."""
     cameras = scene.looks.cameras
-    rig = [camera.name for camera in load_rig(cameras)] if isinstance(cameras, str) else FRAMING
-    spec = job_spec_adapter.validate_python(
+    if isinstance(cameras, dict):
+        viewpoints = list(cameras)
+    elif isinstance(cameras, str):
+        viewpoints = [camera.name for camera in load_rig(cameras)]
+    else:
+        viewpoints = list(FRAMING)
+    return ClothSceneSpec.model_validate(
         {
             "kind": "cloth_scene",
             "scene": scene.model_dump(mode="json"),
-            "frames": min(30, scene.frames),
+            "frames": min(SAMPLE_FRAMES, scene.frames),
             "allow_uncertified": allow_uncertified,
-            "axes": {
-                "texture": "checker",
-                "viewpoint": next(iter(cameras if isinstance(cameras, dict) else rig)),
-            },
+            "axes": {"texture": "checker", "viewpoint": viewpoints[0]},
         }
     )
-    assert isinstance(spec, ClothSceneSpec)
-    return spec
-
-
-def read_spec(path: Path) -> dict[str, Any]:
-    """Return the document of a spec file, which may break rules of specs.
-
-    Raise CommandError if it is no document.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise CommandError(f"there is no file {path}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise CommandError(f"{path} cannot be read: {error}") from error
-    try:
-        document = json.loads(text) if path.suffix == ".json" else parse_yaml(text)
-    except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise CommandError(
-            f"{path} is not {'JSON' if path.suffix == '.json' else 'YAML'}: {error}"
-        ) from error
-    if not isinstance(document, dict):
-        raise CommandError(
-            f"{path} must hold a mapping (key: value), and it holds {document!r:.100}"
-        )
-    try:
-        _check(document, "", path, count())
-    except RecursionError as error:
-        raise CommandError(
-            f"{path} must not nest so deeply: does an alias name what it is in?"
-        ) from error
-    return document
-
-
-def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return the document of a spec file, and the files by digest that its scene names.
-
-    A scene that is a file, or that names files, becomes a document with references by digest.
-
-    Raises CommandError where it is no document, or the scene breaks a rule.
-    """
-    document = read_spec(path)
-    scene = document.get("scene")
-    if isinstance(scene, dict):
-        made, files = _inlined(scene, path)
-    elif isinstance(scene, str) and Path(scene).suffix in SCENE_SUFFIXES:
-        made, files = read_scene(path.parent / scene)
-    else:
-        return document, {}
-    return document | {"scene": made.model_dump(mode="json")}, files
-
-
-def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
-    """Return the scene of a file, with references by digest, and its files by digest; raise
-    CommandError.
-    """
-    name = path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
-    return _inlined({"name": name, **read_spec(path)}, path)
-
-
-def _inlined(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
-    if (length := len(json.dumps(document))) > MAX_DOCUMENT_BYTES:
-        raise CommandError(
-            f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has {length}"
-        )
-    try:
-        scene = Scene.model_validate(document)
-    except ValidationError as error:
-        raise _not_valid(error, document, Scene, path) from error
-
-    if not any(scene.files()):
-        return scene, {}
-    from stickslip_schemas.scene.files import (
-        UnfitFileError,
-        frames_of,
-        inlined,
-    )  # needs the extra `arrays`
-
-    def read(name: str) -> bytes:
-        place = (path.parent / name).resolve()
-        if not place.is_relative_to(path.parent.resolve()):
-            raise UnfitFileError("must be in the folder of the scene, and a link leads out of it")
-        return (
-            frames_of(sorted(place.glob("*.obj")), scene, name)
-            if place.is_dir()
-            else place.read_bytes()
-        )
-
-    try:
-        return inlined(scene, read)
-    except UnfitFileError as error:
-        raise CommandError(f"{path} is not valid\n  {error}") from error
-
-
-def check_spec(document: dict[str, Any], path: Path) -> JobSpec:
-    """Return the spec of a document; raise CommandError with all fields that break a rule."""
-    try:
-        return job_spec_adapter.validate_python(document)
-    except ValidationError as error:
-        raise _not_valid(error, document, AnyJobSpec, path) from error
-
-
-def _not_valid(
-    error: ValidationError, document: dict[str, Any], model: Any, path: Path
-) -> CommandError:
-    lines = [field_line(field) for field in field_errors(error, document, model)]
-    return CommandError("\n".join([f"{path} is not valid", *lines]))
-
-
-def _check(value: Any, place: str, path: Path, values: Iterator[int]) -> None:
-    """Raise CommandError for values that JSON cannot hold, and for aliases that make too many of
-    them.
-    """
-    if next(values) > MAX_VALUES:
-        raise CommandError(
-            f"{path} must hold at most {MAX_VALUES} values, with aliases written out"
-        )
-    if isinstance(value, dict):
-        for key, item in value.items():
-            _check(item, f"{place}.{key}" if place else str(key), path, values)
-    elif isinstance(value, list):
-        for position, item in enumerate(value):
-            _check(item, f"{place}.{position}", path, values)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise CommandError(f"{path}: {place} must be a finite number, and it is {value}")
-    elif value is not None and not isinstance(value, str | int | float | bool):
-        raise CommandError(
-            f"{path}: {place} must be a number, a word, a list or a mapping, and it is {value!r}"
-        )

@@ -5,14 +5,25 @@ from pathlib import Path
 
 import click
 from click.exceptions import Exit
+from stickslip_schemas.documents.responses import CertificateEntry, WorkerEntry
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET
 from stickslip_schemas.spec.jobs import PresetName
 
-from stickslip_services.cli.common import FILE, asks, json_option, print_json, print_table
+from stickslip_services.cli.common import FILE, asks, json_option
+from stickslip_services.cli.output import Cell, Styled, print_json, print_table, tell
+from stickslip_services.client.answers import printable
 from stickslip_services.client.errors import UnreachableError
 from stickslip_services.client.http import Client
 from stickslip_services.local import making
 from stickslip_services.units import duration
+
+PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
+DIGEST_LETTERS = 16
+"""Letters of a certificate's digest that a table shows."""
+BUILD_LETTERS = 12
+"""Letters of a build that a table shows."""
+REGISTER_PATIENCE_SECONDS = 1.0
+"""How long a coordinator is waited for after a measurement [s]: it may well not run."""
 
 
 @click.command()
@@ -20,23 +31,28 @@ from stickslip_services.units import duration
 @asks
 def workers(client: Client, as_json: bool) -> None:
     """List the registered workers, newest first."""
-    found = client.workers()
+    entries = client.workers()
     if as_json:
-        return print_json(found)
-    rows, now = [], datetime.now(UTC)
-    for worker in found:
-        ago = f"{duration(max(0.0, (now - worker.last_seen_at).total_seconds()))} ago"
-        seen = ago if worker.alive else click.style(f"{ago}: not connected", fg="red")
-        numbers = str(worker.condition.slots), str(worker.leased)
-        rows.append((worker.name, worker.condition.state, *numbers, seen, ", ".join(worker.builds)))
+        print_json(entries)
+        return
+    rows = [_worker_row(worker) for worker in entries]
     print_table(("worker", "state", "slots", "tasks", "last seen", "kinds"), rows)
-    for worker in found:
+    for worker in entries:
         if worker.condition.reason:
-            click.echo(f"{worker.name}: {worker.condition.reason}")
-    return None
+            tell(printable(f"{worker.name}: {worker.condition.reason}"))
 
 
-PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
+def _worker_row(worker: WorkerEntry) -> tuple[Cell, ...]:
+    silence = max(0.0, (datetime.now(UTC) - worker.last_seen_at).total_seconds())
+    last_seen = f"{duration(silence)} ago"
+    return (
+        worker.name,
+        str(worker.condition.state),
+        str(worker.condition.slots),
+        str(worker.leased),
+        last_seen if worker.alive else Styled(f"{last_seen}: not connected", "red"),
+        ", ".join(worker.builds),
+    )
 
 
 @click.command()
@@ -49,32 +65,28 @@ PRESETS = (ROD_PRESET, *(preset.value for preset in PresetName))
 )
 @asks
 def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
-    """Measure a preset on the physical protocols, and register the certificate with the
-    coordinator.
+    """Measure a preset on the physical protocols, and register the certificate.
 
     A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this
     build and preset only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     directory = out or Path("certificates") / preset
     certificate = making.measure(preset, directory, quick=quick)
-    written = directory / making.DOCUMENT_NAME
+    file = directory / making.DOCUMENT_NAME
     if quick:
         passed = "All" if certificate.passed else "NOT all"
-        click.echo(
-            f"{passed} of the few points that were measured are within the tolerances: {written}"
-        )
-        click.echo(
-            f"A quick run does not count. To certify the preset: stickslip certify --preset {preset}"
+        tell(f"{passed} of the few points that were measured are within the tolerances: {file}")
+        tell(
+            "A quick run does not count. To certify the preset: "
+            f"stickslip certify --preset {preset}"
         )
     else:
-        click.echo(
-            f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {written}"
-        )
-    client.patience = 1.0
+        tell(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {file}")
+    client.patience = REGISTER_PATIENCE_SECONDS
     try:
         _register(client, directory)
     except UnreachableError:
-        click.echo(f"no coordinator answers at {client.url}; later: stickslip register {directory}")
+        tell(f"no coordinator answers at {client.url}; later: stickslip register {directory}")
     raise Exit(0 if certificate.passed else 1)
 
 
@@ -88,28 +100,31 @@ def register(client: Client, directory: Path) -> None:
 
 def _register(client: Client, directory: Path) -> None:
     entry = client.register(making.read_certificate(directory))
-    click.echo(
-        f"certificate {entry.digest} is registered: {client.url}/certificates/{entry.digest}"
-    )
+    tell(f"certificate {entry.digest} is registered: {client.url}/certificates/{entry.digest}")
 
 
 @click.command()
 @json_option
 @asks
 def certificates(client: Client, as_json: bool) -> None:
-    """List certificates, newest first, and compare their builds with those of the connected
-    workers.
-    """
-    found = list(client.certificates())
+    """List certificates, newest first, and whether they are of the connected workers' builds."""
+    entries = list(client.certificates())
     if as_json:
-        return print_json(found)
-    builds = {own.sim_core for worker in client.workers() for own in worker.builds.values()}
-    rows = []
-    for entry in found:
-        verdict = (
-            click.style("passed", fg="green") if entry.passed else click.style("failed", fg="red")
-        )
-        build = "this" if entry.sim_core in builds else f"another ({entry.sim_core[:12]})"
-        made = f"{entry.created_at:%Y-%m-%d %H:%M} UTC"
-        rows.append((entry.digest[:16], entry.preset, verdict, build, entry.extent, made))
-    return print_table(("certificate", "preset", "verdict", "build", "extent", "made"), rows)
+        print_json(entries)
+        return
+    builds: set[str] = set()
+    for worker in client.workers():
+        builds.update(build.sim_core for build in worker.builds.values())
+    rows = [_certificate_row(entry, entry.sim_core in builds) for entry in entries]
+    print_table(("certificate", "preset", "verdict", "build", "extent", "made"), rows)
+
+
+def _certificate_row(entry: CertificateEntry, is_of_workers: bool) -> tuple[Cell, ...]:
+    return (
+        entry.digest[:DIGEST_LETTERS],
+        entry.preset,
+        Styled("passed", "green") if entry.passed else Styled("failed", "red"),
+        "this" if is_of_workers else f"another ({entry.sim_core[:BUILD_LETTERS]})",
+        entry.extent,
+        f"{entry.created_at:%Y-%m-%d %H:%M} UTC",
+    )

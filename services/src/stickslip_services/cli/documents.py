@@ -1,0 +1,266 @@
+"""Spec and scene files, YAML or JSON, with the files that a scene names."""
+
+import datetime
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+from stickslip_schemas.documents.problems import field_errors
+from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
+from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
+from stickslip_schemas.scene.library import load_scene, parse_yaml
+from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.names import MATERIAL_NAME
+
+from stickslip_services.cli.common import field_line
+from stickslip_services.client.errors import ClientError
+from stickslip_services.errors import CommandError
+
+SCENE_SUFFIXES = (".yaml", ".yml", ".json")
+"""Of a `scene` that is a file; other names are those of built-in scenes."""
+MAX_VALUES = 1_000_000
+"""Most values of a document, with aliases written out."""
+MAX_FILE_BYTES = 16 * 2**20
+"""Largest spec file [bytes]: the coordinator takes no larger request."""
+VALUE_LETTERS = 100
+"""Most letters of a value that a message repeats."""
+
+_MAGIC = {
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"PK\x03\x04": "a ZIP or NPZ file",
+    b"%PDF": "a PDF file",
+}
+"""First bytes of files that people name by mistake."""
+
+
+def read_spec(path: Path) -> dict[str, Any]:
+    """Return the document of a spec file, which may break rules of specs.
+
+    Raises:
+        CommandError: The file cannot be read, or holds no document.
+    """
+    text = _read_text(path)
+    syntax = "JSON" if path.suffix == ".json" else "YAML"
+    try:
+        document = json.loads(text) if syntax == "JSON" else parse_yaml(text)
+    except RecursionError as error:
+        raise CommandError(f"{path} must not nest its values so deeply") from error
+    except json.JSONDecodeError as error:
+        line = f"line {error.lineno}, column {error.colno}"
+        raise CommandError(f"{path} is not JSON: {error.msg}, {line}") from error
+    except yaml.MarkedYAMLError as error:
+        raise CommandError(f"{path} is not YAML: {_yaml_problem(error)}") from error
+    except (ValueError, yaml.YAMLError) as error:
+        raise CommandError(f"{path} is not {syntax}: {error}") from error
+    if document is None:
+        raise CommandError(f"{path} is empty: it must hold a mapping (key: value)")
+    if not isinstance(document, dict):
+        raise CommandError(
+            f"{path} must hold a mapping (key: value), and it holds {_value_words(document)}"
+        )
+    _check_size(document, path)
+    _check_values(document, "", path)
+    return document
+
+
+def _read_text(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise CommandError(f"there is no file {path}") from error
+    except OSError as error:
+        raise CommandError(f"{path} cannot be read: {error.strerror}") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise CommandError(
+            f"{path} must have at most {MAX_FILE_BYTES} bytes, and it has {len(data)}"
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        kinds = [kind for magic, kind in _MAGIC.items() if data.startswith(magic)]
+        other = f", and it is {kinds[0]}" if kinds else f"; byte {error.start} is not UTF-8"
+        raise CommandError(
+            f"{path} cannot be read: it must be YAML or JSON, text in UTF-8{other}"
+        ) from error
+
+
+def _yaml_problem(error: yaml.MarkedYAMLError) -> str:
+    """Return the fault and its position, without the excerpt that the library adds."""
+    mark = error.problem_mark
+    position = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+    return f"{error.problem or error.context}{position}"
+
+
+def _value_words(value: object) -> str:
+    """Return a value of a document as people write it, and never as Python does."""
+    if isinstance(value, datetime.date):
+        return f"the date {value.isoformat()}: write it in quotes to have a word"
+    if isinstance(value, bytes):
+        return "binary data"
+    if isinstance(value, set | frozenset):
+        return "a set"
+    text = json.dumps(value, default=lambda item: type(item).__name__)
+    return text if len(text) <= VALUE_LETTERS else f"{text[:VALUE_LETTERS]}..."
+
+
+def _check_size(document: dict[str, Any], path: Path) -> None:
+    """Raise CommandError for a document of too many values, or one that contains itself.
+
+    Aliases of YAML name one value many times. Each value is counted once and remembered, so that a
+    file of 400 bytes with aliases of aliases is refused at once.
+    """
+    counts: dict[int, int] = {}
+    open_values: set[int] = set()
+
+    def count_values(value: object) -> int:
+        if isinstance(value, dict):
+            items = list(value.values())
+        elif isinstance(value, list):
+            items = value
+        else:
+            return 1
+        identity = id(value)
+        if identity in open_values:
+            raise CommandError(f"{path} must not nest so deeply: does an alias name what it is in?")
+        if identity not in counts:
+            open_values.add(identity)
+            counts[identity] = 1 + sum(count_values(item) for item in items)
+            open_values.remove(identity)
+        return counts[identity]
+
+    try:
+        total = count_values(document)
+    except RecursionError as error:
+        raise CommandError(f"{path} must not nest its values so deeply") from error
+    if total > MAX_VALUES:
+        raise CommandError(
+            f"{path} must hold at most {MAX_VALUES} values, with aliases written out, and it holds "
+            f"{total}"
+        )
+
+
+def _check_values(value: object, field: str, path: Path) -> None:
+    """Raise CommandError for values that JSON cannot hold."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_values(item, f"{field}.{key}" if field else str(key), path)
+    elif isinstance(value, list):
+        for position, item in enumerate(value):
+            _check_values(item, f"{field}.{position}", path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise CommandError(f"{path}: {field} must be a finite number, and it is {value}")
+    elif value is not None and not isinstance(value, str | int | float | bool):
+        raise CommandError(
+            f"{path}: {field} must be a number, a word, a list or a mapping, and it is "
+            f"{_value_words(value)}"
+        )
+
+
+def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Return the document of a spec file, and the files by digest that its scene names.
+
+    A scene that is a file, or that names files, becomes a document with references by digest.
+
+    Raises:
+        CommandError: The file holds no document, or its scene breaks a rule.
+    """
+    document = read_spec(path)
+    stated = document.get("scene")
+    if isinstance(stated, dict):
+        scene, files = _inline_files(stated, path)
+    elif isinstance(stated, str) and Path(stated).suffix in SCENE_SUFFIXES:
+        scene, files = read_scene(path.parent / stated)
+    else:
+        return document, {}
+    return document | {"scene": scene.model_dump(mode="json")}, files
+
+
+def find_scene(name: str) -> tuple[Scene, dict[str, bytes]]:
+    """Return a scene with its files by digest; `name` is a file or a built-in scene.
+
+    Raises:
+        CommandError: The file does not exist, or breaks a rule.
+        ClientError: There is no built-in scene of this name.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix in SCENE_SUFFIXES or "/" in name:
+        return read_scene(path)
+    try:
+        return load_scene(name), {}
+    except ValueError as error:
+        raise ClientError(f"scene {error}, in a file; it is {name!r}") from None
+
+
+def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
+    """Return the scene of a file, with references by digest, and its files by digest.
+
+    Raises:
+        CommandError: The file holds no document, or the scene breaks a rule.
+    """
+    name = path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
+    return _inline_files({"name": name, **read_spec(path)}, path)
+
+
+def _inline_files(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
+    """Return a scene with references by digest in place of names of files, and these files."""
+    length = len(json.dumps(document))
+    if length > MAX_DOCUMENT_BYTES:
+        raise CommandError(
+            f"{path} must be a scene of at most {MAX_DOCUMENT_BYTES} bytes as JSON, and has "
+            f"{length}"
+        )
+    try:
+        scene = Scene.model_validate(document)
+    except ValidationError as error:
+        raise _not_valid(error, document, Scene, path) from error
+    if not any(scene.files()):
+        return scene, {}
+
+    # This module needs the extra `arrays`, which a scene without files does not.
+    from stickslip_schemas.scene.files import UnfitFileError, frames_of, inlined
+
+    folder = path.parent.resolve()
+
+    def read(name: str) -> bytes:
+        file = (path.parent / name).resolve()
+        if not file.is_relative_to(folder):
+            raise UnfitFileError("must be in the folder of the scene, and a link leads out of it")
+        if file.is_dir():
+            return frames_of(sorted(file.glob("*.obj"), key=_frame_order), scene, name)
+        return file.read_bytes()
+
+    try:
+        return inlined(scene, read)
+    except UnfitFileError as error:
+        raise CommandError(f"{path} is not valid\n  {error}") from error
+
+
+def _frame_order(file: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts `frame_2` before `frame_10`: numbers in a name count as numbers."""
+    pieces = re.split(r"(\d+)", file.name)
+    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in pieces]
+
+
+def check_spec(document: Mapping[str, Any], path: Path) -> JobSpec:
+    """Return the spec of a document.
+
+    Raises:
+        CommandError: It breaks rules; the message has all of them.
+    """
+    try:
+        return job_spec_adapter.validate_python(document)
+    except ValidationError as error:
+        raise _not_valid(error, document, AnyJobSpec, path) from error
+
+
+def _not_valid(
+    error: ValidationError, document: Mapping[str, Any], model: object, path: Path
+) -> CommandError:
+    lines = [field_line(field) for field in field_errors(error, document, model)]
+    return CommandError("\n".join([f"{path} is not valid", *lines]))
