@@ -6,6 +6,7 @@ or a texture.
 
 import io
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path as LocalPath
@@ -16,13 +17,11 @@ import numpy.typing as npt
 
 from stickslip_schemas.base import ARTIFACT, sha256
 from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
+from stickslip_schemas.scene.errors import UnfitFileError as UnfitFileError
+from stickslip_schemas.scene.gate import MAX_FILE_BYTES, MAX_TRIANGLES, check_file
 from stickslip_schemas.scene.parameters import Path, at, with_values
 from stickslip_schemas.scene.parts import MeshBody
 
-MAX_FILE_BYTES = 16 * 2**20
-"""Of a file of a scene, and of the arrays of an NPZ file."""
-MAX_TRIANGLES = 2 * MAX_VERTICES
-"""Of one mesh."""
 FARTHEST = 100.0
 """Largest coordinate in a file [m]."""
 
@@ -39,10 +38,6 @@ _SKIN: _Shapes = {
     "bones": ("frame", "bone", 3, 4),
     **_MESH,
 }
-
-
-class UnfitFileError(ValueError):
-    """A file cannot be what a scene needs; the message has the rule, and what was found."""
 
 
 def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str, bytes]]:
@@ -146,7 +141,7 @@ def read_file(place: Path, data: bytes) -> Arrays:
     - a body: `triangles` (T, 3), `times` (F) [s] and `positions` (F, N, 3) [m] or, of a skin,
       `rest` (N, 3) [m], `weights` (N, B) and `bones` (F, B, 3, 4), x -> A x + b
     """
-    _check_size(data)
+    check_file(data)
     if place[-1] == "path":
         return _path(data)
     if place[0] == "bodies":
@@ -163,20 +158,15 @@ def _counts(place: Path, found: Arrays) -> tuple[int, int] | None:
     )
 
 
-def _check_size(data: bytes) -> None:
-    if len(data) > MAX_FILE_BYTES:
-        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
-
-
 def counts_of(data: bytes) -> tuple[int, int] | None:
     """Return the numbers of vertices and triangles of an OBJ file; None of an NPZ or CSV file.
 
     Raise UnfitFileError.
     """
-    _check_size(data)
+    check_file(data)
     if data.startswith(b"PK"):
-        _names(data)
-    elif data.startswith(b"time"):
+        return None
+    if data.startswith(b"time"):
         _path(data)
     else:
         vertices, triangles, _ = read_obj(data)
@@ -287,7 +277,7 @@ def _arrays(data: bytes, shapes: _Shapes) -> Arrays:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             found = {name: file[name] for name in shapes}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+    except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise UnfitFileError(f"must be an NPZ file of plain arrays: {error}") from error
     sides: dict[Any, int] = {3: 3, 4: 4}
     for name, values in found.items():

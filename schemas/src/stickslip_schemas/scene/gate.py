@@ -1,0 +1,227 @@
+"""The gate for files of scenes: what a file says of itself, before anything in it is decoded.
+
+A small file can ask for much: 400 bytes of NPZ declare an array of 80 GB, and a mesh of two million
+faces takes a parser 20 s. So counts, shapes and sizes are read from headers and from the structure
+of lines, in one pass with constant memory, and a file beyond the limits is refused.
+"""
+
+import ast
+import io
+import re
+import struct
+import zipfile
+import zlib
+from math import prod
+
+from stickslip_schemas.scene.document import MAX_VERTICES
+from stickslip_schemas.scene.errors import UnfitFileError
+
+MAX_FILE_BYTES = 16 * 2**20
+"""Largest file of a scene, and largest sum of the arrays of an NPZ file [bytes]."""
+
+MAX_TRIANGLES = 2 * MAX_VERTICES
+"""Triangles of one mesh: a closed surface has about two for each vertex."""
+
+MAX_LINES = 1_000_000
+"""Lines of a text file: a mesh at its limits has 600,000, with texture coordinates and normals."""
+
+MAX_PATH_ROWS = 100_000
+"""Rows of a path: 100 s at 1 kHz."""
+
+MAX_FACE_BYTES = 64 * 2**10
+"""Longest face of an OBJ file [bytes]: 2,000 corners with texture coordinates and normals."""
+
+MAX_ARRAYS = 16
+"""Arrays of an NPZ file; a skin, which has the most, needs five."""
+
+MAX_DIRECTORY_BYTES = 8 * 2**10
+"""Largest directory of an NPZ file [bytes]: about 100 a member, and a comment."""
+
+MAX_HEADER_BYTES = 1024
+"""Longest header of an array of an NPZ file [bytes]; NumPy writes 118."""
+
+_ROLES = (
+    frozenset({"positions"}),
+    frozenset({"rest", "weights", "bones"}),
+    frozenset({"time", "move", "turn"}),
+)
+"""Arrays of which an NPZ file must have one set: a mesh or a start, a skin, a path."""
+
+_ZIP = b"PK"
+_END_OF_DIRECTORY = struct.Struct("<4s4H2LH")
+_MAX_COMMENT_BYTES = 2**16 - 1
+_ENCRYPTED = 0x1
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_NPY_MAGIC = b"\x93NUMPY"
+_NUMBER = re.compile(r"[<>|=][fiu](1|2|4|8)")
+
+_NEWLINES = (
+    b"\n",
+    b"\r",
+    b"\x0b",
+    b"\x0c",
+    b"\x1c",
+    b"\x1d",
+    b"\x1e",
+    b"\xc2\x85",
+    b"\xe2\x80\xa8",
+)
+"""Everything at which `str.splitlines` begins a new line, in UTF-8."""
+
+_VERTEX = re.compile(rb"^[ \t]*v[ \t]", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t]*f[ \t]([^\r\n]*)", re.MULTILINE)
+
+
+def check_file(data: bytes) -> None:
+    """Raise UnfitFileError for a file that no scene can use, from its headers and line structure.
+
+    A file that passes may still have wrong contents, but reading it takes bounded time and memory.
+    """
+    if len(data) > MAX_FILE_BYTES:
+        raise UnfitFileError(f"must have at most {MAX_FILE_BYTES} bytes, and has {len(data)}")
+    if data.startswith(_ZIP):
+        _check_npz(data)
+        return
+    lines = sum(data.count(newline) for newline in _NEWLINES)
+    if lines > MAX_LINES:
+        raise UnfitFileError(f"must have at most {MAX_LINES} lines, and has {lines}")
+    if data.lstrip(b"\xef\xbb\xbf \t").startswith(b"time"):
+        if lines > MAX_PATH_ROWS + 1:
+            raise UnfitFileError(f"must have at most {MAX_PATH_ROWS} rows, and has {lines - 1}")
+    else:
+        _check_mesh(data)
+
+
+def _check_mesh(data: bytes) -> None:
+    """Count vertices and triangles of an OBJ file, up to their limits.
+
+    A face of n corners has n - 2 triangles. A backslash continues a line.
+    """
+    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    vertices = sum(1 for _ in _VERTEX.finditer(text))
+    if vertices > MAX_VERTICES:
+        raise UnfitFileError(f"must have at most {MAX_VERTICES} vertices, and has {vertices}")
+    triangles = 0
+    for face in _FACE.finditer(text):
+        corners = face[1]
+        if len(corners) > MAX_FACE_BYTES:
+            raise UnfitFileError(
+                f"a face must have at most {MAX_FACE_BYTES} bytes in its line, and one has "
+                f"{len(corners)}"
+            )
+        triangles += max(1, len(corners.split()) - 2)
+        if triangles > MAX_TRIANGLES:
+            raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has more")
+
+
+def _check_npz(data: bytes) -> None:
+    """Check the members of an NPZ file, and read each header, without decoding an array."""
+    try:
+        _check_directory(data)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            _check_members(members)
+            for member in members:
+                _check_array(archive, member)
+    except UnfitFileError:
+        raise
+    # A damaged archive fails in many ways: offsets before its beginning (ValueError), wrong
+    # checksums, streams that end early.
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, struct.error) as error:
+        raise UnfitFileError(f"must be an NPZ file: {error}") from error
+
+
+def _check_directory(data: bytes) -> None:
+    """Check the size of the directory, which `zipfile` reads as a whole.
+
+    ZIP64 has other fields, for archives beyond 4 GB or 65,535 members, and is refused.
+    """
+    tail = data[-(_END_OF_DIRECTORY.size + _MAX_COMMENT_BYTES) :]
+    position = tail.rfind(b"PK\x05\x06")
+    if position < 0 or position + _END_OF_DIRECTORY.size > len(tail):
+        raise UnfitFileError("must be an NPZ file, and its directory is missing")
+    _, _, _, _, count, size, _, _ = _END_OF_DIRECTORY.unpack_from(tail, position)
+    if count > MAX_ARRAYS:
+        raise UnfitFileError(f"must have at most {MAX_ARRAYS} arrays, and has {count}")
+    if size > MAX_DIRECTORY_BYTES:
+        raise UnfitFileError(
+            f"must have a directory of at most {MAX_DIRECTORY_BYTES} bytes, and it has {size}"
+        )
+
+
+def _check_members(members: list[zipfile.ZipInfo]) -> None:
+    """Check the names, sizes and compressions that the directory states."""
+    if len(members) > MAX_ARRAYS:
+        raise UnfitFileError(f"must have at most {MAX_ARRAYS} arrays, and has {len(members)}")
+    names = [member.filename for member in members]
+    arrays = {name.removesuffix(".npy") for name in names if name.endswith(".npy")}
+    if not any(role <= arrays for role in _ROLES):
+        listed = ", ".join(sorted(arrays))[:200] or "none"
+        raise UnfitFileError(
+            "must have the arrays of a mesh or a start (positions), of a skin (rest, weights, "
+            f"bones) or of a path (time, move, turn), and has {listed}"
+        )
+    if len(arrays) != len(names):
+        raise UnfitFileError("must have only arrays (.npy), each once")
+    for member in members:
+        if member.flag_bits & _ENCRYPTED:
+            raise UnfitFileError(f"must not be encrypted, and {member.filename} is")
+        if member.compress_type not in _COMPRESSIONS:
+            raise UnfitFileError(
+                "must be stored or compressed with deflate, as numpy.savez does, and "
+                f"{member.filename} has compression {member.compress_type}"
+            )
+    unpacked = sum(member.file_size for member in members)
+    if unpacked > MAX_FILE_BYTES:
+        raise UnfitFileError(
+            f"must have at most {MAX_FILE_BYTES} bytes when unpacked, and has {unpacked}"
+        )
+
+
+def _check_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+    """Check that the header of an array states numbers of a shape that fills the member exactly."""
+    name = member.filename.removesuffix(".npy")
+    with archive.open(member) as file:
+        magic = file.read(8)
+        if not magic.startswith(_NPY_MAGIC) or len(magic) < 8:
+            raise UnfitFileError(f"{name} must be an array in NumPy's format")
+        length_format = "<H" if magic[6] == 1 else "<L"
+        length_bytes = file.read(struct.calcsize(length_format))
+        (length,) = struct.unpack(length_format, length_bytes)
+        if length > MAX_HEADER_BYTES:
+            raise UnfitFileError(
+                f"{name} must have a header of at most {MAX_HEADER_BYTES} bytes, and it has {length}"
+            )
+        header = file.read(length)
+    item_bytes, shape = _read_header(name, header)
+    expected = len(magic) + len(length_bytes) + length + item_bytes * prod(shape)
+    if expected != member.file_size:
+        raise UnfitFileError(
+            f"{name} must have the {expected} bytes of its shape {shape}, and has "
+            f"{member.file_size}"
+        )
+
+
+def _read_header(name: str, header: bytes) -> tuple[int, tuple[int, ...]]:
+    """Return the bytes of a number, and the shape, of an array."""
+    try:
+        fields = ast.literal_eval(header.decode("latin-1").strip())
+    # A thousand brackets exhaust the parser of Python in one of these ways.
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+        raise UnfitFileError(f"{name} must have a header in NumPy's format") from error
+    is_complete = isinstance(fields, dict) and fields.keys() == {"descr", "fortran_order", "shape"}
+    if not is_complete or not isinstance(fields["fortran_order"], bool):
+        raise UnfitFileError(f"{name} must have a header in NumPy's format")
+    number = fields["descr"]
+    match = _NUMBER.fullmatch(number) if isinstance(number, str) else None
+    if match is None:
+        raise UnfitFileError(f"{name} must be numbers, and its type is {str(number)[:40]}")
+    shape = fields["shape"]
+    if not isinstance(shape, tuple) or not all(_is_side(side) for side in shape):
+        raise UnfitFileError(f"{name} must have a shape of whole numbers, and it is {shape!s:.60}")
+    return int(match[1]), shape
+
+
+def _is_side(side: object) -> bool:
+    """Return whether a value can be a side of a shape: True and False are ints in Python, too."""
+    return type(side) is int and 0 <= side <= MAX_FILE_BYTES
