@@ -17,7 +17,7 @@ from typing import Any
 
 import httpx
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import count, estimated
+from stickslip_schemas.plan.costs import count, estimate_cost
 from thesis_job import service
 
 
@@ -72,7 +72,7 @@ JOBS = [
 def measured(client: httpx.Client, document: dict[str, Any]) -> dict[str, Any]:
     """Run a job; return its cost by stage and the estimate of the package [s]."""
     spec = job_spec_adapter.validate_python(document)
-    usual = estimated(spec, count(spec), {}, 1)
+    usual = estimate_cost(spec, count(spec), {}, 1)
     load = os.getloadavg()[0]
     job = client.post("/v1/jobs", json=document).raise_for_status().json()["id"]
     while (state := client.get(f"/v1/jobs/{job}").json())["finished_at"] is None:

@@ -19,6 +19,7 @@ from stickslip_services.queue.eta import (
     Cost,
     StageTimings,
     limit_seconds,
+    read_costs,
 )
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
@@ -81,7 +82,7 @@ def test_leases_carry_the_limit_of_their_group(
         finish(worker, lease, 1.0)
     measured = worker.lease(render=4)
     for lease in measured:
-        finish(worker, lease, 5.0, call=40.0)
+        finish(worker, lease, 36.0, call=40.0)
     (lease,) = worker.lease(render=1)
     assert lease.limit_seconds == pytest.approx(120.0)
     worker.report((lease, failure(Reason.exec_timeout)))
@@ -101,6 +102,17 @@ def test_a_call_that_is_not_to_be_gone_by_is_not_counted(
     worker.report((lease, worker.result(lease.task).model_copy(update={"call_seconds": None})))
     with context.database.read() as connection:
         assert connection.execute(select(cost_groups)).all() == []
+
+
+def test_a_call_of_many_tasks_is_one_measurement(context: Context, worker: PretendWorker) -> None:
+    """The first batch of a service is slow, and must not stand for thousands of tasks."""
+    submit(context, gamma=(1.0, 2.0, 3.0, 4.0))
+    for lease in worker.lease(simulate=4):
+        finish(worker, lease, 0.4, call=1.6)  # four tasks of one call
+    with context.database.read() as connection:
+        (cost,) = (c for (stage, *_), c in read_costs(connection).items() if stage == "simulate")
+    assert cost.calls == pytest.approx(1.0)
+    assert not cost.is_known
 
 
 def test_quick_rejections_do_not_shorten_the_time_left(

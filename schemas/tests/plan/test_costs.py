@@ -1,19 +1,29 @@
-"""What a job costs: usual costs of the kinds, and what a service has measured in their place."""
+"""What a job costs: packaged costs of the kinds, and costs that a service has measured."""
 
 from typing import Any
 
 import pytest
 from stickslip_schemas.base import Stage
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import Estimate, Interval, count, estimated
+from stickslip_schemas.plan.costs import (
+    JOB_SECONDS,
+    Estimate,
+    Interval,
+    MachineSpeed,
+    count,
+    estimate_cost,
+)
 from stickslip_schemas.spec.names import Texture
 
 
 def estimate(
-    slots: int = 2, measured: dict[Stage, Interval] | None = None, **document: Any
+    slots: int = 2,
+    measured: dict[Stage, Interval] | None = None,
+    speed: MachineSpeed | None = None,
+    **document: Any,
 ) -> Estimate:
     spec = job_spec_adapter.validate_python(document)
-    return estimated(spec, count(spec), measured or {}, slots)
+    return estimate_cost(spec, count(spec), measured or {}, slots, speed)
 
 
 def rods(number: int, quality: str) -> dict[str, Any]:
@@ -45,7 +55,7 @@ def clips(*textures: str, mu: Any = 0.3, **more: Any) -> dict[str, Any]:
         (clips("dots", mesh=41), Stage.simulate, 31.0),
     ],
 )
-def test_usual_costs_fit_the_jobs_that_they_were_taken_from(
+def test_packaged_costs_fit_the_jobs_that_they_were_taken_from(
     document: Any, stage: Stage, cost: float
 ) -> None:
     """Not a check of accuracy: these jobs gave the numbers. It holds the units and the counts."""
@@ -63,8 +73,29 @@ def test_what_was_measured_replaces_what_is_usual() -> None:
         sum(stage.median for stage in costs.stages.values())
     )
     assert costs.wall_seconds is not None
-    assert costs.wall_seconds.high == pytest.approx(costs.cpu_seconds.high / 4)
+    # One simulation, one shading: the four slots cannot share them.
+    assert costs.wall_seconds.high == pytest.approx(costs.cpu_seconds.high + JOB_SECONDS)
     assert estimate(slots=0, **rods(2, "draft")).wall_seconds is None
+
+
+def test_packaged_costs_follow_the_speed_of_the_machine() -> None:
+    here = estimate(slots=2, **rods(1000, "draft"))
+    slow = estimate(slots=2, speed=MachineSpeed(cpu_speed=0.5), **rods(1000, "draft"))
+    half = estimate(slots=2, speed=MachineSpeed(cpu_available=0.5), **rods(1000, "draft"))
+    assert slow.cpu_seconds.median == pytest.approx(2 * here.cpu_seconds.median)
+    assert half.cpu_seconds == here.cpu_seconds
+    assert here.wall_seconds is not None
+    assert half.wall_seconds is not None
+    assert half.wall_seconds.median - JOB_SECONDS == pytest.approx(
+        2 * (here.wall_seconds.median - JOB_SECONDS)
+    )
+
+
+def test_a_measured_stage_does_not_follow_the_speed() -> None:
+    known = Interval(median=100.0, low=90.0, high=120.0)
+    speed = MachineSpeed(cpu_speed=0.1)
+    costs = estimate(measured={Stage.simulate: known}, speed=speed, **clips("dots"))
+    assert costs.stages[Stage.simulate] == known
 
 
 def test_textures_share_a_shading_and_nothing_is_rendered_without_views() -> None:

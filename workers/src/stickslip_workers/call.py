@@ -15,6 +15,9 @@ FRAMES_SECONDS = 2.0
 _held: dict[tuple[str, str], tuple[Any, Any]] = {}
 """What factories made in this process, with its builds."""
 
+_used: set[str] = set()
+"""Factories that have run tasks in this process."""
+
 
 def run(
     factory: str,
@@ -37,7 +40,12 @@ def run(
         made = getattr(importlib.import_module(module), name)(store)
         held = _held[factory, store] = made, made.describe()["builds"]
     inner, own_builds = held
-    yield {"node": ray.get_runtime_context().get_node_id(), "foreign": own_builds != builds}
+    # The first tasks of a process also import what their kind needs.
+    is_cold = bool(arguments) and factory not in _used
+    if arguments:
+        _used.add(factory)
+    node = ray.get_runtime_context().get_node_id()
+    yield {"node": node, "foreign": own_builds != builds, "cold": is_cold}
     if own_builds != builds:
         return
 

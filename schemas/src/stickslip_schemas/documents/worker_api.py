@@ -8,6 +8,7 @@ from stickslip_schemas.base import Bool, Document, Float, Int, Stage
 from stickslip_schemas.documents.tasks import Task, TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
 from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.costs import MachineSpeed
 
 MAX_SLOTS = 100_000
 """The most tasks that one dispatcher may run at once."""
@@ -20,6 +21,9 @@ class WorkerCondition(Document):
     slots: Int = Field(ge=0, le=MAX_SLOTS, description="number of tasks that run at once")
     reason: str = Field(
         default="", max_length=1000, description="why it is not ready, or what is wrong; for people"
+    )
+    speed: MachineSpeed = Field(
+        default_factory=MachineSpeed, description="scales what jobs cost where nothing was measured"
     )
 
 

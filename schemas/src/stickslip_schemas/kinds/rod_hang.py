@@ -114,9 +114,10 @@ class RodHangSpec(JobSpec):
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
 
     @property
-    def usual_costs(self) -> Costs:
+    def default_costs(self) -> Costs:
+        """CPU times of the packaged records."""
         view = {"preview": 0.016, "draft": 0.026, "standard": 0.055, "high": 0.18}[self.quality]
-        return Costs(simulate=0.005, render=4 * view)
+        return Costs(simulate=0.001, render=4 * view, renderer_start=0.3)
 
     def cameras(self) -> tuple[Camera, ...]:
         return () if self.views is None else load_rig(self.views)

@@ -1,9 +1,9 @@
-"""Numbers of samples and tasks of a spec, and what they cost.
+"""Numbers of samples and tasks of a spec, and the cost of a job.
 
 Costs are from tasks that a service has measured or, of other stages, from the records of the
-package. These were fitted to measured jobs of 1 to 768 samples on two shared virtual cores. Another
-machine, fabric or motion makes them larger or smaller: the 80 % intervals say by how much, and are
-guessed.
+package. These were fitted to measured jobs of 1 to 2,500 samples (benchmarks/job_costs.py), and are
+CPU seconds of the machine that `stickslip_workers.machine` measures others against. Another fabric
+or motion makes them larger or smaller: the 80 % intervals say by how much.
 """
 
 from collections.abc import Collection, Mapping
@@ -13,17 +13,22 @@ from math import ceil, prod
 
 from pydantic import Field
 
-from stickslip_schemas.base import Document, Stage
+from stickslip_schemas.base import Document, Float, Stage
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.axes import axis_values
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
-PACK_SECONDS = 0.03
-"""CPU time of packing a sample [s]."""
-PUBLISH_SECONDS = 0.1
-"""CPU time of publishing a shard [s]."""
-UNSURE = 2.0
-"""80 % of renders, packs and publishes are taken to be within this factor of their usual time."""
+PUBLISH_SECONDS = 0.3
+"""CPU time of publishing a version [s]."""
+
+PUBLISH_SHARD_SECONDS = 0.02
+"""CPU time of a shard in a version that is published [s]."""
+
+JOB_SECONDS = 2.0
+"""Wall time of a job beside its tasks [s]: leases, and waits of one stage for another."""
+
+UNCERTAINTY_FACTOR = 1.6
+"""80 % of renders, packs and publishes take within this factor of their usual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +112,17 @@ def _distinct(spec: JobSpec, names: Collection[str]) -> int:
     return int(rows.max()) + 1
 
 
+class MachineSpeed(Document):
+    """How fast the CPUs of a machine are, beside the machine of the packaged costs."""
+
+    cpu_speed: Float = Field(
+        default=1.0, gt=0, description="CPU time there over CPU time here, of the same work"
+    )
+    cpu_available: Float = Field(
+        default=1.0, gt=0, le=1, description="CPUs that a busy process gets: less under a quota"
+    )
+
+
 class Interval(Document):
     """A time [s]; 80 % of jobs lie from `low` to `high`."""
 
@@ -127,31 +143,77 @@ class Estimate(Document):
     measured: tuple[Stage, ...] = Field(description="stages whose cost this service has measured")
 
 
-def estimated(
-    spec: JobSpec, counts: Counts, measured: Mapping[Stage, Interval], slots: int
+def estimate_cost(
+    spec: JobSpec,
+    counts: Counts,
+    measured: Mapping[Stage, Interval],
+    slots: int,
+    speed: MachineSpeed | None = None,
 ) -> Estimate:
-    """Return what a job costs; `measured` are the CPU times of stages that a service knows [s]."""
-    usual = spec.usual_costs
-    shaded = usual.start + counts.shadings * usual.shade + counts.render_count * usual.render
-    stages = {
-        Stage.simulate: _within(counts.simulation_count * usual.simulate, usual.unsure),
-        Stage.render: _within(shaded if counts.render_count else 0.0, UNSURE),
-        Stage.pack: _within(counts.sample_count * PACK_SECONDS, UNSURE),
-        Stage.publish: _within(counts.shards * PUBLISH_SECONDS, UNSURE),
-    } | dict(measured)
-    totals = {
-        name: sum(getattr(stage, name) for stage in stages.values())
-        for name in Interval.model_fields
-    }
-    wall = Interval(**{name: total / slots for name, total in totals.items()}) if slots else None
+    """Return the cost of a job, without cached results.
+
+    `measured` are the CPU times of stages that a service knows [s]; packaged costs stand for the
+    others, and `speed` carries them over to the machine of the workers. With c_s the CPU time of
+    stage s, n_s its tasks, p slots and a the CPUs that each slot gets,
+
+        T = sum_s c_s / (a min(n_s, p)) + JOB_SECONDS
+    """
+    speed = speed or MachineSpeed()
+    stages = _packaged_costs(spec, counts, speed, max(slots, 1)) | dict(measured)
+    totals = {}
+    for name in Interval.model_fields:
+        totals[name] = sum(getattr(stage, name) for stage in stages.values())
     return Estimate(
         cpu_seconds=Interval(**totals),
-        wall_seconds=wall,
+        wall_seconds=_wall_time(stages, counts, slots, speed) if slots else None,
         slots=slots,
         stages=stages,
         measured=tuple(measured),
     )
 
 
-def _within(seconds: float, unsure: float) -> Interval:
-    return Interval(median=seconds, low=seconds / unsure, high=seconds * unsure)
+def _packaged_costs(
+    spec: JobSpec, counts: Counts, speed: MachineSpeed, slots: int
+) -> dict[Stage, Interval]:
+    """Return the CPU times of the stages by the records of the package [s]."""
+    costs = spec.default_costs
+    # A process that starts has to import the solver or Blender: each slot does so once.
+    simulating = min(slots, counts.simulation_count)
+    rendering = min(slots, counts.shadings)
+    simulate = simulating * costs.simulator_start + counts.simulation_count * costs.simulate
+    render = 0.0
+    if counts.render_count:
+        render = rendering * costs.renderer_start
+        render += counts.shadings * costs.shade + counts.render_count * costs.render
+    publish = PUBLISH_SECONDS + counts.shards * PUBLISH_SHARD_SECONDS
+    seconds = {
+        Stage.simulate: (simulate, costs.uncertainty_factor),
+        Stage.render: (render, UNCERTAINTY_FACTOR),
+        Stage.pack: (counts.sample_count * costs.pack, UNCERTAINTY_FACTOR),
+        Stage.publish: (publish, UNCERTAINTY_FACTOR),
+    }
+    stages = {}
+    for stage, (reference_seconds, factor) in seconds.items():
+        median = reference_seconds / speed.cpu_speed
+        stages[stage] = Interval(median=median, low=median / factor, high=median * factor)
+    return stages
+
+
+def _wall_time(
+    stages: Mapping[Stage, Interval], counts: Counts, slots: int, speed: MachineSpeed
+) -> Interval:
+    """Return the wall time of stages that run one after the other [s]."""
+    tasks = {
+        Stage.simulate: counts.simulation_count,
+        Stage.render: counts.shadings,  # renders of one shading are one call
+        Stage.pack: counts.shards,
+        Stage.publish: 1,
+    }
+    walls = {}
+    for name in Interval.model_fields:
+        seconds = JOB_SECONDS
+        for stage, interval in stages.items():
+            parallel = max(1, min(slots, tasks[stage]))
+            seconds += getattr(interval, name) / (parallel * speed.cpu_available)
+        walls[name] = seconds
+    return Interval(**walls)

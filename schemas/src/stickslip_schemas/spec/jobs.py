@@ -143,18 +143,31 @@ class SeedRule(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Usual CPU times [s] of a simulation, of a render once it is shaded, of a shading, and of a
-    renderer's start.
+    """CPU times [s] of the tasks of a kind, on the machine that the package was measured on.
 
-    Renders share a shading that differ only in the axis of variants. 80 % of simulations are within
-    a factor `unsure`.
+    Renders share a shading that differ only in the axis of variants.
     """
 
     simulate: float
+    """Of a simulation, in a process that has started."""
+
     render: float
+    """Of a render, once it is shaded."""
+
     shade: float = 0.0
-    start: float = 0.0
-    unsure: float = 2.0
+    """Of a shading."""
+
+    pack: float = 0.001
+    """Of a sample that is packed."""
+
+    simulator_start: float = 0.5
+    """Of the start of a process that simulates: it imports the solver."""
+
+    renderer_start: float = 2.0
+    """Of the start of a process that renders: it imports Blender."""
+
+    uncertainty_factor: float = 2.0
+    """80 % of simulations take within this factor of `simulate`."""
 
 
 class JobSpec(Document):
@@ -237,7 +250,7 @@ class JobSpec(Document):
         raise NotImplementedError
 
     @property
-    def usual_costs(self) -> Costs:
+    def default_costs(self) -> Costs:
         """Usual CPU times of the tasks of this kind."""
         raise NotImplementedError
 

@@ -10,7 +10,7 @@ from click.exceptions import Exit
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents import responses
 from stickslip_schemas.format.manifest import bytes_estimate
-from stickslip_schemas.plan.costs import Counts, Estimate, count, estimated
+from stickslip_schemas.plan.costs import Counts, Estimate, count, estimate_cost
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.cli.common import FILE, asks, job_argument, json_option, spec_argument
@@ -84,7 +84,7 @@ def _validation_fields(answer: responses.Validation, spec: JobSpec) -> Iterator[
 
 def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
     counts = count(spec)
-    costs = estimated(spec, counts, {}, os.cpu_count() or 1)
+    costs = estimate_cost(spec, counts, {}, os.cpu_count() or 1)
     if as_json:
         print_json({"estimate": costs.model_dump(mode="json")})
         return

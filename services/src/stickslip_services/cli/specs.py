@@ -152,11 +152,14 @@ def _arrays(spec: ClothSceneSpec) -> list[JsonValue]:
 
 def _cost(document: Scene, spec: ClothSceneSpec, files: Mapping[str, bytes]) -> dict[str, Any]:
     """Return the size of a sample, and an interval of the CPU time that it takes."""
-    costs = spec.usual_costs
+    costs = spec.default_costs
     return {
         "vertices": sum(sheet.mesh.shape[0] for sheet in document.sheets.values()),
         "frames": document.frames,
-        "cpu_seconds_a_sample": [costs.simulate / costs.unsure, costs.simulate * costs.unsure],
+        "cpu_seconds_a_sample": [
+            costs.simulate / costs.uncertainty_factor,
+            costs.simulate * costs.uncertainty_factor,
+        ],
         "bytes_a_sample": sum(array.sample_bytes for array in layout(spec)),
         "files_bytes": sum(len(data) for data in files.values()),
     }

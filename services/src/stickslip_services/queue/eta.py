@@ -45,7 +45,7 @@ PACK_GUESS = 5.0
 """Assumed duration of a pack or publish task before one has been measured [s]."""
 
 MEASURED = 3
-"""Measured tasks of a group that make its cost known."""
+"""Measured calls of a group that make its cost known."""
 
 LONG_CALL = 60.0
 """One call that takes longer than this [s] makes a cost known."""
@@ -93,9 +93,16 @@ class Cost:
     call: StageTimings
 
     @property
+    def calls(self) -> float:
+        """Measured calls: each task has its fraction of the wall time of its call."""
+        return self.share.count * self.share.total / max(self.call.total, 1e-9)
+
+    @property
     def is_known(self) -> bool:
-        """True where enough tasks have been measured."""
-        return self.share.count >= MEASURED or (self.share.count > 0 and self.call.mean > LONG_CALL)
+        """True if enough calls have been measured: a call of many tasks is one measurement."""
+        if self.share.count == 0:
+            return False
+        return self.calls > MEASURED - 0.5 or self.call.mean > LONG_CALL
 
     @property
     def expected_call(self) -> float:
@@ -170,6 +177,18 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
         return None
     mean = sum(share.total for share in found) / sum(share.count for share in found)
     return StageTimings(1, mean, mean**2)
+
+
+def known_timings(
+    costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str
+) -> StageTimings | None:
+    """Return the shares of a group, None if too little is known of it.
+
+    Other groups say nothing of a job that has not begun: a frame of another quality, for example,
+    costs several times as much.
+    """
+    cost = costs.get((stage, kind, group))
+    return cost.share if cost is not None and cost.is_known else None
 
 
 def timings_of(

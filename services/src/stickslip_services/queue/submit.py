@@ -19,7 +19,7 @@ from stickslip_schemas.base import JobState, Reason, Stage, sha256
 from stickslip_schemas.documents.responses import JobDetail, Validation
 from stickslip_schemas.format.manifest import bytes_estimate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import Counts, Interval, count, estimated
+from stickslip_schemas.plan.costs import Counts, Interval, count, estimate_cost
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.access import audit_log
@@ -41,7 +41,7 @@ from stickslip_services.errors import (
     PresetNotCertifiedError,
 )
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.eta import StageWork, estimate, read_costs, timings_of
+from stickslip_services.queue.eta import StageWork, estimate, known_timings, read_costs
 from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.jobs import show_job, unplanned_jobs
 from stickslip_services.queue.plan import (
@@ -56,7 +56,7 @@ from stickslip_services.queue.plan import (
 )
 from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets, terms_of
 from stickslip_services.queue.transaction import SETTLED, queue_transaction
-from stickslip_services.queue.workers import NO_WORKER, alive_workers, present_workers
+from stickslip_services.queue.workers import NO_WORKER, alive_workers, mean_speed, present_workers
 
 logger = logging.getLogger(__name__)
 
@@ -157,7 +157,8 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
             refusal = str(error)
         compression = _compression(connection, spec.kind)
         measured = _measured(connection, spec, counts)
-        slots = sum(worker.condition.slots for worker in alive_workers(context, connection))
+        workers = alive_workers(context, connection)
+        slots = sum(worker.condition.slots for worker in workers)
     return document_of(
         Validation,
         counts,
@@ -166,7 +167,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
         cached_count=None if terms is None else _cached(database, spec, terms),
         bytes_estimate=raw,
         stored_bytes_estimate=None if compression is None else round(raw * compression),
-        estimate=estimated(spec, counts, measured, slots),
+        estimate=estimate_cost(spec, counts, measured, slots, mean_speed(workers)),
         certificate=None if terms is None else terms.certificate,
         refusal=refusal,
     )
@@ -175,14 +176,14 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
 def _measured(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Stage, Interval]:
     """Return what the stages cost of which tasks were measured."""
     costs, points = read_costs(connection), list(islice(spec.grid(), LOOKED_UP))
-    work = {Stage.pack: [StageWork(counts.shards, timings_of(costs, Stage.pack, spec.kind, ""))]}
+    work = {Stage.pack: [StageWork(counts.shards, known_timings(costs, Stage.pack, spec.kind, ""))]}
     for stage, number in (
         (Stage.simulate, counts.simulation_count),
         (Stage.render, counts.render_count),
     ):
         groups = Counter(spec.cost_group(stage, point) for point in points)
         work[stage] = [
-            StageWork(number * share / len(points), timings_of(costs, stage, spec.kind, group))
+            StageWork(number * share / len(points), known_timings(costs, stage, spec.kind, group))
             for group, share in groups.items()
         ]
     kept = (

@@ -12,6 +12,7 @@ from stickslip_schemas.base import JobState, Reason, Stage
 from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.worker_api import WorkerCondition, WorkerRegistration
 from stickslip_schemas.plan.builds import Builds
+from stickslip_schemas.plan.costs import MachineSpeed
 
 from stickslip_services.access.principals import is_visible_project
 from stickslip_services.database.database import Prepared, as_datetime, document_of
@@ -141,6 +142,16 @@ def record_condition(
 ) -> None:
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
+
+
+def mean_speed(workers: Collection[RegisteredWorker]) -> MachineSpeed:
+    """Return the speed of an average slot of some workers; the reference speed if none is ready."""
+    slots = sum(worker.condition.slots for worker in workers)
+    if slots == 0:
+        return MachineSpeed()
+    cpu_speed = sum(w.condition.slots * w.condition.speed.cpu_speed for w in workers)
+    cpu_available = sum(w.condition.slots * w.condition.speed.cpu_available for w in workers)
+    return MachineSpeed(cpu_speed=cpu_speed / slots, cpu_available=cpu_available / slots)
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:

@@ -206,16 +206,15 @@ class ClipSpec(JobSpec):
         }
         return own | {"instants": self.shown_instants}
 
-    def clip_costs(self, simulate: float, unsure: float) -> Costs:
-        """Return usual CPU times.
+    def clip_costs(self, simulate: float, uncertainty_factor: float) -> Costs:
+        """Return CPU times of clips.
 
-        Measuring the clips of eight textures costs the share `measured` of their shading.
+        Measuring the clips of eight textures costs the fraction `measured` of their shading.
         """
-        shade = {"preview": 0.8, "draft": 1.15, "standard": 1.55, "high": 4.0}[
-            self.quality
-        ] * self.frames
+        frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 3.3}
+        shade = frame_seconds[self.quality] * self.frames
         render = 0.01 * self.frames + self.measured * shade / 8
-        return Costs(simulate, render, shade, start=2.0, unsure=unsure)
+        return Costs(simulate, render, shade, pack=0.02, uncertainty_factor=uncertainty_factor)
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
         return f"{self.quality}, {self.frames} frames" if stage is Stage.render else ""

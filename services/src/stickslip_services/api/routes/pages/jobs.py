@@ -15,7 +15,7 @@ from sqlalchemy import func, select
 from stickslip_schemas.base import JobState, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.plan.costs import count, estimated
+from stickslip_schemas.plan.costs import count, estimate_cost
 
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import EventStream
@@ -108,7 +108,7 @@ def get_job(job_id: str, context: ContextDep) -> Response:
             spec=spec_text(job.spec),
             durations=stage_durations(connection, seq),
             elapsed=None if job.started_at is None else end - job.started_at.timestamp(),
-            costs=estimated(job.spec, count(job.spec), {}, 0),
+            costs=estimate_cost(job.spec, count(job.spec), {}, 0),
             previews=list_previews(connection, seq, count=24, newest=True),
             rejected=list_samples(
                 connection, seq, PageRequest(SHOWN_LOST, None), TaskState.rejected

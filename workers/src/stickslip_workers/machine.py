@@ -1,0 +1,187 @@
+"""How fast this machine is: a short drag of cloth, timed on some of its CPUs at the same time.
+
+The packaged costs of specs are CPU seconds of the machine that `REFERENCE_CPU_SECONDS` was measured
+on. Two numbers carry them over to another machine:
+
+    cpu_speed     = REFERENCE_CPU_SECONDS / CPU seconds of the drag here
+    cpu_available = CPU seconds of the drag here / its wall time
+
+The second one is below 1 if a quota or other programs leave less than a CPU to each process.
+
+    python -m stickslip_workers.machine     runs the drag and prints its times as JSON
+"""
+
+import json
+import logging
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import ValidationError
+from stickslip_schemas.base import Document, Float
+from stickslip_schemas.plan.costs import MachineSpeed
+
+log = logging.getLogger(__name__)
+
+REFERENCE_CPU_SECONDS = 0.235
+"""CPU time of the drag on the machine of the packaged costs [s]: one core of a virtual AMD EPYC
+with AVX-512, benchmarks/results/job-costs.json."""
+
+DRAG_VERTICES = 11
+DRAG_SECONDS = 10.0
+"""Mesh and duration [s] of the drag: long enough to time, and two of them take a second of CPU."""
+
+MAX_PROCESSES = 2
+"""Drags at the same time: a quota shows with two, and the measurement stays below 2 CPU s."""
+
+TIMEOUT_SECONDS = 60.0
+"""A machine that is so slow that the drag takes longer is not measured [s]."""
+
+
+class StoredSpeed(Document):
+    """A measured speed, and the machine that it is of."""
+
+    machine: str
+    speed: MachineSpeed
+
+
+class DragTimes(Document):
+    """What the drag took in one process [s]."""
+
+    cpu_seconds: Float
+    wall_seconds: Float
+
+
+def machine_name() -> str:
+    """Return a text that changes when the CPUs do: their model, number and quota."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:  # another system than Linux
+        lines = []
+    for line in lines:
+        name, _, value = line.partition(":")
+        if name.strip() == "model name":
+            model = value.strip()
+            break
+    cpus = os.cpu_count() if sys.platform != "linux" else len(os.sched_getaffinity(0))
+    return f"{model}, {cpus} CPUs, quota {_cpu_quota()}"
+
+
+def _cpu_quota() -> str:
+    """Return the CPU quotas of this process's control groups, `max` if there is none."""
+    quotas = []
+    for folder in _control_groups():
+        # Version 2 has a file with quota and period, version 1 has the quota [us] alone.
+        for name, unlimited in (("cpu.max", "max"), ("cpu.cfs_quota_us", "-1")):
+            try:
+                text = (folder / name).read_text(encoding="ascii").strip()
+            except OSError:
+                continue
+            if not text.startswith(unlimited):
+                quotas.append(text)
+    return "; ".join(quotas) or "max"
+
+
+def _control_groups() -> Iterator[Path]:
+    """Yield the folders of the control groups that may limit the CPU time of this process.
+
+    A group's quota holds for the groups below it, too. `/proc/self/cgroup` has a line
+    `number:controllers:group` for each hierarchy; in version 2 the controllers are empty.
+    """
+    try:
+        mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8").splitlines()
+        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:  # another system than Linux
+        return
+    groups = {}
+    for line in lines:
+        _, controllers, group = line.split(":", 2)
+        for controller in controllers.split(","):
+            groups[controller] = group
+    for mount in mounts:
+        fields, _, kind = mount.partition(" - ")
+        point = Path(fields.split()[4])
+        file_system, _, options = kind.split(" ", 2)
+        if file_system == "cgroup2":
+            group = groups.get("", "/")
+        elif file_system == "cgroup" and "cpu" in options.split(","):
+            group = groups.get("cpu", "/")
+        else:
+            continue
+        yield from (point / part.relative_to("/") for part in (Path(group), *Path(group).parents))
+
+
+def speed_file() -> Path:
+    """Return the file that keeps the speed of this machine, in the user's cache."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "stickslip" / "machine-speed.json"
+
+
+def machine_speed(file: Path, slots: int) -> MachineSpeed:
+    """Return the speed of this machine; measure it if `file` has none or that of another machine.
+
+    A machine that cannot be measured counts as the reference machine; the log says why.
+    """
+    name = machine_name()
+    try:
+        stored = StoredSpeed.model_validate_json(file.read_bytes())
+        if stored.machine == name:
+            return stored.speed
+    except FileNotFoundError:
+        pass
+    except (OSError, ValidationError) as error:
+        log.warning("%s is not the speed of a machine, and is measured again: %s", file, error)
+    try:
+        speed = measure_speed(min(slots, MAX_PROCESSES))
+    except (OSError, subprocess.SubprocessError) as error:
+        log.warning("the speed of this machine is unknown: %s", error)
+        return MachineSpeed()
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(StoredSpeed(machine=name, speed=speed).model_dump_json(), encoding="utf-8")
+    except OSError as error:
+        log.warning("the speed of this machine cannot be stored: %s", error)
+    return speed
+
+
+def measure_speed(processes: int) -> MachineSpeed:
+    """Run the drag in some processes at the same time, and return the speed of the machine."""
+    command = [sys.executable, "-m", "stickslip_workers.machine"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    running = []
+    for _ in range(max(processes, 1)):
+        running.append(subprocess.Popen(command, stdout=subprocess.PIPE, env=environment))
+    times = []
+    for process in running:
+        output, _ = process.communicate(timeout=TIMEOUT_SECONDS)
+        if process.returncode != 0:
+            raise subprocess.CalledProcessError(process.returncode, command)
+        times.append(DragTimes.model_validate_json(output))
+    cpu_seconds = sum(time.cpu_seconds for time in times) / len(times)
+    wall_seconds = sum(time.wall_seconds for time in times) / len(times)
+    return MachineSpeed(
+        cpu_speed=REFERENCE_CPU_SECONDS / cpu_seconds,
+        cpu_available=min(1.0, cpu_seconds / wall_seconds),
+    )
+
+
+def drag() -> DragTimes:
+    """Drop and drag a coarse cloth for a short time, and return what that took."""
+    from stickslip_sim_core.scenes import cloth_drag
+
+    frames = round(DRAG_SECONDS * cloth_drag.FRAME_RATE) + 1
+    scene = cloth_drag.scene("gray-interlock", 0.5, mesh=DRAG_VERTICES, frames=frames, seed=0)
+    started_at = time.perf_counter()
+    cpu_before = time.process_time()
+    scene.run()
+    cpu_seconds = time.process_time() - cpu_before
+    return DragTimes(cpu_seconds=cpu_seconds, wall_seconds=time.perf_counter() - started_at)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(drag().model_dump()) + "\n")

@@ -1,0 +1,83 @@
+"""The speed of a machine is measured once, and again when its CPUs change."""
+
+import json
+import logging
+import subprocess
+from pathlib import Path
+
+import pytest
+from stickslip_schemas.plan.costs import MachineSpeed
+from stickslip_workers import machine
+
+
+@pytest.fixture
+def measurements(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Replace the drag; collect the number of processes of each measurement."""
+    calls: list[int] = []
+
+    def measure_speed(processes: int) -> MachineSpeed:
+        calls.append(processes)
+        return MachineSpeed(cpu_speed=0.5, cpu_available=0.25)
+
+    monkeypatch.setattr(machine, "measure_speed", measure_speed)
+    return calls
+
+
+def test_a_measured_speed_is_stored(tmp_path: Path, measurements: list[int]) -> None:
+    file = tmp_path / "cache" / "speed.json"
+    first = machine.machine_speed(file, slots=16)
+    assert first == MachineSpeed(cpu_speed=0.5, cpu_available=0.25)
+    assert machine.machine_speed(file, slots=16) == first
+    assert measurements == [machine.MAX_PROCESSES]
+
+
+def test_other_cpus_are_measured_again(
+    tmp_path: Path, measurements: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "speed.json"
+    machine.machine_speed(file, slots=1)
+    monkeypatch.setattr(machine, "machine_name", lambda: "another CPU")
+    machine.machine_speed(file, slots=1)
+    assert measurements == [1, 1]
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b'{"machine": 3}'])
+def test_a_damaged_file_is_measured_again_with_a_warning(
+    tmp_path: Path, measurements: list[int], content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "speed.json"
+    file.write_bytes(content)
+    machine.machine_speed(file, slots=1)
+    assert measurements == [1]
+    assert "is not the speed of a machine" in caplog.text
+
+
+def test_a_machine_that_cannot_be_measured_is_the_reference_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def measure_speed(_processes: int) -> MachineSpeed:
+        raise subprocess.CalledProcessError(1, ["python"])
+
+    monkeypatch.setattr(machine, "measure_speed", measure_speed)
+    with caplog.at_level(logging.WARNING):
+        assert machine.machine_speed(tmp_path / "speed.json", slots=2) == MachineSpeed()
+    assert "the speed of this machine is unknown" in caplog.text
+    assert not (tmp_path / "speed.json").exists()
+
+
+def test_the_name_of_a_machine_has_its_quota(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "cpu.max").write_text("50000 100000\n")
+    monkeypatch.setattr(machine, "_control_groups", lambda: iter([tmp_path]))
+    assert machine.machine_name().endswith("quota 50000 100000")
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert machine.machine_name().endswith("quota max")
+
+
+@pytest.mark.physics
+def test_the_drag_takes_a_second_of_cpu_at_most() -> None:
+    command = [machine.sys.executable, "-m", "stickslip_workers.machine"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    times = json.loads(done.stdout)
+    assert 0 < times["cpu_seconds"] <= times["wall_seconds"] * 1.05
