@@ -72,7 +72,7 @@ test-fast: setup-dev
 	$(PYTEST) -m "not slow and not real and not physics" --cpu-limit=1
 
 test: setup-dev
-	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender test-without-blender test-core check
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-main test-blender check
 
 # Tests wait a quarter of their time: one more runs than there are cores.
 test-main:

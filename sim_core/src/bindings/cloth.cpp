@@ -87,6 +87,16 @@ void bind_cloth(nb::module_& m) {
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
+      .def_prop_ro(
+          "rungs",
+          [](const StepReport& report) {
+            std::map<std::string, std::pair<int, int>> out;
+            for (std::size_t r = 0; r < rung_names.size(); ++r) {
+              out[rung_names[r]] = {report.rungs[r].tried, report.rungs[r].converged};
+            }
+            return out;
+          },
+          "How often each rung of the fallback ladder was tried and converged, by name.")
       .def_ro("seen", &StepReport::seen)
       .def_ro("sharpest", &StepReport::sharpest,
               "Least radius of a skeleton that cloth touched, in cells.")

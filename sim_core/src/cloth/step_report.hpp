@@ -1,0 +1,90 @@
+// What a step reports: work, quality, and the rungs of the fallback ladder that it took.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cstddef>
+#include <limits>
+
+namespace sim_core {
+
+// Rungs of the fallback ladder, see stepping.hpp.
+enum class Rung : int { attempt, plain, stiff_pairs, smoothed_law, persistent, best_iterate };
+
+constexpr std::array<const char*, 6> rung_names{"attempt",      "plain",      "stiff_pairs",
+                                                "smoothed_law", "persistent", "best_iterate"};
+
+// How often a rung was tried, and how often it converged. The best iterate never does.
+struct RungCount {
+  int tried = 0;
+  int converged = 0;
+};
+
+// Worst values over the accepted steps, which the checks of a run judge, see checks.py.
+struct Observed {
+  double stretch = 0.0;  // largest principal stretch of a triangle at the end of a step
+  double depth =
+      0.0;  // largest depth in a body at the end of a step beyond what round bodies allow, cells
+  int passages = 0;  // triangles that passed the core of a body
+  double contact_work =
+      0.0;            // J: of bodies on the cloth as it moves against them, where that is positive
+  double flow = 0.0;  // J: sum of the sizes of all changes of energy and of all work
+  double balance = 0.0;  // J: energy gained beyond the work of all forces
+  double gain = 0.0;     // J: the largest `balance` at the end of a step
+
+  void add(const Observed& next) {
+    stretch = std::max(stretch, next.stretch);
+    depth = std::max(depth, next.depth);
+    passages += next.passages;
+    contact_work += next.contact_work;
+    flow += next.flow;
+    gain = std::max(gain, balance + next.gain);
+    balance += next.balance;
+  }
+};
+
+struct StepReport {
+  bool converged = true;
+  double residual = 0.0;           // N: worst over the parts
+  int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
+  int missed = 0;  // of those, by steps of the controller that are further off than it allows
+  int newton = 0, krylov = 0;
+  double least_distance =
+      std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
+  double sharpest =
+      std::numeric_limits<double>::infinity();  // cells: least radius of a skeleton that bears
+  double uneven =
+      0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
+  double factorizations = 0.0;                       // whole ones, and shares of those in part
+  std::array<RungCount, rung_names.size()> rungs{};  // by Rung, rejected steps included
+  Observed seen;
+
+  void count(Rung rung, bool solved) {
+    RungCount& counted = rungs[static_cast<std::size_t>(rung)];
+    ++counted.tried;
+    counted.converged += solved;
+  }
+  void add_work(const StepReport& other) {
+    newton += other.newton;
+    krylov += other.krylov;
+    factorizations += other.factorizations;
+    for (std::size_t r = 0; r < rungs.size(); ++r) {
+      rungs[r].tried += other.rungs[r].tried;
+      rungs[r].converged += other.rungs[r].converged;
+    }
+  }
+  void add(const StepReport& other) {
+    add_work(other);
+    steps += other.steps;
+    unconverged += other.unconverged;
+    missed += other.missed;
+    converged = converged && other.converged;
+    if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
+    least_distance = std::min(least_distance, other.least_distance);
+    sharpest = std::min(sharpest, other.sharpest);
+    uneven = std::max(uneven, other.uneven);
+    seen.add(other.seen);
+  }
+};
+
+}  // namespace sim_core
