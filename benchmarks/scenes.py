@@ -90,7 +90,7 @@ def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> di
     part.
     """
     begin, clock = time.process_time(), Clock()
-    given = simulation.given(files.__getitem__)
+    given = simulation.inputs(files.__getitem__)
     scene = cloth_scene.scene(given["scene"], seed=given["seed"])
     set_up = time.process_time() - begin
     scene = replace(

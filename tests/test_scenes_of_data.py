@@ -75,7 +75,7 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     (point,) = keyed_points(spec, BUILDS)
     simulation = spec.simulation_type.model_validate_json(point.simulation_text)
     assert isinstance(simulation, ClothSceneSimulation)
-    (outcome,) = cloth_scene.KIND.simulate([simulation.given(built_in_files().__getitem__)], None)
+    (outcome,) = cloth_scene.KIND.simulate([simulation.inputs(built_in_files().__getitem__)], None)
     assert not outcome.reason
     made = {**outcome.record, **outcome.labels}
     for layout in spec.arrays():

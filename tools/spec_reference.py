@@ -54,8 +54,10 @@ Rows = dict[str, str]
 
 
 def reference() -> str:
-    """Return the page: what all kinds share, what all kinds of cloth share, then each kind, then
-    custom entries.
+    """Return the page.
+
+    Keys that all kinds share come first, then keys that all kinds of cloth share, then each kind,
+    then custom entries.
     """
     keys = {name: _keys(kind) for name, kind in KINDS.items()}
     axes = {name: _axes(kind) for name, kind in KINDS.items()}

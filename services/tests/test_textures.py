@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
-from stickslip_schemas.base import referred
+from stickslip_schemas.base import artifact_digest
 from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.documents.tasks import RenderTask
 from stickslip_services.cli import app
@@ -67,7 +67,7 @@ def test_a_texture_is_uploaded_once_and_named_by_a_spec(
     entry = client.upload_texture(_png())
     assert (entry.side, entry.bytes) == (64, len(_png()))
     assert client.upload_texture(_png()) == entry
-    digest = referred(entry.texture)
+    digest = artifact_digest(entry.texture)
     assert digest is not None
     assert shared_server.store.read(digest) == _png()
     assert client.validate(_spec(entry.texture)).sample_count == 2

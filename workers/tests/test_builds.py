@@ -31,7 +31,7 @@ SIMULATIONS = {
     "cloth_scene": {
         "seed": 1,
         "scene": load_scene("belt")
-        .checked(
+        .physics_with(
             {
                 ("end", "at_most"): 0.1,
                 ("sheets", "cloth", "mesh", "cells", 0): 4,

@@ -1,1 +1,1 @@
-"""The contract of stickslip: what its parts say to each other. See the modules, one concept each."""
+"""The contract of stickslip: the documents that its parts exchange, one concept a module."""

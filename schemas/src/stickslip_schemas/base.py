@@ -1,6 +1,4 @@
-"""The base of all documents: strict numbers, content keys, states and reasons, and units of
-numbers.
-"""
+"""The base of all documents: strict numbers, content keys, states, reasons and units."""
 
 import hashlib
 import json
@@ -45,37 +43,45 @@ Sha256 = Annotated[
 
 
 def canonical_json(value: Any) -> str:
-    """Return the one JSON text of `value`: sorted keys, no spaces, shortest round-trip floats, -0.0
-    as 0.0.
+    """Return the canonical JSON text of `value`.
+
+    Keys are sorted, there are no spaces, floats have the shortest text that reads back as the same
+    number, and -0.0 is written as 0.0.
 
     NaN and infinities raise ValueError, for they have no JSON form.
     """
+    # Two documents are equal exactly if these texts are, so the text can stand for the document.
     return json.dumps(_normalised(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def content_key(purpose: str, value: Any) -> str:
-    """Return the SHA-256 of `value`, kept apart by `purpose` so that two kinds of thing never share
-    a key.
+    """Return the SHA-256 of `value` and `purpose`.
+
+    The purpose keeps two sorts of things from ever sharing a key.
     """
     return sha256(keyed_text(purpose, canonical_json(value)).encode())
 
 
 def keyed_text(purpose: str, canonical: str) -> str:
-    """Return the text whose SHA-256 is the content key of a value with the canonical JSON
-    `canonical`.
+    """Return the text that is hashed for the content key of a value.
+
+    `canonical` is the canonical JSON of the value.
     """
     return f"stickslip/{purpose}\n{canonical}"
 
 
 def derived_seed(seed: int, purpose: str, value: Any) -> int:
-    """Return a seed in [0, 2**31) that depends on `seed` and on what it is for, never on a position
-    in a grid.
+    """Return a seed in [0, 2**31) that depends on `seed`, `purpose` and `value`.
+
+    It never depends on a position in a grid, so a larger grid leaves the seeds of its samples
+    alone.
     """
     return seed_of_key(content_key(f"seed/{purpose}", {"seed": seed, "for": value}))
 
 
 def seed_of_key(key: str) -> int:
     """Return the seed in [0, 2**31) that a content key gives."""
+    # 15 hexadecimal digits are 60 bits: enough for every remainder to be equally likely.
     return int(key[:15], 16) % 2**31
 
 
@@ -85,6 +91,7 @@ def sha256(data: bytes) -> str:
 
 
 def is_sha256(text: str) -> bool:
+    """Return whether `text` has the form of a SHA-256 in lower-case hexadecimal."""
     return re.fullmatch(KEY_PATTERN, text) is not None
 
 
@@ -97,12 +104,12 @@ ArtifactRef = Annotated[
 ]
 
 
-def referred(name: str) -> Sha256 | None:
+def artifact_digest(name: str) -> Sha256 | None:
     """Return the digest that a reference to an artifact names; None where `name` is a name."""
     return name.removeprefix(ARTIFACT) if name.startswith(ARTIFACT) else None
 
 
-def placed(document: Any, place: Sequence[str | int], value: Any) -> Any:
+def replace_at(document: Any, place: Sequence[str | int], value: Any) -> Any:
     """Return a copy of a JSON document with another value at a place.
 
     Positions in lists may be texts.
@@ -110,12 +117,12 @@ def placed(document: Any, place: Sequence[str | int], value: Any) -> Any:
     if not place:
         return value
     step, *rest = place
+    # Only the lists and mappings along the location are copied; the rest is shared.
     if isinstance(document, list):
-        return [
-            placed(item, rest, value) if at == int(step) else item
-            for at, item in enumerate(document)
-        ]
-    return {**document, step: placed(document[step], rest, value)}
+        items = list(document)
+        items[int(step)] = replace_at(items[int(step)], rest, value)
+        return items
+    return {**document, step: replace_at(document[step], rest, value)}
 
 
 def _normalised(value: Any) -> Any:
@@ -129,9 +136,9 @@ def _normalised(value: Any) -> Any:
 
 
 class JobState(StrEnum):
-    """Where a job is; `pausing` and `cancelling` last until the leased tasks have been given back.
+    """State of a job; `pausing` and `cancelling` last until all leased tasks are returned.
 
-    A job of many samples is `planning` until all its tasks are written down; the first of them run
+    A job of many samples is `planning` until all its tasks are written; the first of them run
     meanwhile.
     """
 
@@ -159,7 +166,7 @@ class JobState(StrEnum):
 
 
 class TaskState(StrEnum):
-    """Where a task is; `soft_failed` waits for another try, `rejected` is a result, not a fault."""
+    """State of a task; `soft_failed` waits for another try, `rejected` is a result."""
 
     pending = "pending"
     leased = "leased"
@@ -172,7 +179,7 @@ class TaskState(StrEnum):
 
     @property
     def is_settled(self) -> bool:
-        """True where the task has a result that others may use."""
+        """True if the task has a result that others may use."""
         return self in (TaskState.succeeded, TaskState.rejected)
 
     @property
@@ -192,7 +199,7 @@ class Stage(StrEnum):
 class Reason(StrEnum):
     """Why a job or task ended, or why it waits."""
 
-    # Infrastructure: another try may succeed.
+    # Infrastructure. Another try may succeed, so these are retried.
     exec_timeout = "exec_timeout"
     worker_lost = "worker_lost"
     oom_killed = "oom_killed"
@@ -201,12 +208,12 @@ class Reason(StrEnum):
     storage_error = "storage_error"
     store_unavailable = "store_unavailable"
     internal_error = "internal_error"
-    # The sample itself: deterministic, never retried.
+    # The sample itself. These are deterministic, so they are never retried.
     solver_diverged = "solver_diverged"
     out_of_frame = "out_of_frame"
     invalid_sample = "invalid_sample"
     poor_pictures = "poor_pictures"
-    # The same, of cloth: the check of the solver that failed.
+    # The same, of cloth: the names are those of the solver's checks.
     not_finite = "not_finite"
     jumps = "jumps"
     unconverged = "unconverged"
@@ -218,7 +225,7 @@ class Reason(StrEnum):
     penetration = "penetration"
     passages = "passages"
     sharpness = "sharpness"
-    # A job's own.
+    # Only jobs end or wait for these.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"
     quarantined = "quarantined"
@@ -227,7 +234,7 @@ class Reason(StrEnum):
 
     @property
     def ends_a_process(self) -> bool:
-        """True where a task took its process with it.
+        """True if the process of the task ended with it.
 
         One that does so again and again is quarantined.
         """
@@ -235,8 +242,9 @@ class Reason(StrEnum):
 
     @property
     def is_deterministic(self) -> bool:
-        """True where a second try gives the same answer, so that the sample is rejected and not
-        retried.
+        """True if a second try gives the same answer.
+
+        The sample is then rejected and not retried.
         """
         return self not in _INFRASTRUCTURE | _OF_JOBS
 
@@ -258,7 +266,7 @@ _OF_JOBS = {
 }
 
 
-_RULES = (
+_NUMBER_RULES = (
     "greater_than",
     "greater_than_equal",
     "less_than",
@@ -269,57 +277,64 @@ _RULES = (
 """Types of pydantic's errors that are about a number."""
 
 
-def unit_of(item: ErrorDetails, of: Any) -> str:
+def unit_of(item: ErrorDetails, expected: Any) -> str:
     """Return ` [unit]` of the number that an error is about, or an empty text.
 
-    `of` is the type that the document was to be, a model or a union of models.
+    `expected` is the type of the whole document, a model or a union of models.
     """
+    if item["type"] not in _NUMBER_RULES:
+        return ""
     location = item["loc"]
-    names = [
-        place
-        for place, part in enumerate(location)
-        if isinstance(part, str) and item["type"] in _RULES
-    ]
-    for place in reversed(names):
-        for model in models_at(of, location[:place]):
-            if (field := model.model_fields.get(str(location[place]))) is not None:
-                unit = _said(field)
+    names = [depth for depth, part in enumerate(location) if isinstance(part, str)]
+    # The innermost name is a field, unless it is the tag of a union or a key of a mapping.
+    for depth in reversed(names):
+        for model in models_at(expected, location[:depth]):
+            field = model.model_fields.get(str(location[depth]))
+            if field is not None:
+                unit = _field_unit(field)
                 return f" [{unit}]" if unit else ""
     return ""
 
 
 def unit_in(document: Any, location: Sequence[int | str]) -> str:
-    """Return the unit of the number at a place in a document; `1` of a pure number."""
+    """Return the unit of the number at a location in a document; `1` of a pure number."""
     unit = ""
     for part in location:
         if isinstance(document, BaseModel):
-            unit = _said(type(document).model_fields[str(part)])
+            unit = _field_unit(type(document).model_fields[str(part)])
             document = getattr(document, str(part))
         else:
             document = document[part]
     return unit or "1"
 
 
-def _said(field: FieldInfo) -> str:
+def _field_unit(field: FieldInfo) -> str:
+    # Descriptions of numbers have their unit in brackets, for example "length [m]".
     unit = re.search(r"\[([^\]]+)\]", field.description or "")
     return unit[1] if unit else ""
 
 
-def models_at(of: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
-    """Return the models that a place in a document may hold, from the type of the whole."""
-    models = list(_models_in(of))
+def models_at(expected: Any, location: Sequence[int | str]) -> list[type[BaseModel]]:
+    """Return the models that a location in a document may hold, from the type of the whole."""
+    models = list(_models_in(expected))
     for part in location:
-        fields = [model.model_fields[part] for model in models if part in model.model_fields]
-        if fields:
-            models = [found for field in fields for found in _models_in(field.annotation)]
-        else:  # the place in a list, or the tag of a union
-            tagged = [
-                m
-                for m in models
-                if any(part in literals(of.annotation) for of in m.model_fields.values())
-            ]
-            models = tagged or models
+        annotations = [
+            model.model_fields[part].annotation for model in models if part in model.model_fields
+        ]
+        if annotations:
+            # A field: go on with the models that its value may be.
+            models = []
+            for annotation in annotations:
+                models += _models_in(annotation)
+        else:
+            # A position in a list keeps all models; the tag of a union selects one of them.
+            models = [model for model in models if _has_tag(model, part)] or models
     return models
+
+
+def _has_tag(model: type[BaseModel], tag: int | str) -> bool:
+    """Return whether a model is the one of a union that this tag stands for."""
+    return any(tag in literals(field.annotation) for field in model.model_fields.values())
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -331,6 +346,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def literals(annotation: Any) -> list[str]:
-    return (
-        [str(value) for value in get_args(annotation)] if get_origin(annotation) is Literal else []
-    )
+    """Return the values of a `Literal` as texts; none of any other annotation."""
+    if get_origin(annotation) is not Literal:
+        return []
+    return [str(value) for value in get_args(annotation)]

@@ -215,7 +215,7 @@ def test_a_large_image_is_cut_to_its_middle_and_made_smaller() -> None:
 
 
 def test_rotations_of_rodrigues_are_those_of_opencv() -> None:
-    """Of the rig's cameras, whose rotation vectors were computed by another formula: the logarithm."""
+    """Rotation vectors of the cameras of the rig, by another formula: the logarithm."""
     from scipy.spatial.transform import Rotation
 
     for camera in load_rig("drag"):

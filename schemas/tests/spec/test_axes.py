@@ -46,7 +46,7 @@ def test_sobol_fills_evenly() -> None:
 
 
 def test_pinned_samples() -> None:
-    """A seed always means the same values: change these numbers only with a change of the format."""
+    """A seed always means the same values: change these only with a change of the format."""
     assert values(sampled("random", 0, 2)) == pytest.approx(PINNED_RANDOM, rel=1e-12)
     assert values(sampled("sobol", 0, 2)) == pytest.approx(PINNED_SOBOL, rel=1e-12)
 

@@ -300,7 +300,7 @@ def test_one_of_many_writers_wins_and_no_reader_sees_a_part(place: Place) -> Non
 def test_a_probe_leaves_nothing(store: Store) -> None:
     store.probe()
     assert list(store.stored()) == []
-    room = store.room()
+    room = store.disk_usage()
     assert room is None or 0 < room.free <= room.total
 
 

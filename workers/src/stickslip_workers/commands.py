@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.base import Reason, canonical_json, content_key, referred
+from stickslip_schemas.base import Reason, artifact_digest, canonical_json, content_key
 from stickslip_schemas.documents.certificate import Certificate, ProtocolReport
 from stickslip_schemas.documents.tasks import AnyTask, RenderTask, TaskResult
 from stickslip_schemas.kinds.cloth.arrays import scene_segments
@@ -84,7 +84,7 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
     cameras = load_rig(given) if isinstance(given, str) else views
     with TemporaryDirectory(prefix="stickslip-preview-") as folder:
         pictures = {
-            place: Path(folder, referred(name) or "")
+            place: Path(folder, artifact_digest(name) or "")
             for place, name in scene.files()
             if place[0] == "looks"
         }

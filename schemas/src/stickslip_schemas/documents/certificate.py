@@ -1,12 +1,11 @@
-"""The certificate: what one build of the core, with the numbers of one preset, measured on the
-physical protocols.
+"""The certificate: measurements of one build and one preset on the physical protocols.
 
 Its digest is over everything but `environment` and the densely drawn curves: the same build and
 preset on another day give the same certificate.
 """
 
-import math
 from collections.abc import Iterable
+from itertools import chain
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -15,6 +14,7 @@ from stickslip_schemas.base import Bool, Document, Float, Sha256, canonical_json
 
 Numbers = tuple[Float | None, ...]
 
+# The day, the machine and the points of pictures say nothing about the solver.
 _NOT_CONTENT: Any = {
     "environment": True,
     "protocols": {"__all__": {"curves": {"__all__": {"dense_x", "dense_master"}}}},
@@ -25,6 +25,7 @@ class CurveReport(Document):
     """A measured curve beside its master curve; null where there is nothing to measure."""
 
     parameters: dict[str, Float]
+    # One value for each point of the curve.
     x: Numbers
     measured: Numbers
     master: Numbers
@@ -34,14 +35,18 @@ class CurveReport(Document):
     )
     order: Numbers = Field(
         default=(),
-        description="power of the cell's size with which errors fall; null: none was found, and 2 was taken",
+        description=(
+            "power of the cell's size with which errors fall; null: none was found, and 2 was taken"
+        ),
     )
     limit_errors: Numbers = Field(
         default=(), description="limit over master less one; null is infinite"
     )
     cells: tuple[Numbers, ...] = Field(
         default=(),
-        description="by mesh, the coarsest first, and point: cells along the sheet; the last is that of x",
+        description=(
+            "by mesh, the coarsest first, and point: cells along the sheet; the last is that of x"
+        ),
     )
     errors_by_mesh: tuple[Numbers, ...] = Field(
         default=(), description="errors with these cells; the last are `errors`"
@@ -53,16 +58,26 @@ class CurveReport(Document):
 
     @model_validator(mode="after")
     def _one_length(self) -> Self:
+        # All columns belong to the same points of the curve.
         lengths = {len(self.x), len(self.measured), len(self.master), len(self.errors)}
         if len(lengths) > 1:
             raise ValueError(
-                f"x, measured, master and errors must have one length, and theirs are {sorted(lengths)}"
+                "x, measured, master and errors must have one length, and theirs are "
+                f"{sorted(lengths)}"
             )
-        refined = {len(self.limit), len(self.order), len(self.limit_errors)}
-        refined |= {len(row) for rows in (self.cells, self.errors_by_mesh) for row in rows}
+        # The extrapolation to cells of no size has the same points, and ends with the finest mesh.
+        refined_columns = (
+            *self.cells,
+            *self.errors_by_mesh,
+            self.limit,
+            self.order,
+            self.limit_errors,
+        )
+        refined = {len(column) for column in refined_columns}
         if self.cells and (refined != lengths or self.errors_by_mesh[-1:] != (self.errors,)):
             raise ValueError(
-                "limit, order, cells and errors_by_mesh must have the length of x, and end with errors"
+                "limit, order, cells and errors_by_mesh must have the length of x, and end with "
+                "errors"
             )
         if len(self.cells) != len(self.errors_by_mesh) or bool(self.limit) != bool(self.cells):
             raise ValueError(
@@ -97,14 +112,16 @@ class ProtocolReport(Document):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        largest = _largest(error for curve in self.curves for error in curve.errors)
+        # What the report claims must follow from its numbers: nobody can pass by saying so.
+        largest = _largest_error(curve.errors for curve in self.curves)
         if self.error != largest:
             raise ValueError(
-                f"error must be the largest of the curves' errors, {largest}, and it is {self.error}"
+                f"error must be the largest of the curves' errors, {largest}, and it is "
+                f"{self.error}"
             )
         within = self.error is not None and self.error <= self.tolerance
         if self.limit_tolerance is not None:
-            largest = _largest(error for curve in self.curves for error in curve.limit_errors)
+            largest = _largest_error(curve.limit_errors for curve in self.curves)
             if self.limit_error != largest:
                 raise ValueError(
                     f"limit_error must be the largest of the limits' errors, {largest}"
@@ -119,10 +136,12 @@ class ProtocolReport(Document):
         return self
 
 
-def _largest(errors: Iterable[float | None]) -> float | None:
-    """Return the largest |error|; None where one is infinite, or there is none."""
-    largest = max((math.inf if error is None else abs(error) for error in errors), default=math.inf)
-    return None if largest == math.inf else largest
+def _largest_error(curves: Iterable[Numbers]) -> float | None:
+    """Return the largest |error| of all curves; None if one is infinite, or there is none."""
+    errors = list(chain.from_iterable(curves))
+    if not errors or None in errors:
+        return None
+    return max(abs(error) for error in errors if error is not None)
 
 
 class Certificate(Document):
@@ -152,7 +171,7 @@ class Certificate(Document):
 
     @property
     def certifies(self) -> bool:
-        """True where data of this build and preset may be made."""
+        """True if data of this build and preset may be made."""
         return self.passed and self.extent == "full"
 
     def canonical(self) -> bytes:

@@ -71,8 +71,9 @@ class Problem(BaseModel):
 def field_errors(
     error: ValidationError, document: Any, of: Any, *, at_most: int | None = None
 ) -> list[FieldError]:
-    """Return one FieldError for each of pydantic's, with pointers into `document` as the user wrote
-    it.
+    """Return one FieldError for each error of pydantic.
+
+    Pointers lead into `document`, as the user wrote it.
 
     `of` is the type that the document was to be, a model or a union of models: misspelt words are
     compared with its fields and values. This takes time for each error: `at_most` bounds it for a
@@ -83,8 +84,9 @@ def field_errors(
 
 
 def _is_echo(item: ErrorDetails) -> bool:
-    """Return whether a list is said to be too short only because its items have errors of their
-    own.
+    """Return whether an error only repeats the errors of the items of a list.
+
+    pydantic calls a list too short if its items have errors.
     """
     return item["type"] == "too_short" and item["ctx"]["actual_length"] != len(item["input"])
 
@@ -136,8 +138,9 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
 
 
 def _pointer(location: Sequence[int | str], document: Any, *, missing: bool) -> str:
-    """Walk `location` through `document`, leaving out what pydantic put there itself (tags of
-    unions).
+    """Return `location` as a JSON pointer into `document`.
+
+    Parts that pydantic adds itself, such as tags of unions, are left out.
     """
     parts: list[int | str] = []
     here = document

@@ -119,17 +119,28 @@ class Validation(Document):
         description="tasks of all stages: simulations, renders, shards, and one that publishes"
     )
     expected_splits: dict[str, int] = Field(
-        description="expected samples by split; splits are drawn, so the numbers of a dataset differ slightly"
+        description=(
+            "expected samples by split; splits are drawn, so the numbers of a dataset "
+            "differ slightly"
+        )
     )
     cached_count: int | None = Field(
-        description="tasks with a cached result; null: no worker has registered, or the grid is too large to search"
+        description=(
+            "tasks with a cached result; null: no worker has registered, or the grid is "
+            "too large to search"
+        )
     )
     bytes_estimate: int = Field(description="size of the arrays before compression [bytes]")
     stored_bytes_estimate: int | None = Field(
-        description="file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
+        description=(
+            "file size, compressed as the newest dataset of the kind [bytes]; null: there is none"
+        )
     )
     estimate: Estimate = Field(
-        description="time of all tasks, without cached results, from what this service or the package has measured"
+        description=(
+            "time of all tasks, without cached results, from what this service or the "
+            "package has measured"
+        )
     )
     certificate: Sha256 | None = Field(
         description="certificate that covers the dataset; null: none"

@@ -1,4 +1,4 @@
-"""Tasks of the stages and their results. Bulk data is named by digest and never part of a message."""
+"""Tasks of the stages and their results; bulk data is named by digest and never part of them."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from stickslip_schemas.base import Bool, Document, Float, Int, Reason, Sha256, referred
+from stickslip_schemas.base import Bool, Document, Float, Int, Reason, Sha256, artifact_digest
 from stickslip_schemas.format.manifest import FileEntry, ManifestSection, Rejection
 from stickslip_schemas.kinds import AnyJobSpec, AnyRender, AnySimulation
 from stickslip_schemas.plan.builds import Builds
@@ -54,14 +54,16 @@ class RenderTask(Document):
     preview: Bool = False
     textures: tuple[str, ...] = Field(
         default=(),
-        description="textures to make clips of, one sample each, by name or `sha256:` and digest; none: that of the "
+        description="textures to make clips of, one sample each, by name or `sha256:` and digest; "
+        "none: that of the "
         "render document",
     )
 
 
 class RenderOutput(Document):
-    """Encoded chunks by array name, the digest of the preview if there is one, and labels (colour,
-    ...).
+    """Encoded chunks by array name, and labels such as the colour.
+
+    `preview` is the digest of the preview, if there is one.
 
     With `textures` in the task there are only `clips`.
     """
@@ -88,7 +90,7 @@ class PackSlot(Document):
 
     @property
     def valid(self) -> bool:
-        """True where there is data."""
+        """True if there is data."""
         return self.rejection is None
 
 
@@ -102,8 +104,9 @@ class PackTask(Document):
 
 
 class PackOutput(Document):
-    """The shard's files, in the store, and its labels, which go into files with those of other
-    shards.
+    """Files of the shard, in the store, and its labels.
+
+    Labels go into files together with the labels of other shards.
     """
 
     stage: Literal["pack"] = "pack"
@@ -114,7 +117,7 @@ class PackOutput(Document):
 
 
 class PublishSection(ManifestSection):
-    """A section as the publish task reads it, with the labels of each shard; a temporary artifact."""
+    """A section for the publish task, with the labels of each shard; a temporary artifact."""
 
     labels: tuple[Sha256, ...] = Field(description="see `PackOutput`; by shard")
 
@@ -167,11 +170,15 @@ class TaskResult(Document):
     call_seconds: Float | None = Field(
         default=None,
         ge=0,
-        description="duration of the call, which may include other tasks [s]; null: not usable for estimates",
+        description=(
+            "duration of the call, which may include other tasks [s]; null: not usable for "
+            "estimates"
+        ),
     )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        # Output, reason and damaged inputs each belong to certain outcomes.
         if (self.outcome == "succeeded") != (self.output is not None):
             raise ValueError("output is there exactly when the outcome is succeeded")
         if (self.outcome == "succeeded") != (self.reason is None):
@@ -201,22 +208,26 @@ def input_digests(task: AnyTask, read: Callable[[Sha256], bytes]) -> tuple[Sha25
     `read` reads artifacts that list others, which may be damaged or lost.
     """
     if isinstance(task, RenderTask):
-        pictures = map(referred, task.textures or (task.render.variant,))
+        # Textures of users are artifacts; built-in ones are names.
+        pictures = map(artifact_digest, task.textures or (task.render.variant,))
         return tuple(
             dict.fromkeys([task.record.digest, *filter(None, pictures), *task.render.artifacts])
         )
     if isinstance(task, PublishTask):
+        # The sections, and the files that they list.
         digests = list(task.sections)
         for digest in task.sections:
+            # A section that is lost is itself an input, and the worker reports it.
             with suppress(OSError, ValueError):
                 section = PublishSection.model_validate_json(read(digest))
                 digests += [*(file.sha256 for file in section.files), *section.labels]
         return tuple(dict.fromkeys(digests))
     if isinstance(task, SimulateTask):
         return task.simulation.artifacts
-    records = [slot.record.digest for slot in task.slots if slot.record is not None]
-    return tuple(
-        dict.fromkeys(
-            [*records, *(chunk.digest for slot in task.slots for chunk in slot.chunks.values())]
-        )
-    )
+    # A pack task reads the records and the chunks of its slots.
+    inputs: list[Sha256] = []
+    for slot in task.slots:
+        if slot.record is not None:
+            inputs.append(slot.record.digest)
+        inputs += [chunk.digest for chunk in slot.chunks.values()]
+    return tuple(dict.fromkeys(inputs))

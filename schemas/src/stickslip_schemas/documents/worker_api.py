@@ -46,13 +46,14 @@ class WorkerRegistration(Document):
     @field_validator("builds")
     @classmethod
     def _known_kinds(cls, builds: dict[str, Builds]) -> dict[str, Builds]:
+        # An unknown kind raises UnknownKindError, which lists the known ones.
         for name in builds:
             kind_named(name)
         return builds
 
 
 class WorkerSession(Document):
-    """Answer to a registration: the worker's id, and the duration of a lease without a heartbeat."""
+    """Answer to a registration: the id of the worker, and how long a lease lasts unrenewed."""
 
     worker_id: str
     lease_seconds: float = Field(gt=0)
@@ -105,7 +106,10 @@ class Heartbeat(Document):
 
     worker_id: str
     leases: tuple[LeaseState, ...] = Field(
-        description="all that it holds: one that is not there is taken back when it has had the duration of a lease"
+        description=(
+            "all that it holds: one that is not there is taken back when it has had the "
+            "duration of a lease"
+        )
     )
     condition: WorkerCondition
 

@@ -110,8 +110,7 @@ def _turned(array: ArrayLayout, values: np.ndarray) -> np.ndarray:
 
 
 def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
-    """Return how the axes (sample, ...) of an array are turned before its chunks are coded; None:
-    not at all.
+    """Return the order of the axes (sample, ...) of an array in its chunks; None keeps it.
 
     Those of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate over
     time are neighbours, and bytes of one significance are put together: float32 positions then take
@@ -123,16 +122,14 @@ def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
 
 
 def in_order_of_chunks(array: ArrayLayout, values: np.ndarray) -> bool:
-    """Return whether samples (samples, *sample shape) of an array lie in memory in the order that
-    chunks have.
-    """
+    """Return whether samples (samples, *sample shape) lie in memory in the order of chunks."""
     return bool(
         (values.transpose(axes_order(array)) if array.is_clip else values).flags.c_contiguous
     )
 
 
 def empty_in_order(array: ArrayLayout, count: int) -> np.ndarray:
-    """Return an array (count, *sample shape) in that order: decoding clips into it needs no copy."""
+    """Return an empty array (count, *sample shape) that clips are decoded into without a copy."""
     shape = (count, *array.shape)
     if not array.is_clip:
         return np.empty(shape, dtype=array.dtype)
@@ -149,8 +146,9 @@ def packing(array: ArrayLayout) -> Packing | None:
 
 
 def check_chunk(chunk: bytes) -> None:
-    """Raise CorruptChunkError where the checksum of an encoded chunk does not hold; nothing is
-    decoded.
+    """Raise CorruptChunkError if the checksum of an encoded chunk does not hold.
+
+    Nothing is decoded.
     """
     _without_crc(chunk, "chunk")
 
@@ -214,7 +212,7 @@ def _without_crc(data: bytes, what: str) -> memoryview:
 
 
 def _content_size(frame: memoryview) -> int | None:
-    """Return the decoded size that a zstd frame states [RFC 8878, 3.1.1.1], None if it states none."""
+    """Return the decoded size that a zstd frame states, or None [RFC 8878, 3.1.1.1]."""
     if len(frame) < 6 or bytes(frame[:4]) != b"\x28\xb5\x2f\xfd":
         return None
     descriptor = frame[4]

@@ -86,8 +86,9 @@ class Rejection(Document):
 
 
 class ManifestSection(Document):
-    """What a version has of consecutive shards: their samples and the files of their arrays that
-    are no labels.
+    """Part of a manifest: samples of consecutive shards, and the files of their arrays.
+
+    Files of labels are not among them.
     """
 
     first: Int = Field(ge=0, description="slot of the first sample")
@@ -132,7 +133,10 @@ class Pictures(Document):
     )
     device: str = Field(
         default="cpu",
-        description="what Cycles computed on: `cpu`, or a sort of GPU, whose name and driver are in the build `render`",
+        description=(
+            "what Cycles computed on: `cpu`, or a sort of GPU, whose name and driver are "
+            "in the build `render`"
+        ),
     )
 
 
@@ -152,7 +156,10 @@ class Manifest(Document):
         default=None, description="digest of the certificate of preset and build; null: none"
     )
     cameras: tuple[Camera, ...] = Field(
-        description="of the array `views`, in its order, or of the viewpoints, by name; empty where nothing is rendered"
+        description=(
+            "of the array `views`, in its order, or of the viewpoints, by name; empty "
+            "where nothing is rendered"
+        )
     )
     pictures: Pictures | None = Field(
         default=None, description="quality of the pictures; null: there are none"
@@ -163,7 +170,10 @@ class Manifest(Document):
     rejection_counts: dict[str, int] = Field(description="rejected samples by reason")
     sections: tuple[FileEntry, ...] = Field(
         default=(),
-        description="files that list samples and the files of their shards, by slot; none in a small version",
+        description=(
+            "files that list samples and the files of their shards, by slot; none in a "
+            "small version"
+        ),
     )
     rejections: tuple[Rejection, ...] = Field(
         description="empty where there are sections, which have them"
@@ -172,7 +182,8 @@ class Manifest(Document):
         description="by slot; empty where there are sections, which have them"
     )
     files: tuple[FileEntry, ...] = Field(
-        description="every file of the version, by path, but the three that vouch for it (this one, the root's "
+        description="every file of the version, by path, but the three that vouch for it (this "
+        "one, the root's "
         "zarr.json and manifest.sha256), the sections, and what the sections list"
     )
 
@@ -187,7 +198,8 @@ class Manifest(Document):
         found = [section.path for section in self.sections]
         if found != expected:
             raise ValueError(
-                f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got {found[:5]}"
+                f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got "
+                f"{found[:5]}"
             )
         if self.sample_keys or self.rejections:
             raise ValueError(
@@ -234,8 +246,9 @@ class Contents:
             yield self.section(number)
 
     def files(self) -> Iterator[FileEntry]:
-        """Yield every file of the version, but the three that vouch for it: also the sections
-        themselves.
+        """Yield every file of the version, the sections included.
+
+        The three files that vouch for the version are not listed.
         """
         yield from self.manifest.files
         yield from self.manifest.sections
@@ -295,15 +308,17 @@ class Contents:
         slots = number * self._samples, min((number + 1) * self._samples, manifest.sample_count)
         if (section.first, section.end) != slots:
             raise BrokenSectionError(
-                f"{entry.path} must list the samples {slots[0]} to {slots[1] - 1}, and lists {section.first} to "
+                f"{entry.path} must list the samples {slots[0]} to {slots[1] - 1}, and lists "
+                f"{section.first} to "
                 f"{section.end - 1}"
             )
         return section
 
 
 def seal_text(manifest: Sha256, group: Sha256) -> bytes:
-    """Return the bytes of `manifest.sha256`, from the digests of the manifest and of the root's
-    `zarr.json`.
+    """Return the bytes of `manifest.sha256`.
+
+    They are made from the digests of the manifest and of the `zarr.json` of the root.
     """
     return f"{manifest}  {MANIFEST_NAME}\n{group}  {GROUP_NAME}\n".encode()
 
@@ -339,7 +354,8 @@ def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
         ) from error
     if named != digests[MANIFEST_NAME]:
         raise BrokenSealError(
-            f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, {digests[MANIFEST_NAME]}, "
+            f"{GROUP_NAME}: {MANIFEST_ATTRIBUTE} must be that of {MANIFEST_NAME}, "
+            f"{digests[MANIFEST_NAME]}, "
             f"and is {named}"
         )
     return digests[MANIFEST_NAME]

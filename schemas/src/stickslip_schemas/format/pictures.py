@@ -1,5 +1,4 @@
-"""Picture files: custom textures that are read, and previews that are written (PNG, and WebP that
-moves).
+"""Picture files: textures that are read, and previews in PNG and animated WebP.
 
 Pillow is an extra: each function that needs it imports it.
 """
@@ -55,11 +54,13 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
         width, height = picture.size
         if width != height or not low <= width <= high:
             raise UnfitPictureError(
-                f"a texture must be square, of {low} to {high} pixels a side, and it has {width} x {height}"
+                f"a texture must be square, of {low} to {high} pixels a side, and it has {width} x "
+                f"{height}"
             )
         if picture.mode not in _MODES or getattr(picture, "is_animated", False):
             raise UnfitPictureError(
-                f"a texture must be one picture in grey or colour with 8 bits a channel, and its mode is {picture.mode}"
+                "a texture must be one picture in grey or colour with 8 bits a channel, and its "
+                f"mode is {picture.mode}"
                 + (", animated" if getattr(picture, "is_animated", False) else "")
             )
         if (
@@ -92,8 +93,9 @@ def png(picture: Pictures) -> bytes:
 
 
 def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) -> bytes:
-    """Return pictures (n, height, width, 3) as an animated WebP that repeats forever, 120 ms a
-    picture.
+    """Return pictures (n, height, width, 3) as an animated WebP that repeats forever.
+
+    Each picture lasts 120 ms.
 
     With `side`, pictures are reduced to that width [px].
     """
@@ -115,9 +117,7 @@ def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) ->
 
 
 def labelled(pictures: Pictures, text: str, side: int) -> Pictures:
-    """Return pictures (n, height, width, 3) reduced to squares of `side` pixels, with a text above
-    them.
-    """
+    """Return pictures (n, height, width, 3) as squares of `side` pixels with a text above."""
     from PIL import Image, ImageDraw
 
     small = [np.asarray(_reduced(picture, (side, side))) for picture in pictures]

@@ -56,8 +56,9 @@ class Selection(Document):
     def of_options(
         cls, arrays: str | None, split: str | None, where: Iterable[str] | None
     ) -> "Selection":
-        """Return the part that options of a command choose, `arrays` being names with commas; raise
-        ValueError.
+        """Return the selection that options of a command describe; raise ValueError.
+
+        `arrays` are names with commas between.
         """
         names = (
             None
@@ -95,8 +96,9 @@ class Selection(Document):
     def choose_samples(
         self, arrays: Iterable[ArrayLayout], label: Labels
     ) -> "npt.NDArray[np.bool_]":
-        """Return which slots are of the part, bool (slots,): they are valid, of the split, and hold
-        to the conditions.
+        """Return the chosen slots, bool (slots,).
+
+        A chosen sample is valid, of the split, and meets all conditions.
 
         Raises ValueError for a condition that makes no sense for its label.
         """
@@ -176,7 +178,8 @@ def _holds(
     parts = _CONDITION.fullmatch(condition)
     if parts is None:
         raise ValueError(
-            f"where must be a label, one of {' '.join(_OPERATORS)}, and a value, as in 'mu<0.5'; and is {condition!r}"
+            f"where must be a label, one of {' '.join(_OPERATORS)}, and a value, as in 'mu<0.5'; "
+            f"and is {condition!r}"
         )
     name, sign, value = parts.groups()
     array = arrays.get(name)

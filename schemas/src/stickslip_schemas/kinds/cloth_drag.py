@@ -1,5 +1,6 @@
-"""A square of cloth dropped on a plane and dragged to and fro [thesis, 4.2.3], seen by the rig
-`drag`.
+"""A square of cloth, dropped on a plane and dragged to and fro [thesis, 4.2.3].
+
+The rig `drag` films it.
 """
 
 from collections.abc import Mapping
@@ -174,7 +175,10 @@ class ClothDragSpec(ClipSpec):
         le=161,
         description="vertices along a side of the square mesh",
         json_schema_extra={
-            "x-cost": "CPU time of a dragged cloth, `certified`: 21 takes 4 s, 41 takes 18 s, 81 takes 2 min"
+            "x-cost": (
+                "CPU time of a dragged cloth, `certified`: 21 takes 4 s, 41 takes 18 s, 81 "
+                "takes 2 min"
+            )
         },
     )
     self_friction: Float | None = Field(
@@ -183,7 +187,10 @@ class ClothDragSpec(ClipSpec):
         le=10,
         description="friction coefficient of the cloth with itself; null turns self-contact off",
         json_schema_extra={
-            "x-cost": "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth folds over itself"
+            "x-cost": (
+                "1.1 to 1.2 times the CPU time of null, up to 1.7 times where the cloth "
+                "folds over itself"
+            )
         },
     )
 
@@ -207,8 +214,10 @@ class ClothDragSpec(ClipSpec):
         return self.clip_costs(seconds, uncertainty_factor=2.5)
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: material, friction to one digit, mesh and
-        preset, or the clip.
+        """Return the group of samples that cost about the same.
+
+        Simulations group by material, friction to one digit, mesh and preset; renders by their
+        clip.
         """
         if stage is Stage.render:
             return super().cost_group(stage, point)

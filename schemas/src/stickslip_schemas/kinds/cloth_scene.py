@@ -19,7 +19,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stickslip_schemas.base import Document, Sha256, Stage, referred
+from stickslip_schemas.base import Document, Sha256, Stage, artifact_digest
 from stickslip_schemas.kinds.cloth.arrays import (
     clip_arrays,
     parameter_label,
@@ -40,9 +40,9 @@ from stickslip_schemas.scene.parameters import (
     LOOKS_AXES,
     ParameterName,
     Value,
-    found,
     refuse,
     refuse_as,
+    resolve_path,
     with_values,
 )
 from stickslip_schemas.scene.parts import MeshBody
@@ -99,7 +99,9 @@ class ClothSceneAxes(Document):
     lighting: LampAxis = None
     substrate: SubstrateAxis | None = Field(
         default=None,
-        description="finish of the floor, or a custom one under `substrates`; by default the scene's",
+        description=(
+            "finish of the floor, or a custom one under `substrates`; by default the scene's"
+        ),
     )
 
 
@@ -112,13 +114,13 @@ class ClothSceneSimulation(Simulation):
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:
-        return tuple(filter(None, (referred(name) for _, name in self.scene.files())))
+        return tuple(filter(None, (artifact_digest(name) for _, name in self.scene.files())))
 
     @property
     def vertices(self) -> int:
         return sum(sheet.mesh.shape[0] for sheet in self.scene.sheets.values())
 
-    def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
+    def inputs(self, read: Callable[[str], bytes]) -> dict[str, Any]:
         from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
 
         return {"scene": with_arrays(self.scene, read), "seed": self.seed}
@@ -147,7 +149,12 @@ class ClothSceneRender(ClipRender):
     def artifacts(self) -> tuple[Sha256, ...]:
         return tuple(
             filter(
-                None, (referred(name) for place, name in self.scene.files() if place[0] == "looks")
+                None,
+                (
+                    artifact_digest(name)
+                    for location, name in self.scene.files()
+                    if location[0] == "looks"
+                ),
             )
         )
 
@@ -179,7 +186,7 @@ class ClothSceneSpec(ClipSpec):
         if isinstance(scene := info.data.get("scene"), Scene):
             for path, value in values.items():
                 try:
-                    scene.checked({found(scene.physics(), path): value})
+                    scene.physics_with({resolve_path(scene.physics(), path): value})
                 except LookupError as error:
                     refuse(scene, (path,), str(error.args[0]), path)
                 except ValidationError as error:
@@ -195,23 +202,31 @@ class ClothSceneSpec(ClipSpec):
                     f"must be one of {', '.join((*known, *LOOKS_AXES))}{did_you_mean(name, known)}"
                 )
                 refuse(self, ("axes", name), rule, name)
-            for place, value in extremes(axis):
+            for location, value in extremes(axis):
                 if not known[name].allows(value):
                     refuse(
-                        self, ("axes", name, *place), f"must be within {known[name].range}", value
+                        self,
+                        ("axes", name, *location),
+                        f"must be within {known[name].range}",
+                        value,
                     )
         for corner in self._corners():
             try:
-                self.stage.checked(
-                    {place: v for name, v in corner.items() for place in self.stage.places(name)}
+                self.stage.physics_with(
+                    {
+                        location: v
+                        for name, v in corner.items()
+                        for location in self.stage.locations(name)
+                    }
                 )
             except ValidationError as error:
                 refuse_as(error, self.stage, ("axes",), corner)
         return self
 
     def _corners(self) -> Iterator[dict[str, Any]]:
-        """Yield points that stand for all others: names, and ends of numbers, one by one and two
-        together.
+        """Yield points that stand for all others.
+
+        These are all names, and the ends of ranges of numbers, one by one and two together.
 
         Rules between two numbers are linear, so what holds at all ends holds between them.
         """
@@ -229,14 +244,16 @@ class ClothSceneSpec(ClipSpec):
         """The scene with the values of `set`."""
         document = self.scene.model_dump(mode="json")
         return Scene.model_validate(
-            with_values(document, {found(document, path): v for path, v in self.set.items()})
+            with_values(document, {resolve_path(document, path): v for path, v in self.set.items()})
         )
 
     @cached_property
-    def _places(self) -> dict[str, tuple[str, ...]]:
+    def _parameter_fields(self) -> dict[str, tuple[str, ...]]:
         """Fields of documents that each parameter sets."""
         return {
-            name: tuple("/".join(map(str, ("scene", *place))) for place in self.stage.places(name))
+            name: tuple(
+                "/".join(map(str, ("scene", *location))) for location in self.stage.locations(name)
+            )
             for name in self.stage.parameters
         }
 
@@ -275,18 +292,20 @@ class ClothSceneSpec(ClipSpec):
         return scene_segments(self.stage.sheets, self.stage.bodies)
 
     def fields_of(self, axis: str) -> tuple[str, ...]:
-        return self._places.get(axis) or super().fields_of(axis)
+        return self._parameter_fields.get(axis) or super().fields_of(axis)
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         return (
-            dict.fromkeys(self._places[axis], value)
-            if axis in self._places
+            dict.fromkeys(self._parameter_fields[axis], value)
+            if axis in self._parameter_fields
             else super().document_fields(axis, value)
         )
 
     def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
-        """Return the axes whose values enter a seed: parameters, and for light all that does not
-        share a shading.
+        """Return the axes whose values enter a seed.
+
+        These are the parameters and, for the light, all axes but the texture, on which no shading
+        depends.
         """
         left_out = ("texture",) if rule.purpose == "light" else LOOKS_AXES
         return tuple(axis for axis in self.named_axes if axis not in left_out)
@@ -324,8 +343,9 @@ class ClothSceneSpec(ClipSpec):
         }
 
     def built_in(self, axis: str) -> tuple[str, ...]:
-        """Return the names that an axis may use without a definition in the spec: those of the
-        scene, too.
+        """Return the names that an axis may use without a definition in the spec.
+
+        Names of the scene are among them.
         """
         cameras = self.stage.looks.cameras
         if axis == "viewpoint" and not isinstance(cameras, dict):
@@ -338,8 +358,9 @@ class ClothSceneSpec(ClipSpec):
         return super().meaning(axis, name) or self._own.get(axis, {}).get(name)
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras by name, but for those that frame what moves: each sample has its own
-        of them.
+        """Return the cameras by name.
+
+        Cameras that frame all that moves differ from sample to sample and are not among them.
         """
         given = self.stage.looks.cameras
         rig = load_rig(given) if isinstance(given, str) else ()
@@ -353,9 +374,11 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        files = ((place, referred(name)) for place, name in self.scene.files())
+        files = ((location, artifact_digest(name)) for location, name in self.scene.files())
         return {
-            "/".join(("/scene", *map(str, place))): digest for place, digest in files if digest
+            "/".join(("/scene", *map(str, location))): digest
+            for location, digest in files
+            if digest
         } | super().artifacts
 
     @property
@@ -384,14 +407,15 @@ class ClothSceneSpec(ClipSpec):
         return self.stage.digest[:12]
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        """Return what the cost of a sample hangs on: the scene, names of fabrics, and numbers to
-        one digit.
+        """Return the group of samples that cost about the same.
+
+        Samples group by scene, by names of fabrics, and by numbers to one digit.
         """
         if stage is Stage.render:
             return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
         shown = (
             f"{v:.1g}" if isinstance(v, float) else str(v)
-            for v in (point.get(name) for name in self._places)
+            for v in (point.get(name) for name in self._parameter_fields)
         )
         return ", ".join((self._cost_of_scene, *shown))
 

@@ -100,8 +100,9 @@ class RodHangSpec(JobSpec):
 
     @property
     def needs_certificate(self) -> bool:
-        """Rods are made without a certificate, too: every shape is checked against its own
-        equations.
+        """False: every shape is checked against its own equations.
+
+        So rods need no certificate.
         """
         return False
 
@@ -134,7 +135,10 @@ class RodHangSpec(JobSpec):
             array("views", "sRGB pictures", "uint8", pixels, per_sample=True),
             array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
         )
-        distance = "least distance over L at which the centreline passes another part of itself; infinite where it does not"
+        distance = (
+            "least distance over L at which the centreline passes another part of itself; infinite "
+            "where it does not"
+        )
         return (
             *(
                 array(name, text, "float32", points | of, is_recorded=True)

@@ -1,5 +1,6 @@
-"""Builds: digests of the code that makes data, over the modules that a stage imports, found by
-reading their sources.
+"""Builds: digests of the code that makes data.
+
+A digest covers the modules that a stage imports, which are found by reading their sources.
 
 A build is part of every content key. So a change of a file that a result depends on changes its
 key, and a change of any other file does not. Four rules say what is followed:
@@ -47,40 +48,48 @@ class Builds(Document):
         return dict(zip(Stage, (self.simulate, self.render, self.pack, self.digest), strict=True))
 
 
+# The list of kinds decides on nothing by itself, and it would make every build depend on every
+# kind. The documents that it leads to are in the content keys as a whole. A store returns the bytes
+# that a digest names, or none, so no result depends on how it does that.
 UNCOUNTED = ("stickslip_schemas.kinds", "stickslip_schemas.store", "stickslip_schemas.store.*")
-"""What builds cut. The list of kinds decides on nothing by itself, and it would make every build
-depend on every kind. The documents that it leads to are in the content keys as a whole. A store
-gives the bytes that a digest names, or none: no result depends on how."""
+"""Modules that no build counts."""
 
 OURS = "stickslip_"
-"""How the names of our packages begin."""
+"""Prefix of the names of our packages."""
 
 
 def sources(roots: Iterable[str], *, cut: Collection[str] = ()) -> dict[str, Path]:
-    """Return the files that the modules `roots` are made of, by their paths below the folders of
-    our packages.
+    """Return the source files of the modules `roots` and of all that they import.
+
+    The keys are paths below the folders of our packages.
 
     Modules in `cut` are left out; `package.*` stands for all that is below a package. Raises
     ModuleNotFoundError.
     """
-    found: dict[str, Path] = {}
-    waiting, seen = list(roots), set()
-    while waiting:
-        name = waiting.pop()
-        if name in seen or _is_cut(name, cut):
+    files: dict[str, Path] = {}
+    # A walk over the graph of imports, from the roots on.
+    pending = list(roots)
+    visited: set[str] = set()
+    while pending:
+        name = pending.pop()
+        if name in visited or _is_cut(name, cut):
             continue
-        seen.add(name)
+        visited.add(name)
         path = module_file(name)
-        if path is None:  # compiled; its build is known by other means
+        # The build of a compiled module is the hash of its sources, which it states itself.
+        if path is None:
             continue
-        folder = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        # Paths below our packages are the same on every machine, whatever the folder of the
+        # installation.
         for file in (path, *_data_files(path)):
-            found["/".join([*folder.split("."), file.name])] = file
-        waiting += _imports(path)
-    return found
+            files["/".join([*package.split("."), file.name])] = file
+        pending += _imports(path)
+    return files
 
 
 def digests(files: dict[str, Path]) -> dict[str, str]:
+    """Return the SHA-256 of each file, in the order of their names."""
     return {name: sha256(path.read_bytes()) for name, path in sorted(files.items())}
 
 
@@ -102,7 +111,8 @@ def _package_folder(package: str) -> Path:
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         raise ModuleNotFoundError(f"there is no package {package}", name=package)
-    folders = [Path(place) for place in spec.submodule_search_locations]
+    # An editable installation may add a folder that has only the compiled module.
+    folders = [Path(folder) for folder in spec.submodule_search_locations]
     return next(folder for folder in folders if (folder / "__init__.py").is_file())
 
 
@@ -115,54 +125,63 @@ def _is_cut(name: str, cut: Collection[str]) -> bool:
 
 def _data_files(module: Path) -> list[Path]:
     """Return the files beside a module that it names."""
-    words = {node.value for node in ast.walk(_parsed(module)) if isinstance(node, ast.Constant)}
-    beside = (
+    strings = {node.value for node in ast.walk(_parse(module)) if isinstance(node, ast.Constant)}
+    # Sources beside it count only if it imports them, which `sources` follows.
+    return [
         file
         for file in sorted(module.parent.iterdir())
-        if file.is_file() and file.suffix not in (".py", ".pyi")
-    )
-    return [file for file in beside if file.name in words]
+        if file.is_file() and file.suffix not in (".py", ".pyi") and file.name in strings
+    ]
 
 
 def _imports(path: Path) -> Iterator[str]:
     """Yield the modules of ours that a file imports."""
-    for node in _import_nodes(_parsed(path)):
+    for node in _import_nodes(_parse(path)):
         if isinstance(node, ast.Import):
+            # import stickslip_x.y
             yield from (alias.name for alias in node.names if alias.name.startswith(OURS))
         elif (node.module or "").startswith(OURS):
+            # from stickslip_x import y: `y` may be a module, or a name from anywhere else
             for alias in node.names:
-                yield _home(str(node.module), alias.name)
+                yield _defining_module(str(node.module), alias.name)
 
 
 def _import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             yield node
+        # What only type checkers import decides on no result.
         elif not (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")):
             yield from _import_nodes(node)
 
 
-def _home(module: str, name: str) -> str:
+def _defining_module(module: str, name: str) -> str:
     """Return the module that `from module import name` gets the name from."""
     path = module_file(module)
+    # Only the `__init__` of a package passes names on.
     if path is None or path.name != "__init__.py":
         return module
-    if (path.parent / name).is_dir() or any(
-        (path.parent / f"{name}{end}").is_file() for end in (".py", ".pyi")
-    ):
+    if _is_submodule(path.parent, name):
         return f"{module}.{name}"
-    for node in _import_nodes(_parsed(path)):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(OURS):
-            for alias in node.names:
-                if (alias.asname or alias.name) == name:
-                    return _home(str(node.module), alias.name)
+    for node in _import_nodes(_parse(path)):
+        if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith(OURS):
+            continue
+        for alias in node.names:
+            if (alias.asname or alias.name) == name:
+                return _defining_module(str(node.module), alias.name)
     return module
 
 
+def _is_submodule(package: Path, name: str) -> bool:
+    sources = (package / f"{name}.py", package / f"{name}.pyi")
+    return (package / name).is_dir() or any(source.is_file() for source in sources)
+
+
 @cache
-def _parsed_text(path: Path, _changed: int) -> ast.Module:
+def _parse_version(path: Path, _modified_ns: int) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def _parsed(path: Path) -> ast.Module:
-    return _parsed_text(path, path.stat().st_mtime_ns)
+def _parse(path: Path) -> ast.Module:
+    # The time of the last change is part of the cache's key: a process may outlive an edit.
+    return _parse_version(path, path.stat().st_mtime_ns)

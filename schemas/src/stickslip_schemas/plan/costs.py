@@ -42,8 +42,9 @@ class Counts:
     """Renders that differ in more than the axis of variants."""
     shards: int
     expected_splits: dict[str, int]
-    """Samples by split if each split got exactly its share; splits are drawn, so real numbers
-    differ a little.
+    """Samples by split if each split got exactly its fraction.
+
+    Splits are drawn, so real numbers differ a little.
     """
 
     @property
@@ -58,58 +59,75 @@ def count(spec: JobSpec) -> Counts:
     seeds, and a render where they agree in those of the render, too. Time and memory grow with the
     longest axis, not with the grid.
     """
-    physical = _axes_of(spec, spec.simulation_type, spec.simulation_seeds)
-    seen = physical | _axes_of(spec, spec.render_type, spec.render_seeds)
-    bounds = [0.0, spec.splits.train, spec.splits.train + spec.splits.validation, 1.0]
-    ends = [round(bound * spec.sample_count) for bound in bounds]
+    simulation_axes = _entering_axes(spec, spec.simulation_type, spec.simulation_seeds)
+    render_axes = simulation_axes | _entering_axes(spec, spec.render_type, spec.render_seeds)
+
+    render_count = 0
+    shadings = 0
+    if spec.render_settings() is not None:
+        render_count = _distinct_points(spec, render_axes)
+        # Renders that differ only in the variant, such as the texture, share a shading.
+        shadings = _distinct_points(spec, render_axes - {spec.variant_axis})
+
     return Counts(
         sample_count=spec.sample_count,
-        simulation_count=_distinct(spec, physical),
-        render_count=0 if spec.render_settings() is None else _distinct(spec, seen),
-        shadings=0
-        if spec.render_settings() is None
-        else _distinct(spec, seen - {spec.variant_axis}),
+        simulation_count=_distinct_points(spec, simulation_axes),
+        render_count=render_count,
+        shadings=shadings,
         shards=ceil(spec.sample_count / spec.samples_per_shard),
-        expected_splits={
-            name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(ends), strict=True)
-        },
+        expected_splits=_expected_splits(spec),
     )
 
 
-def _axes_of(spec: JobSpec, document: type[Document], seeds: Collection[SeedRule]) -> set[str]:
-    """Return the axes that a document of a sample depends on."""
-    entering = {axis for rule in seeds for axis in spec.seed_axes(rule)}
-    fields = document.model_fields
-    return entering | {
-        a
-        for a in spec.named_axes
-        if any(path.partition("/")[0] in fields for path in spec.fields_of(a))
-    }
+def _expected_splits(spec: JobSpec) -> dict[str, int]:
+    """Return the number of samples of each split if each got exactly its fraction."""
+    bounds = [0.0, spec.splits.train, spec.splits.train + spec.splits.validation, 1.0]
+    # The bounds are rounded, not the sizes: so the sizes add up to the number of samples.
+    slots = [round(bound * spec.sample_count) for bound in bounds]
+    return {name: stop - start for name, (start, stop) in zip(SPLITS, pairwise(slots), strict=True)}
 
 
-def _distinct(spec: JobSpec, names: Collection[str]) -> int:
+def _entering_axes(
+    spec: JobSpec, document: type[Document], seeds: Collection[SeedRule]
+) -> set[str | None]:
+    """Return the axes that a document of a sample depends on, by its fields or by its seeds."""
+    axes: set[str | None] = set()
+    for rule in seeds:
+        axes.update(spec.seed_axes(rule))
+    for axis in spec.named_axes:
+        # A path "field/inner/..." sets a value inside of a field.
+        field_names = {path.partition("/")[0] for path in spec.fields_of(axis)}
+        if not field_names.isdisjoint(document.model_fields):
+            axes.add(axis)
+    return axes
+
+
+def _distinct_points(spec: JobSpec, names: Collection[str | None]) -> int:
     """Return how many different values some axes take together over the grid."""
     axes = [
-        (place, axis) for place, (name, axis) in enumerate(spec.named_axes.items()) if name in names
+        (dimension, axis)
+        for dimension, (name, axis) in enumerate(spec.named_axes.items())
+        if name in names
     ]
-    # A narrow range holds fewer numbers than it may be asked for, and zipped lists may repeat
-    # values.
+    # Values are counted, not taken from `num`: a narrow range holds fewer different numbers than
+    # it may be asked for, and zipped lists may repeat values.
     if spec.combine == "product":
         return prod(len(set(axis_values(axis))) for _, axis in axes)
+
     import numpy as np  # the extra `arrays`
 
-    rows = np.zeros(spec.sample_count, dtype=np.int64)
-    for place, axis in axes:
-        values = axis_values(axis, dimension=place)
+    # Number the rows of the zipped columns: after each axis, two samples have the same number if
+    # they agree in all axes so far.
+    row_codes = np.zeros(spec.sample_count, dtype=np.int64)
+    for dimension, axis in axes:
+        values = axis_values(axis, dimension=dimension)
         codes = {value: code for code, value in enumerate(dict.fromkeys(values))}
-        if (
-            len(codes) == spec.sample_count
-        ):  # zipped axes have one length: this one tells all samples apart
+        # Zipped axes have one length, so this axis alone tells all samples apart.
+        if len(codes) == spec.sample_count:
             return spec.sample_count
-        _, rows = np.unique(
-            rows * len(codes) + [codes[value] for value in values], return_inverse=True
-        )
-    return int(rows.max()) + 1
+        column = [codes[value] for value in values]
+        _, row_codes = np.unique(row_codes * len(codes) + column, return_inverse=True)
+    return int(row_codes.max()) + 1
 
 
 class MachineSpeed(Document):

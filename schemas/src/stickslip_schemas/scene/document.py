@@ -8,14 +8,14 @@ from pydantic import Field, ValidationError, model_validator
 
 from stickslip_schemas.base import Document, Float, content_key
 from stickslip_schemas.scene.parameters import (
+    Location,
     Parameter,
     ParameterName,
-    Path,
     Value,
-    at,
-    found,
     refuse,
     refuse_as,
+    resolve_path,
+    value_at,
     with_values,
 )
 from stickslip_schemas.scene.parts import (
@@ -95,7 +95,9 @@ class Physics(Document):
     calm: Calm | None = None
     bearing: Literal["all", "vertices", "first"] = Field(
         default="all",
-        description="who bears friction between sheets: both, vertices on triangles, or the first sheet's",
+        description=(
+            "who bears friction between sheets: both, vertices on triangles, or the first sheet's"
+        ),
     )
     preset: PresetName = Field(default=PresetName.certified, description="named solver settings")
     materials: Annotated[dict[CustomName, FabricNumbers], BY_NAME] = Field(
@@ -122,8 +124,9 @@ class Physics(Document):
         )
 
     def pairs(self) -> Iterator[tuple[str, str]]:
-        """Yield each two that may touch: sheets with each other and with themselves, and sheets
-        with bodies.
+        """Yield each two things that may touch.
+
+        Sheets touch each other, themselves and bodies.
         """
         for one, other in combinations_with_replacement(self.sheets, 2):
             if one != other or self.sheets[one].self_contact:
@@ -137,9 +140,9 @@ class Physics(Document):
         assert self.default_friction is not None
         return self.default_friction
 
-    def files(self) -> Iterator[tuple[Path, str]]:
-        """Yield the files that the physics names: their place in the document, and their name."""
-        motions: list[tuple[Path, Motion | None]] = []
+    def files(self) -> Iterator[tuple[Location, str]]:
+        """Yield the files that the physics names: their location in the document, and their name."""
+        motions: list[tuple[Location, Motion | None]] = []
         for name, sheet in self.sheets.items():
             if isinstance(sheet.mesh, FileMesh):
                 yield ("sheets", name, "mesh", "file"), sheet.mesh.file
@@ -155,7 +158,9 @@ class Physics(Document):
             if not isinstance(body, Plane):
                 motions.append((("bodies", name, "motion"), body.motion))
         yield from (
-            ((*place, "path"), motion.path) for place, motion in motions if motion and motion.path
+            ((*location, "path"), motion.path)
+            for location, motion in motions
+            if motion and motion.path
         )
 
     @model_validator(mode="after")
@@ -181,7 +186,10 @@ class Physics(Document):
                 self.duration,
             )
         if self.frames > MAX_FRAMES:
-            rule = f"length [s] times frame_rate [1/s] must be at most {MAX_FRAMES} frames, and gives {self.frames}"
+            rule = (
+                f"length [s] times frame_rate [1/s] must be at most {MAX_FRAMES} frames, and gives "
+                f"{self.frames}"
+            )
             refuse(self, ("frame_rate",), rule, self.frame_rate)
         vertices = sum(sheet.mesh.shape[0] for sheet in self.sheets.values())
         if vertices > MAX_VERTICES:
@@ -198,11 +206,14 @@ class Physics(Document):
                 )
             count = sheet.mesh.shape[0]
             if count * self.frames > MAX_TRACK:
-                rule = f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and {self.frames}"
+                rule = (
+                    f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and "
+                    f"{self.frames}"
+                )
                 refuse(self, ("sheets", name, "mesh"), rule, count * self.frames)
             for key, held in sheet.holders.items():
                 if count and held.vertices and max(held.vertices) >= count:
-                    place = (
+                    location = (
                         "sheets",
                         name,
                         "holders",
@@ -212,7 +223,7 @@ class Physics(Document):
                     )
                     refuse(
                         self,
-                        place,
+                        location,
                         f"must be a vertex of the sheet, below {count}",
                         max(held.vertices),
                     )
@@ -229,18 +240,21 @@ class Physics(Document):
             )
         there = {frozenset(pair) for pair in self.pairs()}
         named: set[frozenset[str]] = set()
-        for place, pair in enumerate(self.friction):
+        for location, pair in enumerate(self.friction):
             two = frozenset(pair.between)
             if two not in there:
                 refuse(
                     self,
-                    ("friction", place, "between"),
+                    ("friction", location, "between"),
                     "must name two that may touch",
                     list(pair.between),
                 )
             if two in named:
                 refuse(
-                    self, ("friction", place, "between"), "must name two once", list(pair.between)
+                    self,
+                    ("friction", location, "between"),
+                    "must name two once",
+                    list(pair.between),
                 )
             named.add(two)
         if self.default_friction is None and (
@@ -261,8 +275,8 @@ class Staged(Physics):
         """The sheet that takes the axis `texture`: the first without a texture of its own."""
         return next(name for name in self.sheets if name not in self.looks.sheets)
 
-    def files(self) -> Iterator[tuple[Path, str]]:
-        """Yield the files that the scene names: their place in the document, and their name."""
+    def files(self) -> Iterator[tuple[Location, str]]:
+        """Yield the files that the scene names: their location in the document, and their name."""
         yield from super().files()
         for name, look in self.looks.sheets.items():
             if look.texture not in list(Texture):
@@ -314,28 +328,28 @@ class Scene(Staged):
         """Return the part of the document, as JSON, that a trajectory depends on."""
         return self.model_dump(mode="json", include=set(Physics.model_fields))
 
-    def places(self, parameter: str) -> tuple[Path, ...]:
-        """Return the places in the document that a parameter sets."""
+    def locations(self, parameter: str) -> tuple[Location, ...]:
+        """Return the locations in the document that a parameter sets."""
         document = self.physics()
-        return tuple(found(document, path) for path in self.parameters[parameter].sets)
+        return tuple(resolve_path(document, path) for path in self.parameters[parameter].sets)
 
     def default(self, parameter: str) -> Value:
         """Return the value of a parameter where no axis gives one: what the document says."""
-        value: Value = at(self.physics(), self.places(parameter)[0])
+        value: Value = value_at(self.physics(), self.locations(parameter)[0])
         return value
 
-    def checked(self, values: Mapping[Path, Any]) -> Physics:
-        """Return the physics with other values at places of the document; raise ValidationError."""
+    def physics_with(self, values: Mapping[Location, Any]) -> Physics:
+        """Return the physics with other values at locations of the document; raise ValidationError."""
         return Physics.model_validate(with_values(self.physics(), values))
 
     @model_validator(mode="after")
     def _parameters_fit(self) -> Self:
-        document, taken = self.physics(), dict[Path, str]()
+        document, taken = self.physics(), dict[Location, str]()
         for name, parameter in self.parameters.items():
             parameter.check(self, name, document, taken)
             for end, value in parameter.extremes:
                 try:
-                    self.checked(dict.fromkeys(self.places(name), value))
+                    self.physics_with(dict.fromkeys(self.locations(name), value))
                 except ValidationError as error:
                     refuse_as(error, self, ("parameters", name, *end), value)
         return self

@@ -1,6 +1,6 @@
 """The files of a scene: limits, references by digest, and the arrays that they hold.
 
-What a file is for follows from its place in the document: a flat pattern, a start, a body, a motion
+What a file is for follows from its location in the document: a flat pattern, a start, a body, a motion
 or a texture.
 """
 
@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from pathlib import Path as LocalPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from stickslip_schemas.base import ARTIFACT, sha256
 from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
 from stickslip_schemas.scene.errors import UnfitFileError as UnfitFileError
 from stickslip_schemas.scene.gate import MAX_FILE_BYTES, MAX_TRIANGLES, check_file
-from stickslip_schemas.scene.parameters import Path, at, with_values
+from stickslip_schemas.scene.parameters import Location, value_at, with_values
 from stickslip_schemas.scene.parts import MeshBody
 
 FARTHEST = 100.0
@@ -45,29 +45,31 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
     digest.
 
     `read` returns the bytes of a file by its name. Raises UnfitFileError for a file that is not
-    what the scene needs there; the message begins with the place.
+    what the scene needs there; the message begins with the location.
     """
-    values: dict[Path, Any] = {}
+    values: dict[Location, Any] = {}
     found: dict[str, bytes] = {}
-    for place, name in scene.files():
+    for location, name in scene.files():
         if name.startswith(ARTIFACT):
             continue
         try:
             data = read(name)
             if (
-                counts := _counts(place, {} if place[0] == "looks" else read_file(place, data))
+                counts := _counts(
+                    location, {} if location[0] == "looks" else read_file(location, data)
+                )
             ) is not None:
-                values[(*place[:-1], "counts")] = counts
+                values[(*location[:-1], "counts")] = counts
         except (UnfitFileError, OSError) as error:
             rule = (
                 str(error)
                 if isinstance(error, UnfitFileError)
                 else f"must be readable: {error.strerror}"
             )
-            raise UnfitFileError(f"{'.'.join(map(str, place))}: {rule}, in {name}") from error
+            raise UnfitFileError(f"{'.'.join(map(str, location))}: {rule}, in {name}") from error
         digest = sha256(data)
         found[digest] = data
-        values[place] = f"{ARTIFACT}{digest}"
+        values[location] = f"{ARTIFACT}{digest}"
     return Scene.model_validate(with_values(scene.model_dump(mode="json"), values)), found
 
 
@@ -78,14 +80,16 @@ def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any
     `read` returns the bytes of an artifact by its digest. Raises UnfitFileError.
     """
     files = Physics.files(physics)
-    arrays = {place: read_file(place, read(name.removeprefix(ARTIFACT))) for place, name in files}
+    arrays = {
+        location: read_file(location, read(name.removeprefix(ARTIFACT))) for location, name in files
+    }
     found: dict[str, Any] = with_values(
         physics.model_dump(mode="json", include=set(Physics.model_fields)), arrays
     )
     return found
 
 
-def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
+def frames_of(files: Sequence[Path], scene: Scene, name: str) -> bytes:
     """Return a folder of OBJ files, one a frame of the body that names it, as one NPZ file.
 
     Raise UnfitFileError.
@@ -101,7 +105,8 @@ def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
     for file, (vertices, triangles, _) in zip(files, frames, strict=True):
         if vertices.shape != frames[0][0].shape or not np.array_equal(triangles, frames[0][1]):
             raise UnfitFileError(
-                f"{file.name} must have the vertices and faces of {files[0].name}, in the same order"
+                f"{file.name} must have the vertices and faces of {files[0].name}, in the same "
+                "order"
             )
     packed = io.BytesIO()
     times = np.arange(len(files)) / rates[0]
@@ -114,26 +119,28 @@ def frames_of(files: Sequence[LocalPath], scene: Scene, name: str) -> bytes:
     return packed.getvalue()
 
 
-def check_scene_file(scene: Scene, place: Path, data: bytes) -> None:
+def check_scene_file(scene: Scene, location: Location, data: bytes) -> None:
     """Raise UnfitFileError where a file in the store is not what a scene needs, or has not the
     counts that it gives.
     """
-    found, document = read_file(place, data), scene.physics()
-    counts = _counts(place, found)
-    if counts is not None and (said := at(document, (*place[:-1], "counts"))) != list(counts):
+    found, document = read_file(location, data), scene.physics()
+    counts = _counts(location, found)
+    if counts is not None and (said := value_at(document, (*location[:-1], "counts"))) != list(
+        counts
+    ):
         raise UnfitFileError(
             f"counts must be the vertices and triangles of the file, {list(counts)}, and are {said}"
         )
-    if place[0] == "sheets" and place[2] == "start":
-        vertices, expected = found["positions"], scene.sheets[str(place[1])].mesh.shape[0]
+    if location[0] == "sheets" and location[2] == "start":
+        vertices, expected = found["positions"], scene.sheets[str(location[1])].mesh.shape[0]
         if len(vertices) != expected:
             raise UnfitFileError(
                 f"must have the vertices of its sheet, {expected}, and has {len(vertices)}"
             )
 
 
-def read_file(place: Path, data: bytes) -> Arrays:
-    """Return the arrays of a file at a place in the physics; raise UnfitFileError.
+def read_file(location: Location, data: bytes) -> Arrays:
+    """Return the arrays of a file at a location in the physics; raise UnfitFileError.
 
     - a flat pattern: `rest` (V, 2), `positions` (V, 3) [m] and `triangles` (T, 3)
     - a start: `positions` (V, 3) [m]
@@ -142,18 +149,18 @@ def read_file(place: Path, data: bytes) -> Arrays:
       `rest` (N, 3) [m], `weights` (N, B) and `bones` (F, B, 3, 4), x -> A x + b
     """
     check_file(data)
-    if place[-1] == "path":
+    if location[-1] == "path":
         return _path(data)
-    if place[0] == "bodies":
+    if location[0] == "bodies":
         return _body(data)
-    return _start(data) if place[2] == "start" else _pattern(data)
+    return _start(data) if location[2] == "start" else _pattern(data)
 
 
-def _counts(place: Path, found: Arrays) -> tuple[int, int] | None:
+def _counts(location: Location, found: Arrays) -> tuple[int, int] | None:
     """Return the numbers of vertices and triangles of a flat pattern."""
     return (
         (len(found["rest"]), len(found["triangles"]))
-        if place[0] == "sheets" and "rest" in found
+        if location[0] == "sheets" and "rest" in found
         else None
     )
 
@@ -183,9 +190,10 @@ def _pattern(data: bytes) -> Arrays:
     u, v = (flat[triangles[:, corner]] - flat[triangles[:, 0]] for corner in (1, 2))
     area = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     if not (area > 0).all():
-        place = int(np.argmin(area))
+        location = int(np.argmin(area))
         raise UnfitFileError(
-            f"all triangles of the flat pattern must have areas above 0 m^2; {place} has {area[place]:g}"
+            f"all triangles of the flat pattern must have areas above 0 m^2; {location} has "
+            f"{area[location]:g}"
         )
     _check_edges(triangles, len(vertices))
     if len(np.unique(triangles)) != len(vertices):
@@ -228,7 +236,8 @@ def _path(data: bytes) -> Arrays:
     lines = _text(data).splitlines()
     if not lines or lines[0].replace(" ", "") != "time,x,y,z,rx,ry,rz":
         raise UnfitFileError(
-            f"must begin with the line time,x,y,z,rx,ry,rz, and begins with {''.join(lines[:1])[:80]!r}"
+            "must begin with the line time,x,y,z,rx,ry,rz, and begins with "
+            f"{''.join(lines[:1])[:80]!r}"
         )
     rows = []
     for number, line in enumerate(lines[1:], 2):
@@ -310,7 +319,8 @@ def _check_edges(triangles: Triangles, vertices: int) -> None:
     """
     if vertices > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
         raise UnfitFileError(
-            f"must have at most {MAX_VERTICES} vertices and {MAX_TRIANGLES} triangles, and has {vertices} and "
+            f"must have at most {MAX_VERTICES} vertices and {MAX_TRIANGLES} triangles, and has "
+            f"{vertices} and "
             f"{len(triangles)}"
         )
     if len(same := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))):
@@ -371,7 +381,8 @@ def read_obj(data: bytes) -> tuple[Floats, Triangles, Floats | None]:
                 for vertex, of_texture in corners:
                     if of_texture is not None and flat.setdefault(vertex, of_texture) != of_texture:
                         raise UnfitFileError(
-                            f"line {number}: a vertex must have one texture coordinate, and {vertex + 1} has two"
+                            f"line {number}: a vertex must have one texture coordinate, and "
+                            f"{vertex + 1} has two"
                         )
                 names = [vertex for vertex, _ in corners]
                 triangles += [(names[0], b, c) for b, c in pairwise(names[1:])]

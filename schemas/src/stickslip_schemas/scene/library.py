@@ -69,14 +69,16 @@ def load_scene(name: str) -> Scene:
     """
     if name not in scene_names():
         raise ValueError(
-            f"must be one of {', '.join(scene_names())}, or a scene{did_you_mean(name, scene_names())}"
+            f"must be one of {', '.join(scene_names())}, or a "
+            f"scene{did_you_mean(name, scene_names())}"
         )
     return _loaded(name)[0]
 
 
 @cache
 def built_in_files() -> dict[str, bytes]:
-    """Return the files that built-in scenes name, by digest: a coordinator stores them when a job
-    needs them.
+    """Return the files that built-in scenes name, by digest.
+
+    A coordinator stores them when a job needs them.
     """
     return {digest: data for name in scene_names() for digest, data in _loaded(name)[1].items()}

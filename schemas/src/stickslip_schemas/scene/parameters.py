@@ -1,4 +1,4 @@
-"""What of a scene may vary: parameters, and paths into the document that they set."""
+"""Parameters of a scene, and the paths into the document that they set."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Never
@@ -6,11 +6,11 @@ from typing import Annotated, Any, Never
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base import Document, Float, placed, unit_in, unit_of
+from stickslip_schemas.base import Document, Float, replace_at, unit_in, unit_of
 from stickslip_schemas.spec.names import CustomName, did_you_mean
 
-Path = tuple[str | int, ...]
-"""A place in a document: names, and positions in lists."""
+Location = tuple[str | int, ...]
+"""A location in a document: names, and positions in lists."""
 
 ParameterName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
 
@@ -25,9 +25,9 @@ _FIXED = ("duration", "end", "frame_rate", "spacing")
 
 
 class Parameter(Document):
-    """What may vary: one value, which is set at one or several places of the document.
+    """What may vary: one value, which is set at one or several locations of the document.
 
-    The document itself has the default at these places.
+    The document itself has the default at these locations.
     """
 
     unit: Annotated[str, StringConstraints(max_length=32)] = Field(
@@ -44,13 +44,13 @@ class Parameter(Document):
     description: str = Field(default="", max_length=300, description="for people")
 
     def check(
-        self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Path, str]
+        self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Location, str]
     ) -> None:
         """Check a parameter of a scene, whose `document` is JSON.
 
-        `taken` has the places of parameters before it.
+        `taken` has the locations of parameters before it.
         """
-        here: Path = ("parameters", name)
+        here: Location = ("parameters", name)
         if name in LOOKS_AXES:
             refuse(
                 scene,
@@ -60,29 +60,32 @@ class Parameter(Document):
             )
         defaults = []
         for number, path in enumerate(self.sets):
-            place_here = (*here, "sets", number)
+            path_location = (*here, "sets", number)
             try:
-                place = found(document, path)
+                location = resolve_path(document, path)
             except LookupError as error:
-                refuse(scene, place_here, str(error.args[0]), path)
-            value = at(document, place)
-            is_number = isinstance(value, float) and not set(place) & {*_FIXED}
+                refuse(scene, path_location, str(error.args[0]), path)
+            value = value_at(document, location)
+            is_number = isinstance(value, float) and not set(location) & {*_FIXED}
             sized = (
-                place[0] == "sheets"
-                and place[2] == "mesh"
-                and document["sheets"][place[1]]["mesh"]["type"] != "grid"
+                location[0] == "sheets"
+                and location[2] == "mesh"
+                and document["sheets"][location[1]]["mesh"]["type"] != "grid"
             )
-            if not ((is_number and not sized) or place[-1] == "material"):
-                rule = "must lead to a number or a material, and not to what decides on shapes of arrays or on files"
-                refuse(scene, place_here, rule, path)
-            if is_number and self.unit != (unit := unit_in(scene, place)):
+            if not ((is_number and not sized) or location[-1] == "material"):
+                rule = (
+                    "must lead to a number or a material, and not to what decides on shapes of "
+                    "arrays or on files"
+                )
+                refuse(scene, path_location, rule, path)
+            if is_number and self.unit != (unit := unit_in(scene, location)):
                 refuse(scene, (*here, "unit"), f"must be {unit}, as of {path}", self.unit)
-            if place in taken:
-                refuse(scene, place_here, f"must not lead where {taken[place]!r} does", path)
-            taken[place] = name
+            if location in taken:
+                refuse(scene, path_location, f"must not lead where {taken[location]!r} does", path)
+            taken[location] = name
             defaults.append(value)
         if len(set(defaults)) > 1:
-            rule = "must find one value, the default, at all places"
+            rule = "must find one value, the default, at all locations"
             refuse(
                 scene,
                 (*here, "sets"),
@@ -91,7 +94,7 @@ class Parameter(Document):
             )
         self._check_range(scene, here, defaults[0])
 
-    def _check_range(self, scene: Any, here: Path, default: Value) -> None:
+    def _check_range(self, scene: Any, here: Location, default: Value) -> None:
         if isinstance(default, str) or self.values is not None:
             for end in ("low", "high"):
                 if getattr(self, end) is not None:
@@ -123,15 +126,16 @@ class Parameter(Document):
             )
 
     @property
-    def extremes(self) -> list[tuple[Path, Value]]:
-        """Values that stand for all others, each with its place in the parameter: rules of numbers
-        are ranges.
+    def extremes(self) -> list[tuple[Location, Value]]:
+        """Values that stand for all others, each with its position in the parameter.
+
+        Rules of numbers are ranges, so the ends of a range stand for it.
         """
-        listed: list[tuple[Path, Value | None]] = [
+        listed: list[tuple[Location, Value | None]] = [
             (("values", at), value) for at, value in enumerate(self.values or ())
         ]
-        places = [*listed, (("low",), self.low), (("high",), self.high)]
-        return [(place, value) for place, value in places if value is not None]
+        locations = [*listed, (("low",), self.low), (("high",), self.high)]
+        return [(location, value) for location, value in locations if value is not None]
 
     @property
     def range(self) -> str:
@@ -148,8 +152,8 @@ class Parameter(Document):
         return isinstance(value, float | int) and self.low <= value <= self.high
 
 
-def found(document: Mapping[str, Any], path: str) -> Path:
-    """Return the place that a dotted path leads to.
+def resolve_path(document: Mapping[str, Any], path: str) -> Location:
+    """Return the location that a dotted path leads to.
 
     `friction.A.B` finds the coefficient of two in any order.
 
@@ -164,7 +168,7 @@ def found(document: Mapping[str, Any], path: str) -> Path:
             f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}"
         )
     here: Any = document
-    place: list[str | int] = []
+    location: list[str | int] = []
     for word in words:
         step: str | int = int(word) if isinstance(here, list) and word.isdecimal() else word
         known = (
@@ -176,41 +180,43 @@ def found(document: Mapping[str, Any], path: str) -> Path:
         )
         if step not in known:
             names = [str(name) for name in known]
-            where = ".".join(map(str, place)) or "the document"
+            where = ".".join(map(str, location)) or "the document"
             raise LookupError(
-                f"must be a path into the document: {where} has no {word!r}{did_you_mean(word, names)}"
+                f"must be a path into the document: {where} has no "
+                f"{word!r}{did_you_mean(word, names)}"
                 + (f"; it has {', '.join(names[:32])}" if names else "")
             )
         here = here[step]
-        place.append(step)
-    return tuple(place)
+        location.append(step)
+    return tuple(location)
 
 
-def at(document: Any, place: Path) -> Any:
-    for step in place:
+def value_at(document: Any, location: Location) -> Any:
+    for step in location:
         document = document[step]
     return document
 
 
-def with_values(document: Any, values: Mapping[Path, Any]) -> Any:
-    """Return a copy of a document with other values at some places."""
-    for place, value in values.items():
-        document = placed(document, place, value)
+def with_values(document: Any, values: Mapping[Location, Any]) -> Any:
+    """Return a copy of a document with other values at some locations."""
+    for location, value in values.items():
+        document = replace_at(document, location, value)
     return document
 
 
-def refuse(model: BaseModel, place: Path, rule: str, value: Any) -> Never:
-    """Raise a ValidationError that names a place in a document, the rule that it breaks, and its
-    value.
+def refuse(model: BaseModel, location: Location, rule: str, value: Any) -> Never:
+    """Raise a ValidationError for one value of a document.
+
+    It names the position, the rule that does not hold, and the value.
     """
     broken = PydanticCustomError("broken_rule", "{rule}", {"rule": rule})
     raise ValidationError.from_exception_data(
-        type(model).__name__, [InitErrorDetails(type=broken, loc=place, input=value)]
+        type(model).__name__, [InitErrorDetails(type=broken, loc=location, input=value)]
     )
 
 
-def refuse_as(error: ValidationError, scene: BaseModel, place: Path, value: Any) -> Never:
+def refuse_as(error: ValidationError, scene: BaseModel, location: Location, value: Any) -> Never:
     """Raise a ValidationError for a value that another part of a document, a scene, makes wrong."""
     first = error.errors(include_url=False)[0]
     rule = first["msg"].removeprefix("Value error, ") + unit_of(first, type(scene))
-    refuse(scene, place, f"sets {'.'.join(map(str, first['loc']))}: {rule}", value)
+    refuse(scene, location, f"sets {'.'.join(map(str, first['loc']))}: {rule}", value)

@@ -32,8 +32,9 @@ Time = Annotated[Float, Field(ge=0, le=10_000)]
 
 
 def _below_the_scene(name: str) -> str:
-    """Return the name of a file: a reference to an artifact, or a path that stays in the folder of
-    the scene.
+    """Return the name of a file if it may stand in a scene; raise ValueError.
+
+    It is a reference to an artifact, or a path within the folder of the scene.
     """
     if name.startswith(ARTIFACT):
         if not is_sha256(name.removeprefix(ARTIFACT)):
@@ -98,19 +99,25 @@ class Motion(Document):
     spin: Spin | None = None
     path: FileName | None = Field(
         default=None,
-        description="a CSV file with the columns time, x, y, z, rx, ry, rz, or an NPZ file with time (K), move (K, 3) "
+        description="a CSV file with the columns time, x, y, z, rx, ry, rz, or an NPZ file with "
+        "time (K), move (K, 3) "
         "and turn (K, 3): [s], [m], [rad], since the start",
     )
     interpolation: Literal["smooth", "linear"] = Field(
         default="smooth",
-        description="smooth: without overshoot, at rest at the first and the last key; linear: at even speed between",
+        description=(
+            "smooth: without overshoot, at rest at the first and the last key; linear: at "
+            "even speed between"
+        ),
     )
     ramp: Time = Field(
         default=0.0, description="time in which a linear motion changes its speed at each key [s]"
     )
     about: Vector | None = Field(
         default=None,
-        description="point that turns are about [m]; by default the middle of what moves, at the start",
+        description=(
+            "point that turns are about [m]; by default the middle of what moves, at the start"
+        ),
     )
 
     @model_validator(mode="after")
@@ -118,11 +125,13 @@ class Motion(Document):
         given = [name for name in ("keys", "spin", "path") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(
-                f"a motion must have one of keys, spin and path, and it has {', '.join(given) or 'none'}"
+                "a motion must have one of keys, spin and path, and it has "
+                f"{', '.join(given) or 'none'}"
             )
         if self.ramp and (self.spin is not None or self.interpolation == "smooth"):
             raise ValueError(
-                f"ramp is of linear keys and paths, and this motion is not linear; ramp is {self.ramp:g} s"
+                "ramp is of linear keys and paths, and this motion is not linear; ramp is "
+                f"{self.ramp:g} s"
             )
         for before, after in pairwise(self.keys or ()):
             if not before.time < after.time:
@@ -193,7 +202,8 @@ class Box(_Placed):
     def _fits(self) -> Self:
         if self.rounding is not None and 2 * self.rounding > min(self.size):
             raise ValueError(
-                f"rounding must be at most half the least of size, {min(self.size) / 2:g} m, and it is "
+                f"rounding must be at most half the least of size, {min(self.size) / 2:g} m, and "
+                "it is "
                 f"{self.rounding:g} m"
             )
         return self
@@ -248,8 +258,9 @@ class Unstructured(Document):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of vertices and triangles: of rows of a triangular lattice, every second one
-        shifted.
+        """Numbers of vertices and triangles.
+
+        The vertices are rows of a triangular lattice, with every second row shifted.
         """
         columns = max(1, round(self.size[0] / self.spacing))
         rows = max(1, round(self.size[1] / (self.spacing * 0.75**0.5)))
@@ -284,8 +295,9 @@ class Flat(Document):
 
 
 class Hung(Document):
-    """It starts at rest under its holders, for which it is let down from flat before the scene
-    begins.
+    """It starts at rest under its holders.
+
+    It is let down from flat before the scene begins.
     """
 
     type: Literal["hung"]
@@ -309,13 +321,16 @@ class FromFile(Document):
     type: Literal["file"]
     file: FileName | None = Field(
         default=None,
-        description="an OBJ file, or an NPZ file with `positions` (V, 3) [m]; null: the file of the mesh",
+        description=(
+            "an OBJ file, or an NPZ file with `positions` (V, 3) [m]; null: the file of the mesh"
+        ),
     )
 
 
 class Holder(Document):
-    """What holds vertices of a sheet: those in a rectangle of the flat sheet, on an edge, on its
-    rim, or listed.
+    """A holder of vertices of a sheet.
+
+    It holds a rectangle of the flat sheet, an edge, the rim, or listed vertices.
     """
 
     low: tuple[Place, Place] | None = Field(
@@ -325,7 +340,9 @@ class Holder(Document):
     high: tuple[Place, Place] | None = Field(default=None, description="opposite corner [m]")
     edge: Literal["left", "right", "bottom", "top"] | None = Field(
         default=None,
-        description="left and right are the least and the largest along the warp, bottom and top across",
+        description=(
+            "left and right are the least and the largest along the warp, bottom and top across"
+        ),
     )
     rim: Literal[True] | None = Field(default=None, description="all of the outline")
     vertices: tuple[Vertex, ...] | None = Field(default=None, min_length=1, max_length=100_000)
@@ -349,7 +366,8 @@ class Holder(Document):
             raise ValueError("low and high must both be given")
         if any(low > high for low, high in zip(self.low or (), self.high or (), strict=True)):
             raise ValueError(
-                f"low must be at most high in both [m], and they are {list(self.low or ())} and {list(self.high or ())}"
+                f"low must be at most high in both [m], and they are {list(self.low or ())} and "
+                f"{list(self.high or ())}"
             )
         if self.grasp is not None and not self.grasp[0] < self.grasp[1]:
             raise ValueError(
@@ -375,7 +393,10 @@ class Sheet(Document):
     origin: Vector = Field(default=(0.0, 0.0, 0.0), description="where its middle starts [m]")
     turn: Turn = Field(
         default=(0.0, 0.0, 0.0),
-        description="how it lies, as a rotation vector [rad]; without it the warp is along x and the weft along y",
+        description=(
+            "how it lies, as a rotation vector [rad]; without it the warp is along x and "
+            "the weft along y"
+        ),
     )
     thickness: Float = Field(default=5e-4, ge=1e-5, le=0.05, description="[m]")
     self_contact: Bool = Field(default=True, description="false: it passes through itself")
@@ -417,12 +438,14 @@ class View(Document):
         x, y, z = self.position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
-                f"position must be within {FARTHEST:g} m of the middle and {LOWEST:g} m or more above the floor, and "
+                f"position must be within {FARTHEST:g} m of the middle and {LOWEST:g} m or more "
+                "above the floor, and "
                 f"it is {list(self.position)} m"
             )
         if math.hypot(*self._forward[:2]) < 1e-6:
             raise ValueError(
-                f"target must not be straight above or below position, and it is {list(self.target)} m"
+                "target must not be straight above or below position, and it is "
+                f"{list(self.target)} m"
             )
         return self
 
@@ -460,7 +483,9 @@ class Looks(Document):
 
     sheets: Annotated[dict[CustomName, SheetLook], BY_NAME] = Field(
         default_factory=dict,
-        description="textures of their own; the first sheet (by name) without one takes the axis `texture`",
+        description=(
+            "textures of their own; the first sheet (by name) without one takes the axis `texture`"
+        ),
     )
     bodies: Annotated[dict[CustomName, BodyLook], BY_NAME] = Field(default_factory=dict)
     cameras: (

@@ -124,8 +124,9 @@ def describe(array: ArrayLayout) -> dict[str, Any]:
 
 
 def shown_frames(count: int, instants: int) -> tuple[int, ...]:
-    """Return the instants that a clip of `count` frames shows of `instants`: the first, and then
-    evenly spread.
+    """Return the instants that a clip of `count` frames shows, of `instants`.
+
+    They begin with the first instant and are evenly spread.
     """
     if not 1 <= count <= instants:
         raise ValueError(f"frames must be from 1 to {instants}, and is {count}")

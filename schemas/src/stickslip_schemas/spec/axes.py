@@ -155,7 +155,7 @@ def axis_values(axis: AnyAxis, *, dimension: int = 0) -> list[Any]:
 
 
 def extremes(axis: AnyAxis) -> list[tuple[tuple[str | int, ...], Any]]:
-    """Return values that stand for all others in rules of ranges, each with its place in the axis."""
+    """Return values that stand for all others in rules of ranges, each with its position."""
     if isinstance(axis, ListAxis):
         return [(("values", position), value) for position, value in enumerate(axis.values)]
     ends = ("start", "stop") if isinstance(axis, LinspaceAxis) else ("low", "high")

@@ -138,8 +138,7 @@ class Camera(Document):
     def project(
         self, points: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...) [scene
-        units].
+        """Project world points (..., 3) [scene units] to pixels (..., 2) and depths (...).
 
         A point that is not in front of the camera has no image: its pixel is NaN.
         """
@@ -154,8 +153,9 @@ class Camera(Document):
         return np.stack([self.fx * u + self.cx, self.fy * v + self.cy], axis=-1), depth
 
     def rays(self) -> npt.NDArray[np.float64]:
-        """Return the rays of depth 1 through the middle of all pixels, in the camera's axes,
-        (height, width, 3).
+        """Return the rays of depth 1 through the middle of all pixels, (height, width, 3).
+
+        They are in the axes of the camera.
         """
         import numpy as np
 
@@ -164,9 +164,7 @@ class Camera(Document):
         return np.stack([x, y, np.ones(x.shape)], axis=-1)
 
     def border(self) -> list[tuple[float, float]]:
-        """Return the places of the plane at depth 1 that the lens shows along the border of the
-        picture.
-        """
+        """Return the points of the plane at depth 1 that the lens shows along the border."""
         along = [k / _BORDER for k in range(_BORDER + 1)]
         places = [(a, b) for a in along for b in (0.0, 1.0)] + [
             (a, b) for a in (0.0, 1.0) for b in along
@@ -178,9 +176,7 @@ class Camera(Document):
         ]
 
     def pinhole(self) -> Camera:
-        """Return the camera without distortion, of the same focal lengths, that sees all that this
-        one does.
-        """
+        """Return the pinhole camera of the same focal lengths that sees all that this one sees."""
         if not any(self.distortion):
             return self
         x, y = zip(*self.border(), strict=True)
@@ -207,8 +203,9 @@ class Camera(Document):
         ]
 
     def overflow(self, points: npt.ArrayLike, radius: float = 0.0, margin: float = 0.0) -> float:
-        """Measure by how much balls of a radius [scene units] about points (..., 3) leave the frame
-        [px].
+        """Measure by how much balls about points (..., 3) leave the frame [px].
+
+        The balls have a radius [scene units].
 
         The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's
         image is taken as a disc, which is right to first order in its angular size. Infinite if a
@@ -231,8 +228,9 @@ class Camera(Document):
 
 
 def square(name: str, size: int, focal: float, rotation: Any, translation: Vector3) -> Camera:
-    """Return a camera with a square frame of a size, and a focal length [px], whose axis meets the
-    middle.
+    """Return a camera with a square frame whose axis meets the middle of the frame.
+
+    `size` and `focal` are in pixels.
     """
     middle, at = (size - 1) / 2, {"rotation": rotation, "translation": translation}
     return Camera(
@@ -250,8 +248,7 @@ _FRAMED_MARGIN = 10.0  # [px] at 224 pixels
 
 
 def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) -> Camera:
-    """Return the upright camera nearest to points (n, 3) [scene units] that has all of them in its
-    square frame.
+    """Return the nearest upright camera that has all points (n, 3) in its square frame.
 
     A point (X, Y, Z) in the camera's directions is in the frame where |X + t_x| <= k (Z + t_z), and the same of Y, so
     t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of Y, and t_x centres the points.
@@ -307,7 +304,7 @@ def rig_names() -> tuple[str, ...]:
 
 @cache
 def load_rig(name: str) -> tuple[Camera, ...]:
-    """Return the cameras of one of the shipped rigs, in the order in which their views are stored."""
+    """Return the cameras of a shipped rig, in the order in which their views are stored."""
     if name not in rig_names():
         raise ValueError(f"rig must be one of {', '.join(rig_names())}; got {name!r}")
     return read_rigs(RIGS / f"{name}.toml")[name]

@@ -23,7 +23,7 @@ from stickslip_schemas.base import (
     Stage,
     content_key,
     derived_seed,
-    placed,
+    replace_at,
 )
 from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
@@ -34,7 +34,7 @@ D = TypeVar("D", bound=Document)
 
 
 class Quality(StrEnum):
-    """Named render settings; their numbers live with the renderer and are recorded in the dataset."""
+    """Named render settings; the renderer has their numbers, and the dataset records them."""
 
     preview = "preview"
     draft = "draft"
@@ -61,13 +61,16 @@ CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
 
 
 class Splits(Document):
-    """Shares of each split: of the simulations, all renders of one falling in the same split, or of
-    the clips.
+    """Fractions of the simulations in each split, or of the clips.
+
+    By simulation, all renders of a simulation fall in one split.
     """
 
     by: Literal["simulation", "clip"] = Field(
         default="simulation",
-        description="`clip` draws each sample by itself: tests then see simulations that were trained on",
+        description=(
+            "`clip` draws each sample by itself: tests then see simulations that were trained on"
+        ),
     )
     train: Float = Field(default=0.8, ge=0, le=1)
     validation: Float = Field(default=0.1, ge=0, le=1)
@@ -99,7 +102,7 @@ class Simulation(Document):
         """How many vertices its meshes have; its memory grows with them."""
         return 0
 
-    def given(self, read: Callable[[str], bytes]) -> dict[str, Any]:
+    def inputs(self, read: Callable[[str], bytes]) -> dict[str, Any]:
         """Return what it is made from, as JSON and arrays.
 
         `read` returns the bytes of an artifact by its digest.
@@ -108,7 +111,7 @@ class Simulation(Document):
 
 
 class Render(Document):
-    """What the pictures of one sample depend on besides their trajectory and the renderer's build."""
+    """All that the pictures of one sample depend on, besides trajectory and renderer build."""
 
     kind: str
     rig: str | None = Field(description="null: the cameras are of the document or of the sample")
@@ -193,11 +196,16 @@ class JobSpec(Document):
     )
     combine: Literal["product", "zip"] = Field(
         default="product",
-        description="product: every combination of the axes; zip: axes of equal length, row by row; they may repeat",
+        description=(
+            "product: every combination of the axes; zip: axes of equal length, row by "
+            "row; they may repeat"
+        ),
     )
     splits: Splits = Field(
         default=Splits(),
-        description="shares of the simulations in each split, with sum 1; `by: clip` draws samples instead",
+        description=(
+            "shares of the simulations in each split, with sum 1; `by: clip` draws samples instead"
+        ),
     )
     samples_per_shard: Int = Field(
         default=64,
@@ -274,14 +282,12 @@ class JobSpec(Document):
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        """Artifacts that the spec names and that have to be in the store, by JSON pointers into the
-        spec.
-        """
+        """Artifacts that must be in the store, by JSON pointers into the spec."""
         return {}
 
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
-        """The axes by name, in the order in which a product is run through (the last one fastest)."""
+        """The axes by name, in the order of a product; the last one varies fastest."""
         named = {name: getattr(self.axes, name) for name in type(self.axes).model_fields}
         return {name: axis for name, axis in named.items() if axis is not None}
 
@@ -297,15 +303,17 @@ class JobSpec(Document):
 
     @cached_property
     def arrays_digest(self) -> str:
-        """Key of the arrays of the dataset: their shapes, types, fill values and the names of their
-        codes.
+        """Key of the arrays of the dataset.
+
+        It covers their shapes, types, fill values and the names of their codes.
         """
         return content_key("arrays", [array.identity for array in (*self.arrays(), *COMMON_ARRAYS)])
 
     @property
     def dataset_id(self) -> str:
-        """Id of the dataset that answers the spec: the same spec has the same dataset, in any
-        build.
+        """Id of the dataset that answers the spec.
+
+        The same spec has the same dataset, in any build.
         """
         return f"ds-{self.content_digest[:16]}"
 
@@ -318,7 +326,7 @@ class JobSpec(Document):
         ]
 
     def combined(self, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[Any, ...]]:
-        """Combine one column of cells for each axis as the spec says: all with all, or row by row."""
+        """Combine one column of cells for each axis: all with all, or row by row."""
         return zip(*columns, strict=True) if self.combine == "zip" else product(*columns)
 
     def grid(self) -> Iterator[dict[str, Any]]:
@@ -360,7 +368,7 @@ class JobSpec(Document):
             for path, value in self.document_fields(axis, given).items():
                 name, *inner = path.split("/")
                 if name in model.model_fields:
-                    fields[name] = placed(fields.get(name, settings.get(name)), inner, value)
+                    fields[name] = replace_at(fields.get(name, settings.get(name)), inner, value)
         drawn = {
             rule.field: derived_seed(
                 self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)}

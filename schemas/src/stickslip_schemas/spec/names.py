@@ -1,5 +1,6 @@
-"""What names in a spec stand for: fabrics, textures, lamps, floors and cameras, built in or as
-numbers of the user.
+"""Meanings of names in a spec: fabrics, textures, lamps, floors and cameras.
+
+They are built in, or defined by numbers of the user.
 
 The numbers of the measured fabrics live with the simulation core; a contract test compares the
 names.
@@ -58,8 +59,10 @@ class FabricNumbers(Document):
     density: Float = Field(ge=0.01, le=5, description="mass per area [kg/m^2]")
     stretching: tuple[tuple[Stiffness, Stiffness, Stiffness, Stiffness], ...] | None = Field(
         default=None,
-        description="6 rows of (k0, k1, k2, k3) [N/m]; energy per area k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2 "
-        "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, 67.5 and 90 degrees "
+        description="6 rows of (k0, k1, k2, k3) [N/m]; energy per area k0 G00^2/2 + k1 G00 G11 + "
+        "k2 G11^2/2 + k3 G01^2 "
+        "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, "
+        "67.5 and 90 degrees "
         "from the warp",
     )
     young: Float | None = Field(
@@ -73,7 +76,10 @@ class FabricNumbers(Document):
     )
     bending: tuple[Rigidity, Rigidity, Rigidity] | None = Field(
         default=None,
-        description="plate rigidities (along the warp, along the weft, twist) [N m], energy per area H:D:H/2",
+        description=(
+            "plate rigidities (along the warp, along the weft, twist) [N m], energy per "
+            "area H:D:H/2"
+        ),
     )
     damping: Float = Field(
         default=0.0, ge=0, le=10, description="damping force over momentum [1/s]"
@@ -90,7 +96,8 @@ class FabricNumbers(Document):
             for row, (k0, k1, k2, _) in enumerate(self.stretching):
                 if not k1 * k1 < k0 * k2:
                     raise ValueError(
-                        f"stretching must be positive definite: k1^2 < k0 k2 in every row, but row {row} has "
+                        "stretching must be positive definite: k1^2 < k0 k2 in every row, but row "
+                        f"{row} has "
                         f"k0 = {k0:g}, k1 = {k1:g}, k2 = {k2:g}"
                     )
             if self.bending is None:
@@ -103,7 +110,8 @@ class FabricNumbers(Document):
             membrane = self.young * self.thickness
             if membrane > MEMBRANE_MAX:
                 raise ValueError(
-                    f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is {membrane:g}"
+                    f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is "
+                    f"{membrane:g}"
                 )
             plate = (
                 membrane * self.thickness**2 / (12 * (1 - self.poisson**2))
@@ -111,7 +119,8 @@ class FabricNumbers(Document):
             if not PLATE_BOUNDS[0] <= plate <= PLATE_BOUNDS[1]:
                 low, high = PLATE_BOUNDS
                 raise ValueError(
-                    f"young and thickness must give a plate rigidity from {low:g} to {high:g} N m, and it is {plate:g}"
+                    f"young and thickness must give a plate rigidity from {low:g} to {high:g} N m, "
+                    f"and it is {plate:g}"
                 )
         return self
 
@@ -154,7 +163,7 @@ class Texture(StrEnum):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return `.
+    """Return a question for the known word that is most like `word`, or an empty text.
 
     Did you mean ...?` with the known word that is most like `word`, or nothing where none is.
     """
@@ -186,8 +195,9 @@ Row = tuple[Float, Float, Float]
 
 
 class Lighting(StrEnum):
-    """Named ranges that the lamp of a clip is drawn from: two of a studio, a bright room, a window
-    beside the cloth.
+    """Named ranges that the lamp of a clip is drawn from.
+
+    Two are of a studio; the others are a bright room and a window beside the cloth.
 
     Their order gives the codes of the label `lighting`: add new ones at the end.
     """
@@ -199,8 +209,10 @@ class Lighting(StrEnum):
 
 
 class Substrate(StrEnum):
-    """Finishes of the floor: matt black, the seven of the thesis (4.2.2), woven cloth, bright ones,
-    any hard one.
+    """Finishes of the floor.
+
+    They are matt black, the seven of the thesis (4.2.2), woven cloth, bright ones, and any hard
+    one.
 
     Numbers of a finish are drawn within a range. The order gives the codes of the label
     `substrate`: add new ones at the end.
@@ -243,7 +255,9 @@ class LampNumbers(_Ranges):
     """
 
     azimuth: tuple[Azimuth, Azimuth] = Field(
-        description="azimuth of the lamp, seen from the cloth, from +x towards +y [degree], -180 to 180"
+        description=(
+            "azimuth of the lamp, seen from the cloth, from +x towards +y [degree], -180 to 180"
+        )
     )
     elevation: tuple[Elevation, Elevation] = Field(
         description="elevation of the lamp above the floor [degree], 5 to 90"
@@ -260,7 +274,9 @@ class FloorNumbers(_Ranges):
     """
 
     albedo: tuple[Share, Share] = Field(
-        description="share of the light that the floor scatters, or reflects if it is a metal, 0 to 1"
+        description=(
+            "share of the light that the floor scatters, or reflects if it is a metal, 0 to 1"
+        )
     )
     roughness: tuple[Roughness, Roughness] = Field(
         description="roughness of the gloss, 0.01 to 1; 0.02 is a mirror"
@@ -307,13 +323,15 @@ class Calibration(Document):
     def _can_be_rendered(self) -> Self:
         if any(self.distortion[5:]):
             raise ValueError(
-                "distortion must be 0 after k1, k2, p1, p2, k3: calibrate without rational, prism and tilted models; "
+                "distortion must be 0 after k1, k2, p1, p2, k3: calibrate without rational, prism "
+                "and tilted models; "
                 f"it is {list(self.distortion)}"
             )
         (fx, skew, cx), (zero, fy, cy), last = self.camera_matrix
         if skew != 0 or zero != 0 or last != (0.0, 0.0, 1.0) or fx <= 0 or fy <= 0:
             raise ValueError(
-                "camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0: the renderer has "
+                "camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above "
+                "0: the renderer has "
                 f"no skew; it is {[list(row) for row in self.camera_matrix]}"
             )
         for axis, f, c, side in zip("xy", (fx, fy), (cx, cy), self.image_size, strict=True):
@@ -326,21 +344,25 @@ class Calibration(Document):
             ):
                 if not low <= value <= high:
                     raise ValueError(
-                        f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, for a field of view of "
-                        f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; it is {value:g} px"
+                        f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, "
+                        "for a field of view of "
+                        f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; "
+                        f"it is {value:g} px"
                     )
         self._check_lens()
         x, y, z = self.camera("own").position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
-                f"rvec and tvec must put the camera within {FARTHEST:g} m of the scene's middle and {LOWEST:g} m or "
+                f"rvec and tvec must put the camera within {FARTHEST:g} m of the scene's middle "
+                f"and {LOWEST:g} m or "
                 f"more above the floor, and it is at ({x:.3g}, {y:.3g}, {z:.3g}) m"
             )
         return self
 
     def _check_lens(self) -> None:
-        """Refuse a lens that shows a place twice within the square, or that sees farther than any
-        camera may.
+        """Raise ValueError for a lens that no clip can be rendered with.
+
+        A lens must not show a point twice within the square, nor see farther than any camera may.
         """
         camera = self.camera("own")
         border = camera.border()
@@ -363,13 +385,15 @@ class Calibration(Document):
             and farthest <= 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2
         ):
             raise ValueError(
-                "distortion must move places outwards in their order over the whole square of the clip, for a field of "
+                "distortion must move places outwards in their order over the whole square of the "
+                "clip, for a field of "
                 f"view of up to {FIELD_OF_VIEW[1]:g} degrees; it is {list(self.distortion)}"
             )
 
     def camera(self, name: str) -> Camera:
-        """Return the camera of the clip: of the square in the middle of the image, scaled to
-        `CLIP_SIZE`.
+        """Return the camera of the clip.
+
+        It shows the square in the middle of the image, scaled to `CLIP_SIZE`.
         """
         width, height = self.image_size
         side = min(width, height)
@@ -393,7 +417,10 @@ class Calibration(Document):
 
 
 def _rotation(rvec: Row) -> tuple[Row, Row, Row]:
-    """Return the rotation by a = |r| about r: I + sin(a) K + (1 - cos(a)) K^2, K v = r / a x v [Rodrigues]."""
+    """Return the rotation by a = |r| about r [Rodrigues].
+
+    R = I + sin(a) K + (1 - cos(a)) K^2, with K v = r / a x v.
+    """
     angle = math.hypot(*rvec)
     x, y, z = (value / angle if angle > _TOLERANCE else value for value in rvec)
     s, c = math.sin(angle), 1.0 - math.cos(angle)

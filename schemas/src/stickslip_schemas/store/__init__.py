@@ -1,5 +1,4 @@
-"""The store of artifacts and dataset versions: what it is, wherever it keeps its bytes, and the one
-in a directory.
+"""The store of artifacts and dataset versions: its interface, and a store in a directory.
 
 An **artifact** is a run of bytes that is named by its SHA-256. It is there whole or not at all, and
 two writers of the same bytes cannot disturb each other. A **version** of a dataset shows some
@@ -52,8 +51,9 @@ class CorruptArtifactError(OSError):
 
 
 def is_unavailable(error: OSError) -> bool:
-    """Return whether an error says that a store takes no files: full, read-only, not ours, gone, or
-    out of reach.
+    """Return whether an error says that a store takes no files.
+
+    It is full, read-only, of somebody else, gone, or out of reach.
     """
     return error.errno in _UNAVAILABLE
 
@@ -81,7 +81,7 @@ class ShownVersion:
     """When that file was written last [s since 1970]."""
 
 
-class Room(NamedTuple):
+class DiskUsage(NamedTuple):
     """Capacity of a store [bytes]."""
 
     total: int
@@ -109,7 +109,7 @@ class Store(Protocol):
         """A directory that all workers share for what may be lost; None if the store has none."""
 
     def publish(self, data: bytes) -> str:
-        """Make `data` an artifact, durably, and return its digest. A damaged one is written anew."""
+        """Make `data` an artifact, durably, and return its digest; write a damaged one anew."""
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
         """Return an artifact's bytes; raise CorruptArtifactError where it is too short.
@@ -130,8 +130,9 @@ class Store(Protocol):
         """Return whether an artifact is there with at least `size` bytes, without reading it."""
 
     def holds(self, digest: str, *, size: int | None = None) -> bool:
-        """Return whether an artifact is there, of `size` bytes where that is known, with the digest
-        that names it.
+        """Return whether an artifact is there with the digest that names it.
+
+        A known `size` [bytes] is compared first.
         """
 
     def delete(self, name: str) -> None:
@@ -164,7 +165,7 @@ class Store(Protocol):
     def is_shown(self, dataset: str, version: int) -> bool:
         """Return whether a version shows anything."""
 
-    def room(self) -> Room | None:
+    def disk_usage(self) -> DiskUsage | None:
         """Return how full the store is; None if it has no limit that it knows."""
 
     def probe(self) -> None:
@@ -220,8 +221,9 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 def store_place(place: str | Path) -> str:
-    """Return the place of a store as every process of a machine understands it, a path or a URL;
-    raise ValueError.
+    """Return the place of a store, a path or a URL; raise ValueError.
+
+    Every process of a machine understands it alike.
     """
     text = str(place)
     if _SCHEME.match(text) is None and text:
@@ -408,11 +410,11 @@ class DirectoryStore:
     def is_shown(self, dataset: str, version: int) -> bool:
         return any(path.is_file() for path in self.dataset_path(dataset, version).rglob("*"))
 
-    def room(self) -> Room:
+    def disk_usage(self) -> DiskUsage:
         place = self.root
         while not place.exists():
             place = place.parent
-        return Room(*shutil.disk_usage(place))
+        return DiskUsage(*shutil.disk_usage(place))
 
     def probe(self) -> None:
         path = self.root / f".probe-{os.getpid()}"
@@ -421,8 +423,9 @@ class DirectoryStore:
 
 
 def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
-    """Write a file that is there whole or not at all, also after a crash: write, fsync, rename,
-    fsync directory.
+    """Write a file durably: write, fsync, rename, fsync of the directory.
+
+    It is there whole or not at all, also after a crash.
 
     `mode` are its permissions, less those that the umask takes away.
     """

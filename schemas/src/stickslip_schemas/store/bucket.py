@@ -211,7 +211,7 @@ class BucketStore:
         """Return whether a version shows anything."""
         return bool(self._objects.list_objects(f"{version_name(dataset, version)}/"))
 
-    def room(self) -> None:
+    def disk_usage(self) -> None:
         """Return None: a bucket has no limit."""
 
     def probe(self) -> None:

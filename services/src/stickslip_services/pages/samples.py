@@ -186,9 +186,11 @@ def _bodies(data: SampleData, slot: int) -> list[dict[str, Any]]:
         name for name in spec.stage.parameters if isinstance(spec.stage.default(name), float)
     ]
     own = {
-        place: float(data.read(name, slot)) for name in numbers for place in spec.stage.places(name)
+        place: float(data.read(name, slot))
+        for name in numbers
+        for place in spec.stage.locations(name)
     }
-    document = with_arrays(spec.stage.checked(own), data.store.read)
+    document = with_arrays(spec.stage.physics_with(own), data.store.read)
     poses = np.asarray(data.read("body_pose", slot), dtype=float)
     times = np.arange(len(poses)) / spec.instants_per_second
     found = []

@@ -56,7 +56,7 @@ class StoreWatch:
     def _fault(self) -> str:
         for looked_at in self._places:
             try:
-                room = looked_at.room()
+                room = looked_at.disk_usage()
                 if room is not None and room.free < self._min_free_bytes:
                     left, least = room.free / 2**20, self._min_free_bytes / 2**20
                     return f"{looked_at.place} has {left:.3g} MiB left, and {least:.3g} MiB must stay free"

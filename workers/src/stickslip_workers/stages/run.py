@@ -167,7 +167,7 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
     made = kind(names[0])
-    simulations = [task.simulation.given(store.read) for task in tasks]
+    simulations = [task.simulation.inputs(store.read) for task in tasks]
     outcomes = made.simulate(simulations, _note)
     records = _stored(outcomes, made.batch, store)
     return [

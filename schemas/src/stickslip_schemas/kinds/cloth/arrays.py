@@ -1,6 +1,4 @@
-"""Arrays of the datasets of cloth: those of all its kinds, and those of scenes, which follow from
-the document.
-"""
+"""Arrays of the datasets of cloth, of all its kinds and of scenes."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -36,9 +34,7 @@ def over_time(
     of: Mapping[str, int] | None = None,
     **more: Any,
 ) -> ArrayLayout:
-    """Return an array of the record that has a number, or an array of dimensions `of`, at each
-    instant.
-    """
+    """Return a recorded array: a number, or an array of dimensions `of`, at each instant."""
     said = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
     return array(
         name,
@@ -55,7 +51,10 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
     light = "azimuth and elevation of the lamp [degree], its power over the nominal"
-    floor = "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its tint (rgb)"
+    floor = (
+        "albedo, roughness, metallic, specular and contrast of the marks of the floor, and its "
+        "tint (rgb)"
+    )
     return (
         array(
             "video",

@@ -1,6 +1,4 @@
-"""Specs and documents that the kinds of cloth have in common: names that users add to, presets,
-clips.
-"""
+"""Specs and documents that the kinds of cloth share: names that users add, presets, clips."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -9,7 +7,16 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base import ArtifactRef, Bool, Document, Float, Int, Sha256, Stage, referred
+from stickslip_schemas.base import (
+    ArtifactRef,
+    Bool,
+    Document,
+    Float,
+    Int,
+    Sha256,
+    Stage,
+    artifact_digest,
+)
 from stickslip_schemas.scene.parts import View
 from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, Seed, quantity
@@ -32,7 +39,10 @@ TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
     SHORTHAND,
     Field(
-        description="pattern of the cloth, or a custom one under `textures`; the last four are held out for tests"
+        description=(
+            "pattern of the cloth, or a custom one under `textures`; the last four are "
+            "held out for tests"
+        )
     ),
 ]
 LampAxis = Annotated[
@@ -120,16 +130,15 @@ class ClipRender(Render):
 
     @property
     def variant(self) -> str:
-        """The texture, which no shading depends on: a name that is built in, or a reference to a
-        picture.
+        """The texture, on which no shading depends.
+
+        It is a built-in name or a reference to a picture.
         """
         return self.image or self.texture
 
 
 class ClipSpec(JobSpec):
-    """What the specs of all kinds of cloth have in common: clips of trajectories, and custom names
-    on axes of names.
-    """
+    """Base of the specs of cloth: clips of trajectories, and names that users define."""
 
     variant_axis = "texture"
     instants: ClassVar[int]
@@ -167,7 +176,8 @@ class ClipSpec(JobSpec):
         default=Quality.standard,
         description="quality of the pictures",
         json_schema_extra={
-            "x-cost": "CPU time of a frame and texture, if eight textures share a shading, without measuring: preview "
+            "x-cost": "CPU time of a frame and texture, if eight textures share a shading, without "
+            "measuring: preview "
             "0.1 s, draft 0.15 s, standard 0.2 s, high 0.5 s; a texture alone at standard 1.6 s"
         },
     )
@@ -183,10 +193,13 @@ class ClipSpec(JobSpec):
         default=0.5,
         ge=0,
         le=10,
-        description="cost of measuring how good the clips of eight textures are, over that of rendering them; at "
+        description="cost of measuring how good the clips of eight textures are, over that of "
+        "rendering them; at "
         "least one frame of each clip is measured, and none at 0",
         json_schema_extra={
-            "x-cost": "at 0.5, 60 % of the CPU time of rendering 30 frames, and more of fewer frames"
+            "x-cost": (
+                "at 0.5, 60 % of the CPU time of rendering 30 frames, and more of fewer frames"
+            )
         },
     )
     creases: Float = Field(
@@ -260,8 +273,9 @@ class ClipSpec(JobSpec):
         return self._defined(axis).get(name)
 
     def names(self, axis: str) -> tuple[str, ...]:
-        """Return the names that an axis may use, the built-in ones first: they are the codes of the
-        label.
+        """Return the names that an axis may use, built-in ones first.
+
+        Their order gives the codes of the label.
         """
         return (*self.built_in(axis), *self._defined(axis))
 
@@ -270,7 +284,7 @@ class ClipSpec(JobSpec):
         return {
             f"/textures/{name}": digest
             for name, image in self.textures.items()
-            if (digest := referred(image))
+            if (digest := artifact_digest(image))
         }
 
     @model_validator(mode="after")
@@ -280,7 +294,8 @@ class ClipSpec(JobSpec):
             for name in self._defined(axis):
                 if name in self.built_in(axis):
                     raise ValueError(
-                        f"{self.custom[axis].key} must not redefine what is built in, and {name!r} is"
+                        f"{self.custom[axis].key} must not redefine what is built in, and {name!r} "
+                        "is"
                     )
             known = self.names(axis)
             given = getattr(self.axes, axis)
@@ -313,6 +328,7 @@ class ClipSpec(JobSpec):
     def _frames_there_are(self) -> Self:
         if self.frames > self.instants:
             raise ValueError(
-                f"frames must be at most {self.instants}, the instants of the motion; got {self.frames}"
+                f"frames must be at most {self.instants}, the instants of the motion; got "
+                f"{self.frames}"
             )
         return self

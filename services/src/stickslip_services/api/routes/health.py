@@ -48,7 +48,10 @@ class _QueueCollector(Collector):
             count, size, bad, read_at = connection.execute(
                 select(*sums).where(own.manifest.is_not(None))
             ).one()
-        age, room = self._context.clock() - read_at if count else 0.0, self._context.store.room()
+        age, room = (
+            self._context.clock() - read_at if count else 0.0,
+            self._context.store.disk_usage(),
+        )
         disk = () if room is None else (("free", room.free), ("used", room.used))
         return [
             _gauge("tasks", "Tasks by stage and state", tasks, "stage", "state"),

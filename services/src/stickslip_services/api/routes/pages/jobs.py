@@ -200,7 +200,7 @@ def get_workers(context: ContextDep) -> Response:
         certified=certified,
         scrub=None if read_at is None else (as_datetime(read_at), int(damaged)),
         now=as_datetime(context.clock()),
-        disk=context.store.room(),
+        disk=context.store.disk_usage(),
         memory=_memory(),
     )
 
