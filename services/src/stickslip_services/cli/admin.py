@@ -201,7 +201,7 @@ def webhooks() -> None:
 
 
 @webhooks.command("create")
-@click.argument("url", help="receiver of the events: https://..., or http:// on this machine")
+@click.argument("url", help="receiver of the events: https://HOST/PATH, or http:// on this machine")
 @click.option(
     "--project", default="", help="project whose jobs it hears of; default: jobs without one"
 )

@@ -149,7 +149,12 @@ def _exit_status(state: JobState) -> int:
 @json_option
 @click.option("--limit", type=click.IntRange(1), default=50, help="the most jobs to list")
 @click.option("--search", default="", help="a part of the name, kind, id or dataset")
-@click.option("--state", type=click.Choice(JobState), help="only jobs in this state")
+@click.option(
+    "--state",
+    type=click.Choice(JobState),
+    metavar="STATE",
+    help=f"only jobs in this state: {', '.join(JobState)}",
+)
 @click.option("--project", default="", help="only jobs of this project")
 @asks
 def jobs(

@@ -155,13 +155,22 @@ def _fit(widths: list[int], *, sentences: bool) -> list[int]:
     while len(visible) > required and _total(widths, visible) > width:
         # The last column goes, or the last one before the text.
         visible.pop(-required)
-    if sentences and _total(widths, visible) > width:
-        rest = width - widths[visible[0]] - GAP
-        widths[-1] = max(LEAST_WIDTH, rest)
     if _total(widths, visible) > width:
-        first = visible[0]
-        widths[first] = max(LEAST_WIDTH, widths[first] - _total(widths, visible) + width)
+        _narrow(widths, visible, width)
     return visible
+
+
+def _narrow(widths: list[int], visible: list[int], width: int) -> None:
+    """Narrow the one or two columns that are left, so that their cells take several lines."""
+    first = visible[0]
+    if len(visible) == 1:
+        widths[first] = width
+        return
+    # The text gets the rest of the line, and at least half of it.
+    last = visible[1]
+    half = (width - GAP) // 2
+    widths[last] = min(widths[last], max(half, width - GAP - widths[first]))
+    widths[first] = min(widths[first], width - GAP - widths[last])
 
 
 def _total(widths: list[int], visible: list[int]) -> int:

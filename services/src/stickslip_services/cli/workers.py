@@ -56,7 +56,13 @@ def _worker_row(worker: WorkerEntry) -> tuple[Cell, ...]:
 
 
 @click.command()
-@click.option("--preset", type=click.Choice(PRESETS), required=True, help="the preset to certify")
+@click.option(
+    "--preset",
+    type=click.Choice(PRESETS),
+    metavar="PRESET",
+    required=True,
+    help=f"the preset to certify: {', '.join(PRESETS)}",
+)
 @click.option("--out", type=FILE, help="folder for the certificate (certificates/PRESET)")
 @click.option(
     "--quick",
