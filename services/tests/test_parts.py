@@ -128,6 +128,8 @@ def test_a_part_is_completed_and_not_mixed_with_another(
         (("--split", "all"), "split: Input should be 'train', 'validation' or 'test'"),
         (("--where", "gamma"), "where must be a label, one of"),
         (("--where", "speed<3"), "where must name one of the labels"),
+        (("--where", "gamma==9"), "no sample has gamma 9: the nearest values are 2, 3, 4;"),
+        (("--where", "gamma>9"), "no valid sample is in this part of the dataset: gamma>9"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

@@ -188,7 +188,21 @@ def test_what_arrives_damaged_gets_no_name(origin: tuple[str, str], tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "path", ["a/../../b", "../b", "a/..", "a/./b", "/b", "a\\..\\b", "manifest.json", "a.part", ""]
+    "path",
+    [
+        "a/../../b",
+        "../b",
+        "a/..",
+        "a/./b",
+        "/b",
+        "a\\..\\b",
+        "manifest.json",
+        "a.part",
+        "",
+        ".git/hooks/x",
+        "x/.git/hooks/post-checkout",
+        "a/.b",
+    ],
 )
 def test_a_path_that_leaves_the_dataset_is_refused(tmp_path: Path, path: str) -> None:
     with pytest.raises(UnsafePathError):

@@ -52,6 +52,8 @@ the decoding.
 """
 
 _CRC_BYTES = 4
+_FRAME_BYTES = 1024
+"""More than the headers of a frame and its crc32c have [bytes]."""
 _RESIDUE = 0x48674BC7
 """The crc32c of any bytes with their own little-endian crc32c behind them."""
 
@@ -63,6 +65,14 @@ class CorruptChunkError(ValueError):
 def encode_chunk(data: bytes | np.ndarray) -> bytes:
     """Return the encoded chunk of C-ordered little-endian `data`."""
     return _with_crc(bytes(Zstd(level=ZSTD_LEVEL).encode(data)))
+
+
+def largest_chunk(size: int) -> int:
+    """Return the most bytes that a chunk of `size` decoded bytes can have [bytes].
+
+    zstd adds 1/256 and a frame to data that it cannot compress [ZSTD_compressBound].
+    """
+    return size + size // 256 + _FRAME_BYTES
 
 
 def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:

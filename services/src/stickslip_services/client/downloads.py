@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import sync
@@ -18,17 +17,10 @@ from stickslip_schemas.transport.http import AnswerError, TransportError
 
 from stickslip_services.client.errors import DamagedError, UnexpectedError, UnreachableError
 from stickslip_services.client.http import Client
-from stickslip_services.client.verifying import CONNECTIONS, PART_SUFFIX, file_digest
+from stickslip_services.client.verifying import CONNECTIONS, PART_SUFFIX, file_digest, safe_path
 
 ATTEMPTS = 5
 """How often a file is requested before its download fails."""
-
-
-class Target(NamedTuple):
-    """A file of a manifest, and the path that it is written to."""
-
-    file: FileEntry
-    path: Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,30 +30,43 @@ class Downloader:
     client: Client
     root: str
     """Path of the files in the API, with a slash at the end."""
+    target: Path
+    """Directory that files are written to."""
     on_bytes: Callable[[int], None]
     """Called with the number of bytes of each received block, by several threads."""
     stop: threading.Event
 
-    def download_all(self, targets: list[Target]) -> None:
+    def download_all(self, files: list[FileEntry]) -> None:
         """Download files, several at once; the first error stops all.
 
         Raises:
             DamagedError: A file arrives with other bytes than the manifest states.
             ClientError: The coordinator refused, or does not answer.
         """
+        remaining = iter(files)
+        lock = threading.Lock()
+
+        def download_rest() -> None:
+            while not self.stop.is_set():
+                with lock:
+                    file = next(remaining, None)
+                if file is None:
+                    return
+                self._download(file)
+
+        # One task for each thread: a task for each of a million files would fill the memory.
         with ThreadPoolExecutor(CONNECTIONS) as pool:
-            downloads = [pool.submit(self._download, target) for target in targets]
+            tasks = [pool.submit(download_rest) for _ in range(min(CONNECTIONS, len(files)))]
             try:
-                for download in as_completed(downloads):
-                    download.result()
+                for task in as_completed(tasks):
+                    task.result()
             except BaseException:
                 self.stop.set()
-                pool.shutdown(cancel_futures=True)
                 raise
 
-    def _download(self, target: Target) -> None:
+    def _download(self, file: FileEntry) -> None:
         """Download a file to its `.part` file, check it, and rename it."""
-        file, path = target
+        path = safe_path(self.target, file.path)
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(path.name + PART_SUFFIX)
         # A link could lead out of the directory.

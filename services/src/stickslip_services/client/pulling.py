@@ -33,7 +33,7 @@ from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Sel
 from stickslip_schemas.store import write_durably
 
 from stickslip_services.client.answers import parse
-from stickslip_services.client.downloads import Downloader, Target
+from stickslip_services.client.downloads import Downloader
 from stickslip_services.client.errors import (
     ClientError,
     DamagedError,
@@ -48,11 +48,11 @@ from stickslip_services.client.verifying import (
     PART_SUFFIX,
     RESERVED_NAMES,
     check_counts,
+    check_path,
     fault_of,
     files_below,
     read_label,
     read_part,
-    safe_path,
 )
 
 SIGNATURE_BYTES = 2**16
@@ -81,7 +81,7 @@ class _Sealed(NamedTuple):
 class _Part(NamedTuple):
     """The files of a chosen part of a version."""
 
-    targets: list[Target]
+    files: list[FileEntry]
     samples: int
     """Chosen samples."""
     label_files: int
@@ -135,21 +135,22 @@ def pull(
     # All that can be refused is refused before the first byte is written.
     with _selecting():
         selection.choose_arrays(layout(contents.manifest.spec))
-    targets = _targets(target, part_files(contents, selection, None))
+    files = part_files(contents, selection, None)
+    _check_paths(files)
     refuse_foreign_files(target, contents, f"{dataset}:v{version}")
     refuse_other_part(target, selection)
     target.mkdir(parents=True, exist_ok=True)
 
-    downloader = Downloader(client, root, on_bytes, threading.Event())
-    part = _Part(targets, contents.manifest.valid_count, 0, 0)
+    downloader = Downloader(client, root, target, on_bytes, threading.Event())
+    part = _Part(files, contents.manifest.valid_count, 0, 0)
     if not selection.is_everything:
-        quiet = Downloader(client, root, lambda _: None, threading.Event())
-        part = _choose_part(quiet, target, contents, selection, targets)
+        quiet = Downloader(client, root, target, lambda _: None, threading.Event())
+        part = _choose_part(quiet, contents, selection, files)
         manifest_digest = sha256(sealed.files[MANIFEST_NAME])
         document = PartDocument(manifest=manifest_digest, selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
 
-    missing = _missing(target, part.targets)
+    missing = _missing(target, part.files)
     changed = {
         name: content for name, content in sealed.files.items() if _read(target / name) != content
     }
@@ -169,7 +170,7 @@ def pull(
         (target / SELECTION_NAME).unlink(missing_ok=True)
     return Pulled(
         samples=part.samples,
-        files=len(part.targets) + len(sealed.files),
+        files=len(part.files) + len(sealed.files),
         downloaded_files=count + part.label_files,
         downloaded_bytes=size + part.label_bytes,
     )
@@ -177,38 +178,48 @@ def pull(
 
 def _choose_part(
     downloader: Downloader,
-    target: Path,
     contents: Contents,
     selection: Selection,
-    label_targets: list[Target],
+    label_files: list[FileEntry],
 ) -> _Part:
     """Download the labels of a version, and return the files of the samples that they choose."""
-    missing = _missing(target, label_targets)
+    target = downloader.target
+    missing = _missing(target, label_files)
     _refuse_small_disk(target, _total_size(missing))
     downloader.download_all(missing)
     labels = partial(read_label, target, contents.manifest)
     with _selecting():
         chosen = selection.choose_samples(layout(contents.manifest.spec), labels)
         files = part_files(contents, selection, labels)
+    _check_paths(files)
     return _Part(
-        targets=_targets(target, files),
+        files=files,
         samples=int(chosen.sum()),
         label_files=len(missing),
         label_bytes=_total_size(missing),
     )
 
 
-def _targets(target: Path, files: list[FileEntry]) -> list[Target]:
-    return [Target(file, safe_path(target, file.path)) for file in files]
+def _check_paths(files: list[FileEntry]) -> None:
+    """Check that each file may be written, and that none is listed twice.
+
+    Raises:
+        UnsafePathError: A file would be written outside of the dataset, or be hidden.
+        DamagedError: Two entries have one path.
+    """
+    for file in files:
+        check_path(file.path)
+    if len({file.path for file in files}) != len(files):
+        raise DamagedError(f"{MANIFEST_NAME} lists a file twice")
 
 
-def _missing(target: Path, targets: list[Target]) -> list[Target]:
+def _missing(target: Path, files: list[FileEntry]) -> list[FileEntry]:
     """Return the files that a directory does not hold, or holds damaged."""
-    return [entry for entry in targets if fault_of(target, entry.file) is not None]
+    return [file for file in files if fault_of(target, file) is not None]
 
 
-def _total_size(targets: list[Target]) -> int:
-    return sum(entry.file.size for entry in targets)
+def _total_size(files: list[FileEntry]) -> int:
+    return sum(file.size for file in files)
 
 
 def _refuse_small_disk(target: Path, size: int) -> None:

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ValidationError
@@ -112,7 +112,7 @@ def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]
         CorruptChunkError: A chunk does not decode to the size that the layout says.
     """
     import numpy as np  # the extra `arrays`
-    from stickslip_schemas.format.codecs import decode_chunk
+    from stickslip_schemas.format.codecs import CorruptChunkError, decode_chunk, largest_chunk
 
     array = next(array for array in layout(manifest.spec) if array.name == name)
     samples_per_file = manifest.spec.samples_per_file(array)
@@ -121,24 +121,27 @@ def read_label(target: Path, manifest: Manifest, name: str) -> "npt.NDArray[Any]
     for number in range(file_count):
         # A buffer of the stated size: a chunk that decodes to more is refused, not decoded.
         chunk = np.empty((samples_per_file, *array.shape), dtype=array.dtype)
-        decode_chunk((target / array.shard_path(number)).read_bytes(), chunk)
+        file = target / array.shard_path(number)
+        if file.stat().st_size > largest_chunk(chunk.nbytes):
+            raise CorruptChunkError(
+                f"{array.shard_path(number)} is larger than {chunk.nbytes} bytes can be"
+            )
+        decode_chunk(file.read_bytes(), chunk)
         chunks.append(chunk)
     return np.concatenate(chunks)[: manifest.sample_count]
 
 
-def safe_path(target: Path, path: str) -> Path:
-    """Return the path of a file of a manifest below a directory.
+def check_path(path: str) -> None:
+    """Check the path of a file of a manifest, without a look at the disk.
 
-    Existing symbolic links are followed for the check, so a link that leads out of `target` is
-    refused, too. Names that begin with a dot are refused, because other programs obey some of them:
+    Names that begin with a dot are refused, because other programs obey some of them:
     `.git/hooks/post-checkout` for example.
 
     Raises:
-        UnsafePathError: The file would lie outside `target`, be hidden or have a reserved name.
+        UnsafePathError: The file would lie outside the dataset, be hidden or have a reserved name.
     """
-    parts = PurePosixPath(path).parts
-    leaves = not parts or path.startswith("/") or ".." in parts or "\\" in path
-    if leaves or "." in path.split("/"):
+    parts = path.split("/")
+    if not all(parts) or "\\" in path or ".." in parts or "." in parts:
         raise UnsafePathError(
             f"the manifest names the file {path!r}, which leaves the dataset; nothing was written"
         )
@@ -146,13 +149,25 @@ def safe_path(target: Path, path: str) -> Path:
         raise UnsafePathError(
             f"the manifest names the file {path!r}, which is hidden; nothing was written"
         )
-    file = target.joinpath(*parts)
+    if path in RESERVED_NAMES or path.endswith(PART_SUFFIX):
+        raise UnsafePathError(f"the manifest names the file {path!r}, which is a reserved name")
+
+
+def safe_path(target: Path, path: str) -> Path:
+    """Return the path of a file of a manifest below a directory.
+
+    Existing symbolic links are followed for the check, so a link that leads out of `target` is
+    refused, too.
+
+    Raises:
+        UnsafePathError: See `check_path`; or a link leads out of `target`.
+    """
+    check_path(path)
+    file = target / path
     if not file.resolve().is_relative_to(target.resolve()):
         raise UnsafePathError(
             f"the file {path!r} would be written outside {target}; nothing was written"
         )
-    if path in RESERVED_NAMES or path.endswith(PART_SUFFIX):
-        raise UnsafePathError(f"the manifest names the file {path!r}, which is a reserved name")
     return file
 
 
@@ -309,8 +324,10 @@ def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int])
 def fault_of(target: Path, file: FileEntry) -> Fault | None:
     """Return the fault of a file that a manifest lists; None if it is whole."""
     try:
+        # Most files of a new download do not exist, and following links takes time.
+        check_path(file.path)
+        size = (target / file.path).stat().st_size
         path = safe_path(target, file.path)
-        size = path.stat().st_size
         if size != file.size:
             return Fault(file.path, "size", f"{size} bytes, and should have {file.size}")
         digest = file_digest(path)

@@ -205,6 +205,11 @@ class Index:
         what = f"array {array.name}, samples {number * size} to {last}"
         file = self.file(array.shard_path(number), what)
         out = np.empty((size, *array.shape), dtype=array.dtype)
+        # The size is checked before the file is read: memory follows from the layout.
+        if file.size > codecs.largest_chunk(out.nbytes):
+            raise CorruptDataError(
+                f"{what}: {self.at(file)} has {file.size} bytes, more than {out.nbytes} can take"
+            )
         data = self.read_file(file)
         with _naming(f"{what}, {self.at(file)}"):
             codecs.decode_chunk(data, out)

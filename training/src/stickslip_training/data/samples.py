@@ -106,7 +106,8 @@ class Samples(Dataset[Item]):
             Buffers that are used in turn; 0 makes a new one for each batch.
 
         Raises:
-            ValueError: The dataset has no such array, or `ring` is negative.
+            ValueError: The dataset has no such array, the split has no valid sample, or `ring` is
+                negative.
         """
         if ring < 0:
             raise ValueError(
@@ -134,6 +135,9 @@ class Samples(Dataset[Item]):
         self.split = split
         self.slots = self.reader.slots(split)
         """Slot in the dataset of each item, int64 (items,)."""
+        if not len(self.slots):
+            name = "the dataset" if split is None else f"the split {split}"
+            raise ValueError(f"{name} of {self.reader.source} has no valid sample")
         self._arrays = tuple(arrays)
         values = {name: self.reader.label(name)[self.slots] for name in labels}
         self._labels = {
