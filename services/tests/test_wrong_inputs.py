@@ -5,6 +5,7 @@ rule and value.
 import json
 from collections.abc import Iterator
 from copy import deepcopy
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ WRONG_RODS: list[tuple[Any, ...]] = [
     ("kind", "rod", "one of cloth_drag, cloth_scene, rod_hang"),
     ("kind", MISSING, "one of cloth_drag, cloth_scene, rod_hang"),
     ("name", 7, "string"),
-    ("name", "x" * 200, "pattern"),
+    ("name", "x" * 200, "lower-case letters"),
     ("quality", "best", "one of preview, draft, standard, high"),
     ("quality", 3, "one of preview, draft, standard, high"),
     ("views", "rod-5", "one of rod-4"),
@@ -69,7 +70,7 @@ WRONG_RODS: list[tuple[Any, ...]] = [
     ("axes/gamma", "x", "number"),
     ("axes/gamma", [], "at least 1 item"),
     ("axes/gamma", [1, 1], "values must differ unless axes are zipped"),
-    ("axes/gamma", True, "an object"),
+    ("axes/gamma", True, "a value, a list of values, or an object"),
     ("axes/gama", 1, "did you mean gamma?"),
     ("axes/phi1", MISSING, "required"),
     ("axes/gamma", linspace(num=0), "greater than or equal to 1", "axes/gamma/num"),
@@ -94,7 +95,7 @@ WRONG_CLOTH: list[tuple[Any, ...]] = [
     ("frames", 10**6, "frames must be at most 300, the instants of the motion; got 1000000", ""),
     ("frames", "x", "integer"),
     ("quality", "ultra", "one of preview, draft, standard, high"),
-    ("axes/material", "denim", "one of 11oz-black-denim"),
+    ("axes/material", "denim", "did you mean 11oz-black-denim?"),
     ("axes/mu", -0.1, "greater than or equal to 0"),
     ("axes/mu", 50, "less than or equal to 10"),
     ("axes/texture", "dot", "did you mean dots?"),
@@ -111,7 +112,7 @@ WRONG_CLOTH: list[tuple[Any, ...]] = [
     ("creases", "x", "number"),
     ("measured", "x", "number"),
     ("textures", {"logo": "x"}, "sha256", "textures/logo"),
-    ("textures", {"Logo!": "sha256:" + "a" * 64}, "pattern", "textures/Logo!"),
+    ("textures", {"Logo!": "sha256:" + "a" * 64}, "lower-case letters", "textures/Logo!"),
     ("lamps", {"l": {}}, "required", "lamps/l/azimuth"),
     ("substrates", {"s": {"albedo": [2, 3]}}, "less than or equal to 1", "substrates/s/albedo/0"),
     ("viewpoints", {"v": {}}, "required", "viewpoints/v/image_size"),
@@ -121,6 +122,7 @@ WRONG_CLOTH: list[tuple[Any, ...]] = [
 WRONG_SCENES: list[tuple[Any, ...]] = [
     ("scene", "wype", "did you mean wipe?"),
     ("axes/speed", -1, "one of fabric, mu"),
+    ("axes/mu", 3, "within 0 to 1.5"),
     ("axes/texture", MISSING, "required"),
     ("frames", 0, "greater than or equal to 1"),
     ("axes/viewpoint", "nowhere", "one of front, side, high"),
@@ -190,6 +192,9 @@ FLAGS: list[tuple[str, int, str]] = [
     ("validate OK --jsn", 2, "No such option '--jsn'. Did you mean '--json'?"),
     ("validate OK x", 2, "unexpected extra argument (x)"),
     ("validate OK --url 127.0.0.1", 1, "must begin with http:// or https://: it is '127.0.0.1'"),
+    ("validate OK --url http://x:y:1", 1, "must have a host and a port from 1 to 65535"),
+    ("validate OK --url http://[::1", 1, "must have a host and a port from 1 to 65535"),
+    ("validate OK --url http:///x", 1, "must have a host, as in http://HOST:PORT"),
     ("validate OK --url ftp://x", 1, "must begin with http:// or https://: it is 'ftp://x'"),
     ("validate NONE", 1, "there is no file"),
     ("validate LIST", 1, "must hold a mapping (key: value), and it holds [1]"),
@@ -197,11 +202,18 @@ FLAGS: list[tuple[str, int, str]] = [
     (
         "validate DATE",
         1,
-        "name must be a number, a word, a list or a mapping, and it is the date 2026-01-01: write it in",
+        "name must be a number, a word, a list or a mapping, and it is the date 2026-01-01",
     ),
     ("validate TWICE", 1, "the key 'kind' is there twice"),
     ("validate BROKEN", 1, "is not YAML"),
-    ("validate BYTES", 1, "cannot be read"),
+    ("validate BYTES", 1, "it must be YAML or JSON, text in UTF-8; byte 0 is not UTF-8"),
+    ("validate PICTURE", 1, "it must be YAML or JSON, text in UTF-8, and it is a PNG picture"),
+    ("validate EMPTY", 1, "is empty: it must hold a mapping"),
+    ("validate DEEP", 1, "must not nest its values so deeply"),
+    ("validate BOMB", 1, "must hold at most 1000000 values, with aliases written out"),
+    ("scene check absent.yaml", 1, "there is no file absent.yaml"),
+    ("scene check folder/absent", 1, "there is no file folder/absent"),
+    ("scene check EMPTY", 1, "is empty: it must hold a mapping"),
     ("submit OK --priority 101", 2, "'--priority': 101 is not in the range -100<=x<=100"),
     ("submit OK --priority -101", 2, "'--priority': -101 is not in the range -100<=x<=100"),
     ("submit OK --priority high", 2, f"'--priority': 'high' is {NUMBER}"),
@@ -343,6 +355,14 @@ FILES = {
     "TWICE": "kind: rod_hang\nkind: cloth_drag\n",
     "BROKEN": "axes: [",
     "BYTES": "\udcff",
+    "PICTURE": "\udc89PNG\r\n",
+    "EMPTY": "# a comment",
+    "DEEP": "[" * 5000,
+    "BOMB": "a: &a [1]\n"
+    + "\n".join(
+        f"{name}: &{name} [{', '.join([f'*{earlier}'] * 9)}]"
+        for earlier, name in pairwise("abcdefghijk")
+    ),
 }
 
 

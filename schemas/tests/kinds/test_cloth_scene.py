@@ -212,7 +212,7 @@ def test_a_built_in_scene_is_named() -> None:
             "must be one of 11oz-black-denim",
             '{"fabric": "silk"}',
         ),
-        ({"axes": {"mu": "high"}}, "/axes/mu/0", "must be within 0 to 2", '"high"'),
+        ({"axes": {"mu": "high"}}, "/axes/mu", "must be within 0 to 2", '"high"'),
         ({"axes": {"viewpoint": "left"}}, "/axes/viewpoint", "one of front, side, high", '"left"'),
         (
             {"set": {"sheets.cloth.mesh.cels": 3}},

@@ -114,7 +114,7 @@ WRONG: list[tuple[Any, ...]] = [
         "materials.Felt",
         {"density": 0.1, "young": 1e6, "poisson": 0.3, "thickness": 1e-3},
         "",
-        "pattern",
+        "lower-case letters",
         '"Felt"',
     ),
     (f"{UPPER}.material", "fellt", "", "did you mean felt"),

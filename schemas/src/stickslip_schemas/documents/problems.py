@@ -13,6 +13,24 @@ from pydantic_core import ErrorDetails
 from stickslip_schemas.base import literals, models_at, unit_of
 from stickslip_schemas.spec.names import did_you_mean
 
+_NAME_RULE = "must be lower-case letters, digits and '-', 63 at most, the first one no '-'"
+PATTERN_RULES = {
+    r"^[a-z0-9][a-z0-9-]{0,62}$": _NAME_RULE,
+    r"^[a-z0-9][a-z0-9-]*$": "must be lower-case letters, digits and '-', the first one no '-'",
+    r"^[a-z][a-z0-9_]{0,62}$": (
+        "must be lower-case letters, digits and '_', 63 at most, a letter first"
+    ),
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$": (
+        "must be letters, digits, '_', '.' and '-', 63 at most, a letter or digit first"
+    ),
+    r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$": (
+        "must be a path of letters, digits, '_', '.', '-' and '/', a letter, digit or '_' first"
+    ),
+    r"^sha256:[0-9a-f]{64}$": "must be `sha256:` and 64 lower-case hexadecimal digits",
+    r"^[0-9a-f]{64}$": "must be 64 lower-case hexadecimal digits",
+}
+"""The rule of each pattern of our documents, in words."""
+
 MEDIA_TYPE = "application/problem+json"
 
 
@@ -122,6 +140,11 @@ def _field_error(item: ErrorDetails, document: Any, of: Any) -> FieldError:
                 rule = f"must be an object with the field {tag}, one of {', '.join(known)}"
         case "model_type" | "model_attributes_type" | "dict_type":
             rule = "must be an object"
+            if location[-2:-1] == ("axes",):
+                rule = "must be a value, a list of values, or an object with the field type"
+        case "string_pattern_mismatch":
+            pattern = item["ctx"]["pattern"]
+            rule = PATTERN_RULES.get(pattern, f"must have the form {pattern}")
         case "too_short":
             rule = f"must have at least {item['ctx']['min_length']} item(s)"
         case "enum" | "literal_error":
@@ -149,8 +172,8 @@ def _pointer(location: Sequence[int | str], document: Any, *, missing: bool) -> 
             here = here[part]
         elif isinstance(here, list) and isinstance(part, int) and part < len(here):
             here = here[part]
-        elif not (missing and position == len(location) - 1):
-            continue
+        elif not (missing and position == len(location) - 1 and isinstance(here, Mapping | list)):
+            continue  # a tag of a union, or the position of the only value of an axis
         parts.append(part)
     return "".join("/" + str(part).replace("~", "~0").replace("/", "~1") for part in parts)
 

@@ -162,12 +162,21 @@ class Texture(StrEnum):
     terrazzo = "terrazzo"
 
 
+LEAST_LIKENESS = 0.65
+"""Likeness of two words from which on one is suggested for the other [difflib's ratio]."""
+LEAST_PART_LETTERS = 4
+"""Letters that a part of a name must have to stand for it."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a question for the known word that is most like `word`, or an empty text.
 
-    Did you mean ...?` with the known word that is most like `word`, or nothing where none is.
+    A known word that contains `word` counts, too: `denim` means `11oz-black-denim`.
     """
-    close = get_close_matches(word, list(known), n=1, cutoff=0.6)
+    names = list(known)
+    close = get_close_matches(word, names, n=1, cutoff=LEAST_LIKENESS)
+    if not close and len(word) >= LEAST_PART_LETTERS:
+        close = [name for name in names if word.lower() in name.lower()]
     return f"; did you mean {close[0]}?" if close else ""
 
 

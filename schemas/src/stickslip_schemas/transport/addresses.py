@@ -50,6 +50,23 @@ def api_key_for(url: str) -> str | None:
     return api_key_of_environment() if is_below(url, coordinator_url()) else None
 
 
+def check_url(url: str) -> None:
+    """Check that a URL names a server.
+
+    Raises:
+        ValueError: It does not; the message does not repeat the URL, which may have a password.
+    """
+    if not url.startswith(("http://", "https://")):
+        raise ValueError("must begin with http:// or https://")
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        raise ValueError("must have a host and a port from 1 to 65535, as in HOST:PORT") from None
+    if not parts.hostname or port == 0 or any(character.isspace() for character in url):
+        raise ValueError("must have a host, as in http://HOST:PORT, and no spaces")
+
+
 def is_below(url: str, root: str) -> bool:
     """Return whether `url` is `root` or a path below it, on the same server."""
     if _server(url) != _server(root):

@@ -15,6 +15,7 @@ from stickslip_schemas.transport.addresses import (
     InvalidKeyError,
     api_key_of_environment,
     authorization,
+    check_url,
     coordinator_url,
     without_password,
 )
@@ -82,11 +83,11 @@ class Client:
             ClientError: The URL has no scheme, or the key cannot be sent.
         """
         self.url = (url or coordinator_url()).rstrip("/")
-        if not self.url.startswith(("http://", "https://")):
-            raise ClientError(
-                "the URL of the coordinator must begin with http:// or https://: it is "
-                f"{without_password(self.url)!r}"
-            )
+        try:
+            check_url(self.url)
+        except ValueError as error:
+            address = self.url.rpartition("@")[2]
+            raise ClientError(f"the URL of the coordinator {error}: it is {address!r}") from error
         self._sleep = sleep
         self._api_key = key or api_key_of_environment()
         try:

@@ -21,6 +21,7 @@ from stickslip_schemas.transport.addresses import (
     URL_VARIABLE,
     api_key_for,
     api_key_of_environment,
+    check_url,
     coordinator_url,
 )
 from stickslip_schemas.transport.limits import DOCUMENT_BYTES
@@ -279,6 +280,16 @@ class HttpSource(_RemoteSource):
     """
 
     def __init__(self, url: str, *, api_key: str | None = None) -> None:
+        """Make a source; nothing is asked yet.
+
+        Raises:
+            ValueError: The URL names no server.
+        """
+        try:
+            check_url(url)
+        except ValueError as error:
+            address = url.rpartition("@")[2]
+            raise ValueError(f"the URL of a dataset {error}: it is {address!r}") from error
         url = url.rstrip("/")
         version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
         super().__init__(f"{version[1]}/files" if version else url)
