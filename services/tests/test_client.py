@@ -48,6 +48,10 @@ def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
         events = list(client.events(job.id))
         assert isinstance(events[-1], JobStateEvent)
         (made,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
+        lines = [str(event) for event in events]
+        assert lines[-1] == "succeeded"
+        assert f"published {made.dataset.dataset}:v1" in lines
+        assert all("\n" not in line and len(line) < 120 for line in lines)
         assert (
             len(list(client.samples(job.id)))
             == len(client.request("GET", f"/v1/jobs/{job.id}/previews").json())

@@ -280,11 +280,24 @@ class JobStateEvent(Document):
     reason: Reason | None
     message: str
 
+    def __str__(self) -> str:
+        """Return one line: `failed: no sample is valid`."""
+        return f"{self.state}: {self.message}" if self.message else str(self.state)
+
 
 class JobProgressEvent(Document):
     """Tasks have ended."""
 
     progress: Progress
+
+    def __str__(self) -> str:
+        """Return one line: `12 of 40 tasks: simulate 4/4, render 8/36`."""
+        stages = [
+            f"{stage} {counts.done}/{counts.total}"
+            for stage, counts in self.progress.stages.items()
+            if counts.total
+        ]
+        return f"{self.progress.done} of {self.progress.total} tasks: {', '.join(stages)}"
 
 
 class TaskStateEvent(Document):
@@ -296,8 +309,16 @@ class TaskStateEvent(Document):
     reason: Reason
     message: str
 
+    def __str__(self) -> str:
+        """Return one line: `render rejected: out_of_frame: the rod leaves the frame`."""
+        return f"{self.stage} {self.state}: {self.reason}: {self.message}"
+
 
 class DatasetPublishedEvent(Document):
     """A dataset version was committed."""
 
     dataset: DatasetRef
+
+    def __str__(self) -> str:
+        """Return one line: `published ds-0123456789abcdef:v1`."""
+        return f"published {self.dataset.dataset}:v{self.dataset.version}"
