@@ -50,10 +50,6 @@ def test_a_grid_becomes_a_verified_directory(
     counts = json.loads(cli("validate", spec, "--json").stdout)
     assert (counts["sample_count"], counts["cached_count"]) == (4, 0)
     assert "4" in cli("validate", spec).stdout
-    axes = {"material": ["gray-interlock"], "mu": [0.5], "texture": ["dots"], "viewpoint": ["left"]}
-    refused = cli("validate", write(tmp_path / "cloth.yaml", {"kind": "cloth_drag", "axes": axes}))
-    assert refused.exit_code == 1
-    assert "would be refused now: no worker" in refused.stderr
     done = threading.Thread(target=wait_until, args=(lambda: worker.work() > 0,))
     done.start()
     submitted = cli("submit", spec, "--watch")
@@ -85,6 +81,13 @@ def test_a_grid_becomes_a_verified_directory(
     assert cli("pull", f"{dataset['id']}:v7", tmp_path / "e").exit_code == 1
     assert cli("pull", f"{dataset['id']}:vx", tmp_path / "e").exit_code == 1
     assert "has ended" in cli("cancel", job).stderr
+
+
+def test_a_valid_spec_that_would_be_refused_now(cli: Any, tmp_path: Path) -> None:
+    axes = {"material": ["gray-interlock"], "mu": [0.5], "texture": ["dots"], "viewpoint": ["left"]}
+    refused = cli("validate", write(tmp_path / "cloth.yaml", {"kind": "cloth_drag", "axes": axes}))
+    assert refused.exit_code == 1
+    assert "would be refused now: no worker" in refused.stderr
 
 
 def test_a_cancelled_job_is_no_success(
@@ -121,9 +124,9 @@ def test_a_cancelled_job_is_no_success(
         ),
         ("kind: cloth_scene\nscene: a.yaml", ["there is no file"]),
         (
-            "kind: cloth_scene\nscene: {format: stickslip-scene/1, duration: 1, default_friction: 0, bodies: {egg: {"
-            "type: mesh, file: egg.obj}}, sheets: {a: {material: gray-interlock, mesh: {type: grid, size: [1, 1], "
-            "cells: [1, 1]}}}}",
+            "kind: cloth_scene\nscene: {format: stickslip-scene/1, duration: 1, "
+            "default_friction: 0, bodies: {egg: {type: mesh, file: egg.obj}}, sheets: {a: "
+            "{material: gray-interlock, mesh: {type: grid, size: [1, 1], cells: [1, 1]}}}}",
             ["bodies.egg.file: must be readable: No such file or directory, in egg.obj"],
         ),
     ],

@@ -45,7 +45,10 @@ def test_a_command_that_does_not_exist() -> None:
 
 
 def test_a_client_without_the_server_says_what_is_missing() -> None:
-    code = "import sys; sys.modules['sqlalchemy'] = None; from stickslip_services.cli import app; app(['keys', 'list'])"
+    code = (
+        "import sys; sys.modules['sqlalchemy'] = None; "
+        "from stickslip_services.cli import app; app(['keys', 'list'])"
+    )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert run.returncode == 1
     assert "needs the server, and sqlalchemy is not installed" in run.stderr

@@ -1,4 +1,4 @@
-"""Signed datasets: who made it is known, and unsigned, unknown signer and changed are three errors."""
+"""Signed datasets: the signer is known; unsigned, unknown signer and changed are three errors."""
 
 import shutil
 import subprocess

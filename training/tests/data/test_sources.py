@@ -28,6 +28,9 @@ class _Server(http.server.ThreadingHTTPServer):
     bytes_sent = 0
     keys_sent: list[str | None]
 
+    def handle_error(self, *_):
+        """Say nothing about a client that has gone away."""
+
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     """Serve the files of a dataset version as the service does, with ranges."""

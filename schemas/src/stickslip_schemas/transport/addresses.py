@@ -26,6 +26,7 @@ def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach `host`."""
     if host == "localhost":
         return True
+    # Names are not resolved: their address may change between the check and the request.
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -69,8 +70,10 @@ def check_url(url: str) -> None:
 
 def is_below(url: str, root: str) -> bool:
     """Return whether `url` is `root` or a path below it, on the same server."""
+    # The port belongs to the server: another program may listen on another one.
     if _server(url) != _server(root):
         return False
+    # With a slash at the end, `/lab` is no beginning of `/laboratory`.
     root_path = urlsplit(root).path.rstrip("/")
     return f"{urlsplit(url).path}/".startswith(f"{root_path}/")
 
@@ -96,6 +99,7 @@ def authorization(api_key: str | None) -> dict[str, str]:
     """
     if not api_key:
         return {}
+    # httpx would refuse such a header with a message that has the key in it.
     is_header_value = api_key.isascii() and api_key.isprintable() and " " not in api_key
     if not is_header_value:
         raise InvalidKeyError(

@@ -58,7 +58,7 @@ class _RoutingTransport(httpx.BaseTransport):
 
     def __init__(self) -> None:
         self._routes: dict[tuple[Proxy | None, bool], httpx.HTTPTransport] = {}
-        # Threads that download share the transports.
+        # Threads that download share the transports, and their connections stay open.
         self._lock = threading.Lock()
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
@@ -164,6 +164,7 @@ class HttpClient:
         until = time.monotonic() + self.patience
         for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):
             is_last = time.monotonic() >= until
+            # Requests that change something are idempotent, so every one may be repeated.
             try:
                 response = self._attempt(method, url, limit, options)
             except httpx.InvalidURL as error:
@@ -174,6 +175,7 @@ class HttpClient:
                     raise TransportError(f"does not answer: {describe(error)}") from error
             else:
                 is_absent = response.status_code in _GATEWAY_STATUSES
+                # 503 is the coordinator's own word; the others are those of a proxy before it.
                 is_busy = response.status_code == BUSY_STATUS or (is_absent and self._was_answered)
                 self._was_answered = self._was_answered or not is_absent
                 if is_last or not is_busy:
@@ -235,6 +237,7 @@ def read_bounded(response: httpx.Response, limit: int) -> bytes:
         AnswerError: The body is compressed, larger than `limit` bytes, or does not end in time.
     """
     _refuse_compression(response)
+    # A size that is stated spares the reading; one that is not, or a wrong one, is counted.
     stated = response.headers.get("content-length", "")
     if stated.isdecimal() and int(stated) > limit:
         raise AnswerError(response, f"has {stated} bytes, and at most {limit} are accepted")

@@ -114,6 +114,7 @@ class ObjectClient:
         """
 
         def read() -> bytes:
+            # The size comes with the header, before the body is read.
             result = obstore.get(self._store, name)
             size = result.meta["size"]
             if limit is not None and size > limit:
@@ -184,6 +185,7 @@ class ObjectClient:
 
         An object that does not exist is no error.
         """
+        # Some servers have no such request, which shows with the first one.
         if names and self._deletes_many:
             try:
                 self._repeat(lambda: obstore.delete(self._store, names))
@@ -232,11 +234,13 @@ class ObjectClient:
             ) as error:
                 raise PermissionError(errno.EACCES, f"{self.url}: {_summary(error)}") from error
             except (_BusyError, obstore.exceptions.BaseError) as error:
+                # The crate tells its reasons in words only.
                 message = f"{self.url}: {_summary(error)}"
                 if any(words in str(error) for words in _REFUSALS):
                     raise RefusedError(errno.EINVAL, message) from error
                 if time.monotonic() + pause > end:
                     raise OSError(errno.EHOSTUNREACH, message) from error
+            # Many workers wait at once, so each waits another time.
             time.sleep(pause * random.uniform(0.5, 1.0))
             pause = min(2 * pause, _LONGEST_PAUSE_SECONDS)
 

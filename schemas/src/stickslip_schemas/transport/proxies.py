@@ -34,6 +34,7 @@ def proxy_for(url: str) -> Proxy | None:
     `NO_PROXY` lists hosts that are asked directly. A variable in lower case comes first, and an
     empty one switches the other off, as curl has it.
     """
+    # The loopback rule comes first, whatever NO_PROXY says.
     parts = urlsplit(url)
     host = parts.hostname or ""
     if not host or is_loopback(host) or proxy_bypass(host):

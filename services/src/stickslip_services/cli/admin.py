@@ -45,6 +45,7 @@ NAME_LETTERS = 63
 @options(*SERVER)
 def up(settings: Settings, name: str | None, slots: int | None, workers: str | None) -> None:
     """Run a coordinator, a Ray and a dispatcher on this machine, until Ctrl-C."""
+    # Processes that are started in other folders must find the same data.
     data = settings.data
     settings = settings.model_copy(update={"data": data.absolute()})
     check(settings, Role.coordinator, with_store=True)
@@ -117,6 +118,7 @@ def keys() -> None:
 def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], project: str) -> None:
     """Make a key and print it, once: the database keeps only its digest."""
     key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
+    # Only the secret goes to standard output: `key=$(stickslip keys create ...)`.
     click.echo(secret)
     say(
         f"{key_id} is made. Keep the key: it cannot be shown again. Use it as {API_KEY_VARIABLE}, "
@@ -162,6 +164,7 @@ def projects() -> None:
 def list_projects(connection: Connection) -> None:
     """List projects with their quotas, and the jobs and samples that count against them."""
     rows = []
+    # Each quota stands beside the number that it limits.
     for project in stored_quotas.list_projects(connection):
         rows.append(
             (
@@ -214,6 +217,7 @@ def create_webhook(settings: Settings, url: str, project: str) -> None:
         webhook_id, secret = stored_webhooks.create_webhook(
             connection, sealing, url, time.time(), project=project
         )
+    # Only the secret goes to standard output, as that of a key.
     click.echo(secret)
     say(
         f"{webhook_id} is made. The receiver verifies messages with the secret, as "

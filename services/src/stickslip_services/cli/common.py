@@ -69,6 +69,7 @@ def amount(unit: str, least: float) -> Callable[[str], float]:
             value = float(text)
         except ValueError:
             value = math.nan
+        # This refuses NaN, too, which compares with nothing.
         if not least <= value < math.inf:
             raise click.BadParameter(
                 f"must be a number of {unit}, {least:g} or more, and is {text!r}"
@@ -93,7 +94,8 @@ def shows_errors(command: Callable[P, R]) -> Callable[P, R]:
         try:
             return command(*arguments, **options)
         except BrokenPipeError:
-            raise  # the reader of the output has gone: the group ends the program
+            # The reader of the output has gone, which is no error: the group ends the program.
+            raise
         except ProblemError as error:
             _print_problem(error)
         except UnreachableError as error:
@@ -117,12 +119,14 @@ def _print_problem(error: ProblemError) -> None:
     print_error("the document is not valid" if problem.errors else problem.detail)
     for field in problem.errors:
         say(field_line(field))
+    # The user can do nothing about an error of the coordinator, but its log can be searched.
     if problem.request_id and problem.status >= SERVER_ERROR:
         say(f"  request {problem.request_id}; the coordinator's log says more")
 
 
 def _print_missing_package(error: ModuleNotFoundError) -> None:
     """Name the extra that brings a package; raise the error if the package is installed."""
+    # A module of ours, or one of an installed package, is a bug and not a missing extra.
     package = (error.name or "stickslip").partition(".")[0]
     if package.startswith("stickslip") or find_spec(package):
         raise error
@@ -135,6 +139,7 @@ def asks(command: Callable[..., R]) -> Callable[..., R]:
 
     @functools.wraps(command)
     def run(url: str, **options: object) -> R:
+        # The connections end with the command, also after an error.
         with Client(url) as client:
             return command(client, **options)
 

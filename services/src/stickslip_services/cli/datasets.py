@@ -58,6 +58,7 @@ def datasets(client: Client, latest: bool, as_json: bool) -> None:
 
     `stickslip pull "$(stickslip datasets --latest)" DEST` downloads the newest one.
     """
+    # For scripts: only the name, which `pull` reads.
     if latest:
         newest = _newest(client)
         if as_json:
@@ -127,10 +128,12 @@ def pull(
     of stickslip-training shows only the chosen samples; other readers show fill values for missing
     samples.
     """
+    # A wrong option is refused before the coordinator is asked.
     try:
         selection = Selection.of_options(arrays, split, where)
     except ValueError as error:
         raise SelectionError(str(error)) from error
+    # The version is fixed now: a newer one that is published meanwhile must not mix in.
     name = _resolve(client, dataset)
     lock = Lock()  # several threads download
     with click.progressbar(
@@ -187,6 +190,7 @@ def export(client: Client) -> None:
             name = _resolve(client, argument)
             argument = f"{client.url}/v1/datasets/{name.dataset}/versions/{name.version}"
         arguments.append(argument)
+    # In a process of its own: torch and the packages of an export are heavy, and may be missing.
     process = subprocess.run(
         [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
         env=os.environ | {URL_VARIABLE: client.url},  # the key belongs to this coordinator
@@ -197,6 +201,7 @@ def export(client: Client) -> None:
 
 def _resolve(client: Client, text: str) -> VersionName:
     """Return the version that `DATASET` or `DATASET:vN` means, DATASET being an id or a name."""
+    # Names of datasets have no colon, so the last one begins the version.
     dataset, colon, number = text.rpartition(":v")
     if not colon:
         dataset = text
@@ -237,6 +242,7 @@ def verify(target: Path, allowed_signers: Path | None) -> None:
 
     Exit with 1 if anything is wrong.
     """
+    # The signature comes first: it takes milliseconds, and the files may take minutes.
     signer = "" if allowed_signers is None else printable(signer_of(target, allowed_signers))
     faults = find_faults(target)
     if not faults:

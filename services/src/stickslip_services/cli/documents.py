@@ -45,6 +45,7 @@ def read_spec(path: Path) -> dict[str, Any]:
     Raises:
         CommandError: The file cannot be read, or holds no document.
     """
+    # Each parser has errors of its own, which are put into our words.
     text = _read_text(path)
     syntax = "JSON" if path.suffix == ".json" else "YAML"
     try:
@@ -64,6 +65,7 @@ def read_spec(path: Path) -> dict[str, Any]:
         raise CommandError(
             f"{path} must hold a mapping (key: value), and it holds {_value_words(document)}"
         )
+    # The size comes first: the other check writes aliases out.
     _check_size(document, path)
     _check_values(document, "", path)
     return document
@@ -81,6 +83,7 @@ def _read_text(path: Path) -> str:
             f"{path} must have at most {MAX_FILE_BYTES} bytes, and it has {len(data)}"
         )
     try:
+        # Editors of Windows write a mark of the byte order, which is no part of the text.
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         kinds = [kind for magic, kind in _MAGIC.items() if data.startswith(magic)]
@@ -125,6 +128,7 @@ def _check_size(document: dict[str, Any], path: Path) -> None:
             items = value
         else:
             return 1
+        # The document lives while it is counted, so no identity is used twice.
         identity = id(value)
         if identity in open_values:
             raise CommandError(f"{path} must not nest so deeply: does an alias name what it is in?")
@@ -171,6 +175,7 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
         CommandError: The file holds no document, or its scene breaks a rule.
     """
     document = read_spec(path)
+    # A scene may be a document, a file beside the spec, or the name of a built-in one.
     stated = document.get("scene")
     if isinstance(stated, dict):
         scene, files = _inline_files(stated, path)
@@ -188,6 +193,7 @@ def find_scene(name: str) -> tuple[Scene, dict[str, bytes]]:
         CommandError: The file does not exist, or breaks a rule.
         ClientError: There is no built-in scene of this name.
     """
+    # What looks like a file is one: a missing file must not be answered with a list of scenes.
     path = Path(name)
     if path.exists() or path.suffix in SCENE_SUFFIXES or "/" in name:
         return read_scene(path)
@@ -203,12 +209,14 @@ def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
     Raises:
         CommandError: The file holds no document, or the scene breaks a rule.
     """
+    # A scene without a name has that of its file, if the file's name is a possible one.
     name = path.stem if re.fullmatch(MATERIAL_NAME, path.stem) else None
     return _inline_files({"name": name, **read_spec(path)}, path)
 
 
 def _inline_files(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
     """Return a scene with references by digest in place of names of files, and these files."""
+    # The coordinator has the same limit, and would refuse the document later.
     length = len(json.dumps(document))
     if length > MAX_DOCUMENT_BYTES:
         raise CommandError(
@@ -225,6 +233,7 @@ def _inline_files(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str
     # This module needs the extra `arrays`, which a scene without files does not.
     from stickslip_schemas.scene.files import UnfitFileError, frames_of, inlined
 
+    # A scene of somebody else must not read files outside of its folder.
     folder = path.parent.resolve()
 
     def read(name: str) -> bytes:

@@ -52,6 +52,7 @@ def validate(client: Client, file: Path, as_json: bool) -> None:
 
     Exit with 1 if a job of it would be refused. Works offline.
     """
+    # The file is checked here first, so that wrong files are found without a coordinator.
     document, files = read_job(file)
     spec = check_spec(document, file)
     try:
@@ -60,6 +61,7 @@ def validate(client: Client, file: Path, as_json: bool) -> None:
     except UnreachableError:
         _validate_offline(spec, client.url, as_json=as_json)
         return
+    # A valid spec can still be refused: without a worker or a certificate, for example.
     is_refused = answer.refusal is not None
     if as_json:
         print_json(answer)
@@ -131,9 +133,11 @@ def submit(
 ) -> None:
     """Submit a job and print its id."""
     document, files = read_job(file)
+    # The coordinator must have the files of a scene before it accepts the job.
     if files:
         _upload(client, check_spec(document, file), files)
     job = client.submit(document, idempotency_key=idempotency_key, priority=priority)
+    # Only the id goes to standard output: `job=$(stickslip submit SPEC.yaml)`.
     click.echo(printable(job.id))
     if then_watch:
         state = watch_job(client, job.id, as_json=False)
@@ -200,6 +204,7 @@ def show(client: Client, job_id: str, as_json: bool) -> None:
 
 
 def _print_rejects(client: Client, job: responses.JobDetail) -> None:
+    # A job may have a million rejected samples; the first ones show what is wrong.
     rejects = list(islice(client.samples(job.id, state=TaskState.rejected), LISTED_REJECTS))
     if not rejects:
         return
@@ -218,6 +223,7 @@ def _job_fields(job: responses.JobDetail) -> Iterator[tuple[str, Cell]]:
     name = f" ({job.name})" if job.name else ""
     yield "job", f"{job.id}{name}, {job.kind}"
     yield "state", state_cell(job.state)
+    # The message explains the state, so it stands below it.
     if job.message:
         yield "", job.message
     if job.priority:
@@ -226,6 +232,7 @@ def _job_fields(job: responses.JobDetail) -> Iterator[tuple[str, Cell]]:
     planned = planned_so_far(job.progress, job.sample_count)
     if planned:
         yield "", planned
+    # A job that has ended takes no more time.
     if job.state.is_open:
         yield "time left", time_left(job.progress.eta)
     yield "CPU time", duration(sum(stage.cpu_seconds for stage in job.progress.stages.values()))
@@ -294,8 +301,10 @@ def priority(client: Client, job_id: str, priority: int) -> None:
 def _upload(client: Client, spec: JobSpec, files: Mapping[str, bytes]) -> None:
     """Upload the files that a scene names, by digest."""
     for pointer, digest in spec.artifacts.items():
+        # Files of built-in scenes, and files that were uploaded before, are not at hand.
         if digest not in files:
             continue
+        # Pictures of looks are checked as textures, all others as files of scenes.
         if pointer.startswith("/scene/looks/"):
             client.upload_texture(files[digest])
         else:
@@ -318,6 +327,7 @@ def upload(client: Client, files: tuple[Path, ...], as_json: bool) -> None:
         print_json(entries)
         return
     say("In a spec, under any names:")
+    # Textures are named together in a spec, files each in its place.
     textures = []
     references = []
     for file, entry in zip(files, entries, strict=True):

@@ -68,6 +68,7 @@ def rm(settings: Settings, version: str) -> None:
     if parts is None:
         raise ClientError(f"must be DATASET:vN, as in ds-0123456789abcdef:v1, and is {version!r}")
     _refuse_none(settings, Role.upkeep)
+    # A running coordinator could give the version to a reader at this moment.
     with _owned(settings) as (database, files):
         jobs, tasks = remove(database, files, parts[1], int(parts[2]))
     tell(f"{version} is removed, with {jobs} jobs and {tasks} results that no other job needs")
@@ -91,6 +92,7 @@ def gc(settings: Settings, older_than: float, delete: bool) -> None:
     _refuse_none(settings, Role.upkeep)
     with _owned(settings) as (database, files):
         for file in unused(database, files, older_than=3600 * older_than):
+            # Counted in both cases, so that a trial run tells what --delete would do.
             count += 1
             total_bytes += file.bytes
             if delete:

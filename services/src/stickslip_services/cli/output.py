@@ -55,6 +55,7 @@ def tell(text: str) -> None:
 
 def print_error(message: str) -> None:
     """Print a message that begins with `error:`, on standard error."""
+    # The style is added after wrapping, because its codes have no width.
     text = _wrap(f"error: {message}", columns(sys.stderr))
     styled = click.style("error:", bold=True, fg="red")
     click.echo(styled + text.removeprefix("error:"), err=True)
@@ -65,6 +66,7 @@ def _wrap(text: str, width: int) -> str:
     lines = []
     for line in text.split("\n"):
         indent = line[: len(line) - len(line.lstrip(" "))]
+        # Long words are commands, paths and URLs: broken, nobody could copy them.
         pieces = textwrap.wrap(
             line,
             width,
@@ -90,6 +92,7 @@ def print_json_line(value: JsonValue) -> None:
 def strict_json(value: BaseModel | Sequence[BaseModel] | JsonValue) -> JsonValue:
     """Return a value as JSON has it [RFC 8259]: null for numbers that are not finite."""
     if isinstance(value, BaseModel):
+        # pydantic writes null for NaN only into text, not into Python values.
         document: JsonValue = json.loads(value.model_dump_json())
         return document
     if isinstance(value, float) and not math.isfinite(value):
@@ -112,6 +115,7 @@ def print_table(
         rows: Cells by column.
         sentences: Whether the last column is text, which stays and is wrapped between words.
     """
+    # Cells are cleaned before they are measured: an escape sequence has no width.
     lines = [[_clean(cell) for cell in row] for row in rows]
     if any(heads):
         lines.insert(0, [Styled(head, None) for head in heads])
@@ -125,6 +129,7 @@ def print_table(
         _print_row(cells, [widths[column] for column in visible], is_head=is_head)
     hidden = [head for column, head in enumerate(heads) if column not in visible]
     if hidden:
+        # Some tables have no JSON form, and then only a wider terminal helps.
         context = click.get_current_context(silent=True)
         has_json = context is None or "as_json" in context.params
         rest = "--json" if has_json else "a wider terminal"
@@ -144,7 +149,7 @@ def _clean(cell: Cell) -> Styled:
 
 
 def _fit(widths: list[int], *, sentences: bool) -> list[int]:
-    """Return the columns that fit the terminal; narrow the widths of those that are wrapped."""
+    """Return the columns that fit the terminal, and narrow the widths of columns of text."""
     width = columns()
     visible = list(range(len(widths)))
     if sentences:
@@ -153,7 +158,7 @@ def _fit(widths: list[int], *, sentences: bool) -> list[int]:
         widths[-1] = min(widths[-1], max(LEAST_SENTENCE, rest))
     required = 2 if sentences else 1
     while len(visible) > required and _total(widths, visible) > width:
-        # The last column goes, or the last one before the text.
+        # Columns come by importance. The text of the last one says what is wrong: it stays.
         visible.pop(-required)
     if _total(widths, visible) > width:
         _narrow(widths, visible, width)

@@ -92,10 +92,12 @@ def watch_job(client: Client, job_id: str, *, as_json: bool) -> JobState:
     """
     job = client.job(job_id)
     view = JsonView() if as_json else LineView(client.url, job)
+    # The stream of an ended job would replay its whole history.
     if not job.state.is_open:
         for event in _last_events(job):
             view.show(event)
         return job.state
+    # The last state event tells how the job ended, also if the stream was lost in between.
     state = job.state
     try:
         for event in client.events(job.id):
@@ -107,6 +109,7 @@ def watch_job(client: Client, job_id: str, *, as_json: bool) -> JobState:
             f"\nthe job goes on. To watch it again: stickslip watch {job.id}. To cancel it: "
             f"stickslip cancel {job.id}"
         )
+        # Ctrl-C ends the watching, and never the job.
         raise Exit(INTERRUPTED_STATUS) from None
     return state
 
@@ -123,6 +126,7 @@ class JsonView:
 
     def show(self, event: Event) -> None:
         """Print an event."""
+        # Through text, because only there pydantic writes null for numbers that are not finite.
         document = json.loads(event.model_dump_json())
         print_json_line({"event": EVENT_NAMES[type(event)], **document})
 
@@ -162,6 +166,7 @@ class LineView:
         text = ", ".join(part for part in (planned, stage_counts(progress)) if part)
         if progress.eta is not None:
             text += f"; {time_left(progress.eta)} left"
+        # Many events change nothing that a line shows.
         if text == self._last_progress:
             return
         self._last_progress = text
@@ -173,6 +178,7 @@ class LineView:
 
     def _print(self, text: str, styled_state: str = "") -> None:
         """Print a line over the progress; the state in it may have a colour."""
+        # The progress stands on the last line and is overwritten.
         if self._is_terminal:
             click.echo("\r\x1b[K", nl=False)
         line = printable(text)

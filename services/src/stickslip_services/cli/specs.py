@@ -19,7 +19,7 @@ from stickslip_services.local import making
 from stickslip_services.units import size
 
 CERTIFICATES = Path("certificates")
-"""Folder that `stickslip certify` writes to, unless it is told another."""
+"""Folder that `stickslip certify` writes to without its option --out."""
 SAMPLE_FRAMES = 30
 """Most frames of a sample that is simulated or checked."""
 
@@ -60,6 +60,7 @@ def simulate(
     sample is not valid. No coordinator is needed.
     """
     document, files = find_scene(scene)
+    # The certificate of the preset is found by itself where `stickslip certify` has put it.
     usual_folder = CERTIFICATES / document.preset.value
     if certificate_folder is None and usual_folder.is_dir():
         certificate_folder = usual_folder
@@ -105,6 +106,7 @@ def check(scene: str, as_json: bool) -> None:
             }
         )
         return
+    # The last column is text, which is wrapped: lists of values and meanings are long.
     axis_rows = []
     for name, parameter in document.parameters.items():
         axis_rows.append((name, str(document.default(name)), str(parameter.range)))
@@ -185,6 +187,7 @@ def preview(scene: str, out: Path, as_json: bool) -> None:
 
 def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
     """Return the spec of one sample of a scene: default parameters, seen by its first camera."""
+    # One camera suffices: the simulation does not depend on it.
     cameras = scene.looks.cameras
     if isinstance(cameras, dict):
         viewpoints = list(cameras)

@@ -37,12 +37,14 @@ def workers(client: Client, as_json: bool) -> None:
         return
     rows = [_worker_row(worker) for worker in entries]
     print_table(("worker", "state", "slots", "tasks", "last seen", "kinds"), rows)
+    # Reasons are sentences, and would not fit into the table.
     for worker in entries:
         if worker.condition.reason:
             tell(printable(f"{worker.name}: {worker.condition.reason}"))
 
 
 def _worker_row(worker: WorkerEntry) -> tuple[Cell, ...]:
+    # The clocks of two machines may differ by more than a worker is silent.
     silence = max(0.0, (datetime.now(UTC) - worker.last_seen_at).total_seconds())
     last_seen = f"{duration(silence)} ago"
     return (
@@ -88,6 +90,7 @@ def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
         )
     else:
         tell(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {file}")
+    # The certificate is on the disk and can be registered later.
     client.patience = REGISTER_PATIENCE_SECONDS
     try:
         _register(client, directory)
@@ -118,6 +121,7 @@ def certificates(client: Client, as_json: bool) -> None:
     if as_json:
         print_json(entries)
         return
+    # A certificate counts only for the build that it was measured with.
     builds: set[str] = set()
     for worker in client.workers():
         builds.update(build.sim_core for build in worker.builds.values())

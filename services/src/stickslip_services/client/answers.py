@@ -44,6 +44,7 @@ def printable(text: str) -> str:
 
 def printable_json(content: bytes) -> bytes:
     """Return a JSON document whose strings are printable; most documents are already."""
+    # A manifest has megabytes, and parsing it twice would take a second.
     if _SUSPICIOUS.search(content) is None:
         return content
     try:
@@ -85,6 +86,7 @@ def parse(model: type[T], content: bytes, url: str) -> T:
 
 def first_fault(error: ValidationError) -> str:
     """Return the first field that breaks a rule, and the rule, without the value."""
+    # Values are left out: they are a server's, and may be long.
     fault = error.errors(include_url=False, include_input=False)[0]
     field = ".".join(str(part) for part in fault["loc"]) or "the document"
     return printable(f"{field}: {fault['msg']}")
@@ -100,6 +102,7 @@ def raise_for_problem(response: httpx.Response) -> None:
     if response.is_success:
         return
     url = without_password(str(response.url))
+    # A proxy or another program answers with a page of its own, which is not a problem document.
     if response.headers.get("content-type", "").startswith(MEDIA_TYPE):
         raise ProblemError(parse(Problem, response.content, url))
     raise UnexpectedError(

@@ -73,6 +73,7 @@ class Downloader:
         if part.is_symlink():
             part.unlink()
         self.on_bytes(_size(part))
+        # Pauses grow, so that a coordinator that restarts has time to do so.
         fault = ""
         for attempt in range(ATTEMPTS):
             pause = 0.0 if attempt == 0 else min(2.0**attempt / 4, self.client.patience)
@@ -87,6 +88,7 @@ class Downloader:
                 raise UnexpectedError(str(error)) from error
             if self.stop.is_set():
                 return
+            # The size is compared first, because a digest reads the whole file.
             if not fault and _size(part) == file.size and file_digest(part) == file.sha256:
                 sync(part)
                 part.replace(path)
@@ -106,6 +108,8 @@ class Downloader:
         Raises:
             TransportError: The connection failed.
         """
+        # Only the bytes that an earlier attempt did not get are requested, and only if the file
+        # is still the same.
         received = _size(part)
         headers = {}
         if received:
@@ -115,9 +119,11 @@ class Downloader:
                 return ""
             self.client.check_status(response)
             is_rest = response.status_code == 206
+            # A server that ignores the range sends all of the file.
             room = file.size - (received if is_rest else 0)
             with part.open("ab" if is_rest else "wb") as stream:
                 for block in response.iter_raw():
+                    # More bytes than stated are never written.
                     if len(block) > room:
                         return f"it has more than the {file.size} bytes that the manifest states"
                     stream.write(block)

@@ -46,6 +46,7 @@ def read_messages(blocks: Iterable[bytes]) -> Iterator[Message]:
     Raises:
         UnexpectedError: A message does not end.
     """
+    # A block may end within a character, and within a message.
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     pending = ""
     for block in blocks:
@@ -60,6 +61,7 @@ def read_messages(blocks: Iterable[bytes]) -> Iterator[Message]:
 def _read_message(text: str) -> Message:
     fields: dict[str, str] = {}
     for line in text.split("\n"):
+        # Comments, which keep the connection alive, have no name.
         name, _, value = line.partition(": ")
         fields[name] = value
     return Message(fields.get("id", ""), fields.get("event", ""), fields.get("data", ""))

@@ -88,6 +88,7 @@ class Client:
         except ValueError as error:
             address = self.url.rpartition("@")[2]
             raise ClientError(f"the URL of the coordinator {error}: it is {address!r}") from error
+        # A client is made for one coordinator, so the key of the environment is for it.
         self._sleep = sleep
         self._api_key = key or api_key_of_environment()
         try:
@@ -131,6 +132,7 @@ class Client:
 
         Requests with the same idempotency key make one job; by default each call has a new key.
         """
+        # A request whose answer was lost is sent again, and must not make a second job.
         headers = {"Idempotency-Key": idempotency_key or secrets.token_hex(16)}
         query = {"priority": str(priority)} if priority else {}
         return self._call(
@@ -232,6 +234,7 @@ class Client:
 
     def _messages(self, job_id: str, last_id: str) -> Iterator[Message]:
         """Yield the messages of a job's stream that follow the one with the id `last_id`."""
+        # With the id of the last event, the coordinator continues after it.
         headers = {"Accept": "text/event-stream"}
         if last_id:
             headers["Last-Event-ID"] = last_id
@@ -258,6 +261,7 @@ class Client:
         Raises:
             ClientError: No dataset has this name, or several have.
         """
+        # Names are not unique, because two specs may have the same one.
         matches = [dataset for dataset in self.datasets() if dataset.name == name]
         if not matches:
             raise ClientError(
@@ -325,6 +329,7 @@ class Client:
         # A version that does not exist is a problem of the coordinator, and not an empty group.
         self.version(dataset, number)
         url = f"{self.url}/v1/datasets/{dataset}/versions/{number}/files"
+        # The crate has a client of its own, which gets the same key and the same proxy.
         options: Any = {
             "allow_http": True,
             "default_headers": authorization(self._api_key),
@@ -400,6 +405,7 @@ class Client:
         """
         if response.is_success:
             return
+        # The coordinator restarts or sheds load, and the request can be repeated.
         if response.status_code == BUSY_STATUS:
             raise TransportError("is busy")
         try:
@@ -425,6 +431,7 @@ class Client:
         self, answer: type[responses.Page[T]], path: str, query: Mapping[str, str] | None = None
     ) -> Iterator[T]:
         """Yield the items of all pages of a list."""
+        # A page names the next one, so jobs that are added meanwhile shift nothing.
         params = {"page_size": PAGE_SIZE, **(query or {})}
         while True:
             page = self._call(answer, "GET", path, params=params)

@@ -150,6 +150,7 @@ def pull(
         document = PartDocument(manifest=manifest_digest, selection=selection)
         write_durably(target / SELECTION_NAME, document.model_dump_json(indent=2).encode())
 
+    # Intact files of an earlier pull stay.
     missing = _missing(target, part.files)
     changed = {
         name: content for name, content in sealed.files.items() if _read(target / name) != content
@@ -166,6 +167,7 @@ def pull(
     for name, content in changed.items():
         write_durably(target / name, content)
         on_bytes(len(content))
+    # The directory holds the whole version now, and no part of it.
     if selection.is_everything:
         (target / SELECTION_NAME).unlink(missing_ok=True)
     return Pulled(
@@ -187,6 +189,7 @@ def _choose_part(
     missing = _missing(target, label_files)
     _refuse_small_disk(target, _total_size(missing))
     downloader.download_all(missing)
+    # The labels on the disk have been checked, and tell which samples are chosen.
     labels = partial(read_label, target, contents.manifest)
     with _selecting():
         chosen = selection.choose_samples(layout(contents.manifest.spec), labels)
@@ -268,6 +271,7 @@ def refuse_foreign_files(target: Path, contents: Contents, name: str) -> None:
         listed_path = path.removesuffix(PART_SUFFIX)
         if listed_path not in RESERVED_NAMES and contents.file(listed_path) is None:
             foreign.append(path)
+    # A directory that holds this version may have files of the user beside it.
     present = ""
     with suppress(OSError, ValidationError):
         manifest = Manifest.model_validate_json((target / MANIFEST_NAME).read_bytes())
@@ -290,6 +294,7 @@ def _fetch_sealed(client: Client, dataset: str, version: int) -> _Sealed:
     content = answer.content
     group = client.request("GET", f"{base}/files/{GROUP_NAME}").content
     seal = client.request("GET", f"{base}/files/{SEAL_NAME}").content
+    # The record of the coordinator, the seal and the manifest must tell the same story.
     if (sha256(content), sha256(group)) != (record.manifest, record.group):
         raise DamagedError(
             f"{MANIFEST_NAME} or {GROUP_NAME} of {dataset}, version {version}, does not have the "
@@ -315,6 +320,7 @@ def _fetch_signature(client: Client, root: str) -> bytes | None:
     try:
         return client.request("GET", root + SIGNATURE_NAME, limit=SIGNATURE_BYTES).content
     except ProblemError as error:
+        # Most versions are not signed.
         if error.problem.status != 404:
             raise
         return None

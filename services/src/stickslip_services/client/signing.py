@@ -45,6 +45,7 @@ def sign(seal: bytes, key: Path) -> bytes:
 
 def is_signature(signature: bytes, seal: bytes) -> bool:
     """Return whether a signature is one of a seal, by whatever key."""
+    # ssh-keygen reads signatures from files only.
     with NamedTemporaryFile() as file:
         file.write(signature)
         file.flush()
@@ -58,6 +59,7 @@ def sign_directory(target: Path, key: Path) -> None:
     Raises:
         DamagedError: The seal is broken.
     """
+    # A damaged dataset must not get a good signature.
     manifest = (target / MANIFEST_NAME).read_bytes()
     group = (target / GROUP_NAME).read_bytes()
     seal = (target / SEAL_NAME).read_bytes()
@@ -107,6 +109,7 @@ def check_signature(seal: bytes, signature: bytes | None, allowed_signers: Path)
                 f"the dataset or its signature was changed: {SIGNATURE_NAME} is no signature of "
                 f"{SEAL_NAME} ({_last_line(good)})"
             )
+        # Of the allowed signers with this key, one must have been allowed at the time.
         trusted = ("-f", str(allowed_signers), "-s", file.name)
         names = _keygen("find-principals", *trusted).stdout.decode().splitlines()
         for name in names:

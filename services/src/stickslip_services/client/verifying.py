@@ -96,6 +96,7 @@ def check_counts(manifest: Manifest) -> None:
     Raises:
         DamagedError: The numbers differ.
     """
+    # In a manifest of sections, each section is checked against its slots when it is read.
     expected = manifest.spec.sample_count
     listed = manifest.sample_count if manifest.sections else len(manifest.sample_keys)
     if manifest.sample_count != expected or listed != expected:
@@ -145,6 +146,7 @@ def check_path(path: str) -> None:
         raise UnsafePathError(
             f"the manifest names the file {path!r}, which leaves the dataset; nothing was written"
         )
+    # Git, shells and editors run or read hidden files of the folder in which they are started.
     if any(part.startswith(".") for part in parts):
         raise UnsafePathError(
             f"the manifest names the file {path!r}, which is hidden; nothing was written"
@@ -294,6 +296,7 @@ def _check_files(
 
 
 def _faults_of(target: Path, files: list[FileEntry]) -> list[Fault]:
+    # Hashing releases the interpreter's lock, so threads use several cores.
     with ThreadPoolExecutor(CONNECTIONS) as pool:
         faults = list(pool.map(partial(fault_of, target), files))
     return [fault for fault in faults if fault is not None]
@@ -312,6 +315,7 @@ def _sample_key_faults(target: Path, contents: Contents, numbers: Iterable[int])
     faults = []
     for number in numbers:
         section = contents.section(number)
+        # A shard that was swapped with another has an intact digest, but other keys.
         listed = bytes.fromhex("".join(section.sample_keys))
         if stored[section.first : section.end].tobytes() != listed:
             path = array.shard_path(section.first // manifest.spec.samples_per_file(array))
