@@ -1,5 +1,6 @@
-"""The simulation core of stickslip: hanging rods and sliding cloth, in C++ with a thin Python
-layer.
+"""The simulation core of stickslip: hanging rods and sliding cloth.
+
+The solvers are C++ with a thin Python layer.
 """
 
 from stickslip_sim_core._sim_core import BuildInfo, PairForces, build_info, self_intersections

@@ -41,8 +41,11 @@ class Cantilever(RefinedProtocol):
     The preset's time step is the first one; steps grow to 1 s as the strip settles.
     """
 
-    name, x_name, y_name = "cantilever", "Gamma", "H/W"
-    points, time_step_name = "gamma", "first_time_step"
+    name = "cantilever"
+    x_name = "Gamma"
+    y_name = "H/W"
+    points = "gamma"
+    time_step_name = "first_time_step"
     constants: ClassVar = {
         "last_time_step_at_most": LONGEST,
         **{f"finer_beyond_{weight:g}": times for weight, times in FINER.items()},
@@ -86,7 +89,8 @@ def hang(
     straight = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
     cloth.set_state(straight)
     held = clamped.held
-    dt, at_rest = preset.time_step, False
+    dt = preset.time_step
+    at_rest = False
     while cloth.total.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
         cloth.step(dt, held=straight[held], damping=DAMPING)

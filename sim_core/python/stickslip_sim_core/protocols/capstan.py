@@ -40,8 +40,11 @@ FORCE_SHARE = 0.01
 class Capstan(ClothProtocol):
     """Ln(T2/T1) of a strip that slides over a cylinder, with cells of 5 degrees."""
 
-    name, x_name, y_name = "capstan", "mu", "ln(T2/T1)"
-    points, parameters = "friction", {"bending": "bending"}
+    name = "capstan"
+    x_name = "mu"
+    y_name = "ln(T2/T1)"
+    points = "friction"
+    parameters: ClassVar = {"bending": "bending"}
     constants: ClassVar = {
         "wrap": WRAP,
         "cells_per_turn": CELLS_PER_TURN,
@@ -120,11 +123,14 @@ class Strip:
         return Cloth(mesh, material, self.preset, held=self.held, force_scale=force_scale)
 
     def draw(self) -> tuple[Floats, float]:
-        """Return the heavy pull at each measured step [N/m], and the angle between the far
-        directions [rad].
+        """Return the heavy pull at each measured step [N/m] and the wrap angle [rad].
+
+        The angle is between the far directions of the strip.
         """
-        dt, pulls = self.preset.time_step, []
-        first, last = round(SLIDING / dt), round((SLIDING + MEASURED) / dt)
+        dt = self.preset.time_step
+        pulls = []
+        first = round(SLIDING / dt)
+        last = round((SLIDING + MEASURED) / dt)
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
             before = self.cloth.total.newton

@@ -29,13 +29,20 @@ FRICTION = (0.3, 1.0)
 
 # Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing
 # moves further [m].
-FIRST_SHARE, GROWTH, LONGEST, DAMPING, REST = 0.1, 1.1, 0.05, 8.0, 1e-9
+FIRST_SHARE = 0.1
+GROWTH = 1.1
+LONGEST = 0.05
+DAMPING = 8.0
+REST = 1e-9
 STEPS_MAX = 1500
 
 # The pull on the upper layer, over that of the master curve. It grows while the strip is damped,
 # and is held [s] while drift is measured; from the next share on it grows slowly [1/s].
-HOLD_SHARE, HOLD_TIME = 0.9, 10.0
-FROM, UP_TO, RATE = 0.98, 1.02, 0.004
+HOLD_SHARE = 0.9
+HOLD_TIME = 10.0
+FROM = 0.98
+UP_TO = 1.02
+RATE = 0.004
 GROWING = 1.0  # s
 MOVED = 1e-6  # m: an upper layer whose vertices have all come so far slips
 
@@ -45,15 +52,19 @@ FORCE_SHARE = 0.1
 
 @dataclass(kw_only=True, eq=False)
 class HeavyFold(ClothProtocol):
-    """The height of the loop, how far its nose lies before the landing, and the pull at which the
-    upper layer slips.
+    """The shape of a heavy loop, and the pull at which its upper layer slips.
+
+    The shape is the height of the loop and the distance of its nose from the landing.
 
     Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest gives the length of the
     tail. Its weight and the force at the landing are the load on friction.
     """
 
-    name, x_name, y_name = "heavy-fold", "mu", "length/L_gb, pull/(rho g L_gb)"
-    points, parameters = "friction", {"what": "what"}
+    name = "heavy-fold"
+    x_name = "mu"
+    y_name = "length/L_gb, pull/(rho g L_gb)"
+    points = "friction"
+    parameters: ClassVar = {"what": "what"}
     what: ClassVar = range(3)
     thickness = GAP * BENDING_LENGTH
     constants: ClassVar = {
@@ -82,9 +93,7 @@ class HeavyFold(ClothProtocol):
         return self.folds[mu][at["what"]]
 
     def fold(self, mu: float) -> tuple[tuple[float, float], ...]:
-        """Return height, distance of nose and landing, and pull at slip: as measured, and of the
-        master curve.
-        """
+        """Return height, nose to landing, and pull at slip: measured, and of the master curve."""
         exact = master_curves.heavy_fold(GAP)
         fold = Fold(mu, self.solver, self.cells)
         height, nose_to_landing = fold.settle()
@@ -108,7 +117,8 @@ class Fold:
     """
 
     def __init__(self, mu: float, preset: SolverSettings, cells: int) -> None:
-        self.mu, self.preset = mu, preset
+        self.mu = mu
+        self.preset = preset
         loop = master_curves.heavy_fold(GAP).loop_length
         length = (LOWER + loop + UPPER) * BENDING_LENGTH
         cell = length / cells
@@ -172,8 +182,9 @@ class Fold:
         )
 
     def drift(self) -> float:
-        """Return the largest displacement in `HOLD_TIME` without damping [m], pulled by
-        `HOLD_SHARE`.
+        """Return the largest displacement in `HOLD_TIME` without damping [m].
+
+        The pull is the fraction `HOLD_SHARE` of the pull at slip.
         """
         if np.isnan(self.expected):
             return np.inf
@@ -211,8 +222,7 @@ class Fold:
         return np.nan
 
     def measure(self) -> tuple[float, float, float]:
-        """Return height, distance of nose and landing, and length of the strip beyond the landing,
-        over L_gb.
+        """Return height, nose to landing, and length beyond the landing, over L_gb.
 
         Beyond the landing the layer below bears the weight of each vertex, and there a force
         besides. It is where the surplus over the weights has its centre, since the layer bears no
@@ -220,7 +230,8 @@ class Fold:
         """
         at = self.cloth.positions
         line = at[self.middle][np.argsort(self.along[self.middle])]
-        height, nose = peak(line[:, 2]), peak(line[:, 0])
+        height = peak(line[:, 2])
+        nose = peak(line[:, 0])
         pairs = self.cloth.pair_forces
         lift = np.zeros(len(at))
         np.add.at(lift, pairs.vertices, pairs.weights * pairs.forces[:, None, 2])
@@ -234,19 +245,19 @@ class Fold:
 
 
 def strip_of(cell: float, cells: int) -> meshes.Mesh:
-    """Return a strip of equilateral triangles from y = 0 on, two rows wide: they leave most room
-    for a thickness.
+    """Return a strip of equilateral triangles from y = 0 on, two rows wide.
+
+    Such triangles leave most room for a thickness.
     """
-    rise, side, inner = (
-        np.sqrt(0.75) * cell,
-        cell * np.arange(cells + 1),
-        cell * (np.arange(cells) + 0.5),
-    )
+    rise = np.sqrt(0.75) * cell
+    side = cell * np.arange(cells + 1)
+    inner = cell * (np.arange(cells) + 0.5)
     rest = [
         np.column_stack([np.full(len(y), x), y])
         for x, y in ((-rise, side), (0.0, inner), (rise, side))
     ]
-    left, middle = np.arange(cells + 1), cells + 1 + np.arange(cells)
+    left = np.arange(cells + 1)
+    middle = cells + 1 + np.arange(cells)
     right = left + 2 * cells + 1
     triangles = [
         np.column_stack([left[:-1], middle, left[1:]]),

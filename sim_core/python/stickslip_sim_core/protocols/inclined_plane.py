@@ -1,5 +1,7 @@
-"""Inclined plane: the slope at which a patch of cloth begins to slide, or the upper sheets of a
-stack, and its creep below that slope."""
+"""Inclined plane: the slope at which cloth begins to slide, and its creep below that slope.
+
+The cloth is a patch on the plane, or the upper sheets of a stack.
+"""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -54,7 +56,10 @@ class OnSlope:
     def __init__(
         self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]
     ) -> None:
-        self.cloth, self.start, self.mu, self.upper = cloth, start, mu, upper
+        self.cloth = cloth
+        self.start = start
+        self.mu = mu
+        self.upper = upper
         self.floor = [plane(floor)]
         cloth.set_state(start)
 
@@ -99,7 +104,9 @@ class SlopeProtocol(MeshedProtocol):
     measurement is NaN.
     """
 
-    x_name, y_name, points = "mu", "tan(alpha) at slip", "friction"
+    x_name = "mu"
+    y_name = "tan(alpha) at slip"
+    points = "friction"
     constants: ClassVar = {"drift_seconds": HOLD_TIME, "drift_share_of_slip_angle": HOLD_SHARE}
 
     force_share: ClassVar[float]
@@ -113,8 +120,10 @@ class SlopeProtocol(MeshedProtocol):
         """Return cloth at rest on a slope."""
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        creeping, slipping = self.lay(mu, at), self.lay(mu, at)
-        moved, slope = creeping.drift(), slipping.slip_slope()
+        creeping = self.lay(mu, at)
+        slipping = self.lay(mu, at)
+        moved = creeping.drift()
+        slope = slipping.slip_slope()
         self.tally.note(moved)
         self.tally.count(creeping.cloth)
         self.tally.count(slipping.cloth)
@@ -136,7 +145,9 @@ class InclinedPlane(SlopeProtocol):
     residuals are measured in, and slides late by as much over mu.
     """
 
-    name, grids_max, force_share = "inclined-plane", 1, 1.0
+    name = "inclined-plane"
+    grids_max = 1
+    force_share = 1.0
 
     friction: Sequence[float] = FRICTION
     cells: int = 10
@@ -177,7 +188,9 @@ class StackedIncline(SlopeProtocol):
     A stack in which another interface slides has no slip angle either.
     """
 
-    name, force_share, thickness = "stacked-incline", 0.1, THICKNESS
+    name = "stacked-incline"
+    force_share = 0.1
+    thickness = THICKNESS
     parameters: ClassVar = {"sheets": "sheets", "mesh": "meshes"}
 
     friction: Sequence[float] = STACK_FRICTION
@@ -192,13 +205,17 @@ class StackedIncline(SlopeProtocol):
 
 
 class Stack(OnSlope):
-    """Sheets on each other on a slope, the widest below, with the least friction, mu, below sheet
-    `sheets // 2`.
+    """Sheets on each other on a slope, the widest at the bottom.
+
+    The least friction, mu, is below sheet `sheets // 2`.
 
     `cells` are those of the sheet on top along a side.
     """
 
-    share_from, share_to, rate, slid = 0.99, 1.01, 0.002, 1e-6
+    share_from = 0.99
+    share_to = 1.01
+    rate = 0.002
+    slid = 1e-6
 
     def __init__(
         self,

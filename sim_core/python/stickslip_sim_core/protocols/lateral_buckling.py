@@ -1,5 +1,6 @@
-"""Lateral buckling: the weight at which a strip clamped with its width vertical turns sideways
-[Romero et al. 2021].
+"""Lateral buckling: the weight at which a strip on edge turns sideways [Romero et al. 2021].
+
+The strip is clamped with its width vertical.
 
 The strip takes up its weight in its plane, by steps of the solver. What its stress then adds to the
 stiffness against moving out of the plane goes with the weight, what bending adds with the rigidity:
@@ -38,14 +39,18 @@ REACH = 6.0  # cells: no force of bending acts between vertices that are further
 
 @dataclass(kw_only=True, eq=False)
 class LateralBuckling(RefinedProtocol):
-    """The weight Gamma* at which flat strips lose stability, against
-    `master_curves.lateral_buckling`.
+    """The weight Gamma* at which flat strips lose stability.
+
+    The master curve is `master_curves.lateral_buckling`.
 
     The preset's time step is the first one; the others grow.
     """
 
-    name, x_name, y_name = "lateral-buckling", "w/L", "Gamma* = rho_A g L^3 / D"
-    points, parameters = "aspect", {"mesh": "meshes", "poisson": "poisson"}
+    name = "lateral-buckling"
+    x_name = "w/L"
+    y_name = "Gamma* = rho_A g L^3 / D"
+    points = "aspect"
+    parameters: ClassVar = {"mesh": "meshes", "poisson": "poisson"}
     time_step_name = "first_time_step"
     constants: ClassVar = {
         "stretching_over_weight": STRETCHING,
@@ -106,13 +111,13 @@ def loaded(
 
 
 def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matrix:
-    """Return the stiffness (F, F) of the free vertices of a flat cloth against moving out of its
-    plane.
+    """Return the out-of-plane stiffness (F, F) of the free vertices of a flat cloth.
 
     Vertices that are more than twice `REACH` cells apart have no neighbour in common, so they are
     moved together.
     """
-    rest, cell = cloth.mesh.rest[free], cloth.mesh.spacing
+    rest = cloth.mesh.rest[free]
+    cell = cloth.mesh.spacing
     period = int(np.ceil(2.0 * REACH)) + 1
     boxes = np.floor((rest - rest.min(axis=0)) / cell + 1e-6).astype(int)
     crowd = np.zeros(len(free), dtype=int)  # number of a vertex within its box
@@ -121,7 +126,9 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
         crowd[inside] = np.arange(len(inside))
     kinds = np.column_stack([boxes % period, crowd])
     groups = np.asarray(np.unique(kinds, axis=0, return_inverse=True)[1]).ravel()
-    rows, columns, values = [], [], []
+    rows = []
+    columns = []
+    values = []
     for group in range(groups.max() + 1):
         members = np.flatnonzero(groups == group)
         ends = []

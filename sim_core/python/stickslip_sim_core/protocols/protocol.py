@@ -44,8 +44,9 @@ def rectangle(
     seed: int,
     aligned: int = 0,
 ) -> Mesh:
-    """Return a mesh of a rectangle [m]: a grid of `cells`, or triangles with sides of about
-    `spacing` [m].
+    """Return a mesh of a rectangle [m].
+
+    The mesh is a grid of `cells`, or triangles with sides of about `spacing` [m].
 
     `seed` draws the diagonals of a grid, and is added to the seed of an unstructured mesh, of which
     `aligned` rows of cells at the lower end are those of a grid.
@@ -57,8 +58,9 @@ def rectangle(
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """A strip along the second axis of its rest plane, clamped at its lower end by two rows of
-    vertices.
+    """A strip along the second axis of its rest plane, clamped at its lower end.
+
+    Two rows of vertices are clamped.
 
     The rows lie half a cell before and behind the clamp, so that a strip that is straight between
     them is level at the clamp itself. The mesh is longer than the strip by half a cell.
@@ -90,8 +92,9 @@ class Strip:
 
 
 def cell_of(cells: int) -> float:
-    """Return the length of a cell [m] of a strip with `cells` cells along it, half of one of them
-    before the clamp.
+    """Return the length of a cell [m] of a strip with `cells` cells along it.
+
+    Half of a cell is before the clamp.
     """
     return LENGTH / (cells - 0.5)
 
@@ -148,9 +151,7 @@ class Protocol(ABC):
 
     @abstractmethod
     def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        """Return the measured value at a point of the curve with the parameters `at`, and that of
-        its master curve.
-        """
+        """Return the measured value at a point of the curve `at`, and the master curve's value."""
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         """Measure the points x of the curve with the parameters `at`."""
@@ -163,7 +164,10 @@ class Protocol(ABC):
 
     @abstractmethod
     def reported(self) -> dict[str, Setting]:
-        """Return settings and diagnostics for the result besides `constants`, once all is measured."""
+        """Return settings and diagnostics for the result, once all is measured.
+
+        `constants` are added to them.
+        """
 
     def run(self) -> ProtocolResult:
         """Measure all points of all curves."""
@@ -255,8 +259,7 @@ class MeshedProtocol(ClothProtocol):
 
 @dataclass(kw_only=True, eq=False)
 class RefinedProtocol(MeshedProtocol):
-    """A protocol of strips that is run with three sizes of cells, from which the limit of small
-    cells follows.
+    """A protocol of strips with cells of three sizes, which give the limit of small cells.
 
     Raises:
         ValueError: `cells` breaks its rule.
@@ -276,7 +279,8 @@ class RefinedProtocol(MeshedProtocol):
             2 * fine >= 3 * coarse > 18 for coarse, fine in pairwise(self.cells)
         ):
             raise ValueError(
-                f"cells: must be three numbers from 7 on, each 1.5 times the one before, got {self.cells}"
+                "cells: must be three numbers from 7 on, each 1.5 times the one before, "
+                f"got {self.cells}"
             )
 
     def finer(self, x: float) -> int:

@@ -42,9 +42,13 @@ class PullOut(MeshedProtocol):
     mu + mu/2 (1 + weight of the middle sheet / load).
     """
 
-    name, x_name, y_name = "pull-out", "mu", "force/load"
-    points, parameters = "friction", {"load": "loads", "mesh": "meshes"}
-    grids_max, thickness = 1, THICKNESS
+    name = "pull-out"
+    x_name = "mu"
+    y_name = "force/load"
+    points = "friction"
+    parameters: ClassVar = {"load": "loads", "mesh": "meshes"}
+    grids_max = 1
+    thickness = THICKNESS
     constants: ClassVar = {
         "speed": SPEED,
         "friction_below_over_mu": OVER_LOWER,
@@ -78,7 +82,8 @@ class Pulled:
     def __init__(
         self, mu: float, load: float, preset: SolverSettings, cells: int, kind: MeshKind
     ) -> None:
-        self.mu, self.preset = mu, preset
+        self.mu = mu
+        self.preset = preset
         sizes = (
             (1.5 * SIDE, 1.2 * SIDE),
             (1.25 * SIDE, SIDE),
@@ -107,7 +112,8 @@ class Pulled:
         self.drawn = np.flatnonzero((self.level == 1) & (x > x[self.level == 1].max() - 1e-9))
         self.rear = np.flatnonzero((self.level == 2) & (x < x[self.level == 2].min() + 1e-9))
         self.start[np.concatenate([self.drawn, self.rear]), 2] += LIFTED * THICKNESS
-        below, above = OVER_LOWER * mu, UPPER * mu
+        below = OVER_LOWER * mu
+        above = UPPER * mu
         self.cloth = Cloth(
             meshes.together(*parts),
             laid,
@@ -122,16 +128,20 @@ class Pulled:
         self.cloth.set_state(self.start)
 
     def force(self) -> tuple[float, float]:
-        """Return the force that draws the middle sheet over the load (NaN if the lowest one moves),
-        and the master's.
+        """Return the force that draws the middle sheet over the load, and the master curve's.
+
+        The force is NaN if the lowest sheet moves.
 
         The load is what the holders of the upper sheet leave of its weight, and likewise for the
         middle one.
         """
-        cloth, dt = self.cloth, self.preset.time_step
+        cloth = self.cloth
+        dt = self.preset.time_step
         weight = -cloth.masses * cloth.gravity[:, 2]
         ends = self.start[cloth.held]
-        forces, loads, rests = [], [], []
+        forces = []
+        loads = []
+        rests = []
         for step in range(1, round((SLIDING + MEASURED) / dt) + 1):
             ends[: len(self.drawn), 0] = self.start[self.drawn, 0] + SPEED * step * dt
             cloth.step(dt, held=ends, bodies=[plane(ROUGH)])
@@ -141,7 +151,8 @@ class Pulled:
             forces.append(reactions[self.drawn, 0].sum())
             loads.append(weight[self.level == 2].sum() - reactions[self.rear, 2].sum())
             rests.append(weight[self.level == 1].sum() - reactions[self.drawn, 2].sum())
-        load, rest = float(np.mean(loads)), float(np.mean(rests))
+        load = float(np.mean(loads))
+        rest = float(np.mean(rests))
         moved = np.abs(cloth.positions - self.start)[self.level == 0].max()
         force = float(np.mean(forces)) / load if moved < LOWEST_MAX else np.nan
         return force, UPPER * self.mu + OVER_LOWER * self.mu * (1.0 + rest / load)

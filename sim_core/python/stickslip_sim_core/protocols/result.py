@@ -1,5 +1,6 @@
-"""Results of protocols: measured curves beside their master curves, whether they agree, and curves
-for pictures.
+"""Results of protocols: measured curves beside their master curves.
+
+They say whether the curves agree, and have points for pictures.
 """
 
 import math
@@ -56,16 +57,15 @@ or chance.
 
 
 def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
-    """Return the limit and the order p of y(h) = limit + c h^p through three values, the coarsest
-    first.
-    """
+    """Return limit and order p of y(h) = limit + c h^p through three values, coarsest first."""
 
     def missed(p: float) -> float:
         a, b, c = (size**p for size in sizes)
         return float((values[0] - values[1]) * (b - c) - (values[1] - values[2]) * (a - b))
 
     low, high = ORDERS
-    order, power = math.nan, 2.0
+    order = math.nan
+    power = 2.0
     if missed(low) * missed(high) < 0.0:
         order = power = float(brentq(missed, low, high))
     return float(
@@ -106,9 +106,7 @@ class Curve:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return parameters, points and errors, and of three meshes limits, orders and the errors
-        of each.
-        """
+        """Return parameters, points and errors; for three meshes also limits and orders."""
         found = {
             name: getattr(self, name)
             for name in ("parameters", "x", "measured", "master", "errors")
@@ -221,7 +219,8 @@ def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
     cubic [Fritsch, Carlson 1980] through the exact values: for pictures only. A single point
     without a formula has no curve.
     """
-    x, y = np.array(curve.x), np.array(curve.master)
+    x = np.array(curve.x)
+    y = np.array(curve.master)
     known = np.isfinite(x) & np.isfinite(y)
     x, order = np.unique(x[known], return_index=True)
     y = y[known][order]

@@ -1,11 +1,9 @@
-"""Protocols of the rod solver, and what they share: chains of frames, equilibria, extrapolation,
-searches.
-"""
+"""Protocols of the rod solver, with their chains of frames, equilibria and searches."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -51,17 +49,20 @@ def round_rod(phi: float, poisson: float) -> Relax:
 
 
 def planar_frames(angles: Floats) -> Floats:
-    """Frames in the plane y = 0, d3 = -y, whose tangents make these angles [rad] with gravity,
-    shape (N + 1, 4).
+    """Return frames in the plane y = 0 with d3 = -y, shape (N + 1, 4).
+
+    Their tangents make the given angles [rad] with gravity.
     """
-    c, s = np.cos(0.5 * angles), np.sin(0.5 * angles)
+    c = np.cos(0.5 * angles)
+    s = np.sin(0.5 * angles)
     # (1, 1, 1, -1) / 2, the clamp of solve_rods, times (c, 0, 0, s).
     return 0.5 * np.stack([c + s, c + s, c - s, s - c], axis=1)
 
 
 def tip(frames: Floats) -> Floats:
-    """Position of the free end [L], shape (3,): r' = d1 by the trapezoidal rule, whose error is
-    even in h.
+    """Return the position of the free end [L], shape (3,).
+
+    It integrates r' = d1 by the trapezoidal rule, whose error is even in h.
     """
     w, x, y, z = frames.T
     tangents = np.stack(
@@ -73,8 +74,9 @@ def tip(frames: Floats) -> Floats:
 
 
 def extrapolated(measure: Callable[[int], float], elements: int) -> float:
-    """Measure with 1/4, 1/2 and all of `elements` and go to the limit, as the solver does: error
-    O(h^6).
+    """Measure with 1/4, 1/2 and all of `elements` and go to the limit: error O(h^6).
+
+    The solver does the same.
     """
     coarse, middle, fine = (measure(elements // k) for k in (4, 2, 1))
     return float(64.0 * fine - 20.0 * middle + coarse) / 45.0
@@ -137,16 +139,18 @@ DOWN_TO = 1e-4
 
 @dataclass(kw_only=True, eq=False)
 class BendTwist(RodProtocol):
-    """The weight at which a hanging curly rod leaves its plane [Miller et al. 2014; Romero et al.
-    2021].
+    """The weight at which a curly rod leaves its plane [Miller et al. 2014; Romero et al. 2021].
 
     Measured is the weight at which the Hessian along a branch of planar equilibria ceases to be
     positive definite. An exactly planar rod stays planar. The master curve is
     `master_curves.bend_twist`.
     """
 
-    name, x_name, y_name = "bend-twist", "phi", "Gamma"
-    points, parameters = "phi", {"poisson": "poisson"}
+    name = "bend-twist"
+    x_name = "phi"
+    y_name = "Gamma"
+    points = "phi"
+    parameters: ClassVar = {"poisson": "poisson"}
 
     phi: Sequence[float] = PHI
     """Natural curvatures times L [rad]."""
@@ -162,8 +166,9 @@ class BendTwist(RodProtocol):
 
 
 def upper_boundary(phi: float, poisson: float, elements: int) -> float:
-    """Return the weight at which the planar chain, followed from large weights downwards, loses
-    stability, or NaN.
+    """Return the weight at which the planar chain loses stability, or NaN.
+
+    The chain is followed from large weights downwards.
     """
     relax = round_rod(phi, poisson)
     start = relax(phi**3, planar_frames(np.zeros(elements + 1)))
@@ -183,7 +188,9 @@ GAMMA = tuple(float(g) for g in 10.0 ** np.arange(-3.0, 5.1, 0.5))
 class RodCantilever(RodProtocol):
     """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`."""
 
-    name, x_name, y_name = "rod-cantilever", "Gamma", "H/W"
+    name = "rod-cantilever"
+    x_name = "Gamma"
+    y_name = "H/W"
     points = "gamma"
 
     gamma: Sequence[float] = GAMMA
@@ -196,7 +203,7 @@ class RodCantilever(RodProtocol):
 
 
 def drop_over_reach(gamma: float, elements: int) -> float:
-    """Return H/W of a straight chain clamped horizontally, NaN if it finds no stable equilibrium."""
+    """Return H/W of a straight chain clamped horizontally, NaN without a stable equilibrium."""
     straight = planar_frames(np.full(elements + 1, 0.5 * np.pi))
     hanging = round_rod(0.0, 0.5)(gamma, straight)
     if not hanging.stable:
@@ -217,16 +224,20 @@ UP_TO = 60.0
 
 @dataclass(kw_only=True, eq=False)
 class RodLateralBuckling(RodProtocol):
-    """The weight at which a strip clamped edge-on buckles sideways, against
-    `master_curves.lateral_buckling_rod`.
+    """The weight at which a strip that is clamped edge-on buckles sideways.
+
+    The master curve is `master_curves.lateral_buckling_rod`.
 
     Measured is the loss of a positive definite Hessian as the weight of a strip grows that stays in
     its vertical plane. The limit of a strip that does not bend in its own plane is reached by
     extrapolation.
     """
 
-    name, x_name, y_name = "rod-lateral-buckling", "poisson", "rho A g L^3 / sqrt(EI GJ)"
-    points, constants = "poisson", {"stiffness_ratios": STIFFNESS_RATIOS}
+    name = "rod-lateral-buckling"
+    x_name = "poisson"
+    y_name = "rho A g L^3 / sqrt(EI GJ)"
+    points = "poisson"
+    constants: ClassVar = {"stiffness_ratios": STIFFNESS_RATIOS}
 
     poisson: Sequence[float] = POISSON
     elements: int = 128
@@ -241,9 +252,7 @@ class RodLateralBuckling(RodProtocol):
 
 
 def buckling_weight(poisson: float, stiffness_ratio: float, elements: int) -> float:
-    """Return rho A g L^3 / sqrt(EI GJ) at which the chain of a strip loses stability, NaN if it
-    never does.
-    """
+    """Return rho A g L^3 / sqrt(EI GJ) at which a chain loses stability, or NaN."""
     # A thin strip: EI = Y w t^3 / 12 across its plane, GJ = Y w t^3 / (6 (1 + poisson)).
     twist = 2.0 / (1.0 + poisson)
     stiffness = np.array([twist, 1.0, stiffness_ratio])  # d3 = -y is the axis it hardly bends about

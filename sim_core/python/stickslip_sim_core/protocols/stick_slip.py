@@ -1,5 +1,6 @@
-"""Stick-Slip: the friction at which the tip of a buckled strip slips on a wall [Sano et al. 2017;
-Romero et al. 2021].
+"""Stick-Slip: the friction at which the tip of a buckled strip slips on a wall.
+
+Sources are [Sano et al. 2017; Romero et al. 2021].
 
 A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (rate t)^2
 times its length, so that Q/P, which goes with the square root of that strain, grows at an even
@@ -47,7 +48,9 @@ LET_GO = (
 # Strains of the phase diagram, and frictions beyond the triple point.
 PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))
 PHASE_FRICTION = (0.38, 0.5)
-STICK, SLIP, EXTENDED = 0.0, 1.0, 2.0
+STICK = 0.0
+SLIP = 1.0
+EXTENDED = 2.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,9 @@ class Press:
     """Strain at which more than the tip's vertices first touched the wall, or NaN."""
 
     static_error: float
-    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range; NaN if there is none.
+    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range.
+
+    NaN if there is none.
     """
 
     cloth: Cloth
@@ -75,7 +80,9 @@ class StickSlip(RefinedProtocol):
         ValueError: A friction is not on the master curve.
     """
 
-    name, x_name, y_name = "stick-slip", "mu", "mu at which the tip slips"
+    name = "stick-slip"
+    x_name = "mu"
+    y_name = "mu at which the tip slips"
     points = "friction"
 
     friction: Sequence[float] = FRICTION
@@ -127,7 +134,8 @@ def press(
 
     The root of the strain grows by `rate` [1/s].
     """
-    held, tip = clamped.held, clamped.tip
+    held = clamped.held
+    tip = clamped.tip
     width = float(np.ptp(clamped.across))
     buckling = 20.1907 * RIGIDITY * width / LENGTH**2  # N
     cloth = Cloth(
@@ -142,7 +150,8 @@ def press(
         [np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1
     )
     cloth.set_state(upright)
-    wall, clamp = [plane(mu)], upright[held]
+    wall = [plane(mu)]
+    clamp = upright[held]
     mass = float(cloth.masses.sum())
     dt = preset.time_step
     history: list[tuple[float, float, float]] = []
@@ -169,7 +178,8 @@ def press(
         slip = (
             rate * (last + 1.5) * dt
         ) ** 2  # in the middle of the step in which it began to move
-        strain_at, ratio = strain_at[:last], ratio[:last]
+        strain_at = strain_at[:last]
+        ratio = ratio[:last]
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
     )

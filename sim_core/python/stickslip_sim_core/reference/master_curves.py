@@ -1,5 +1,6 @@
-"""Master curves: the values that physics predicts for the protocols, computed here and never
-tabulated.
+"""Master curves: the values that physics predicts for the protocols.
+
+They are computed here and never tabulated.
 
 Every curve of a rod, or of a strip that bends in one direction, comes from the differential
 equations of the continuous rod, solved by scipy's collocation to 1e-9; that of a plate from
@@ -30,12 +31,14 @@ class NotSolvedError(RuntimeError):
 
 
 def cantilever(gamma: ArrayLike) -> Floats:
-    """Return H/W of a heavy elastica clamped horizontally: drop of its tip H over horizontal reach
-    W.
+    """Return H/W of a heavy elastica clamped horizontally.
+
+    H is the drop of its tip, W its horizontal reach.
 
     With psi the angle from the downward vertical to the tangent and primes d/ds,
 
-        psi'' = gamma (1 - s) sin psi,   psi(0) = pi/2,   psi'(1) = 0,   H = int cos psi ds,   W = int sin psi ds.
+        psi'' = gamma (1 - s) sin psi,   psi(0) = pi/2,   psi'(1) = 0,
+        H = int cos psi ds,   W = int sin psi ds.
 
     Of the solutions the one with 0 < psi <= pi/2 is meant; there the energy is convex, so there is
     no other such.
@@ -54,7 +57,8 @@ def _cantilever(gamma: float) -> float:
     # Widths of the layers at the clamp and at the free end; the fields are psi, psi' / rate, and H
     # and W, both scaled.
     rate = max(1.0, np.sqrt(gamma))
-    clamp, tip = 1.0 / rate, min(1.0, gamma ** (-1.0 / 3.0))
+    clamp = 1.0 / rate
+    tip = min(1.0, gamma ** (-1.0 / 3.0))
     mesh = np.unique(
         np.concatenate(
             [np.geomspace(0.25 * clamp, 0.5, 16), 1.0 - tip * np.linspace(0.0, 0.5, 5), [0.0]]
@@ -88,13 +92,15 @@ def _cantilever(gamma: float) -> float:
 
 
 def lateral_buckling_rod() -> float:
-    """Return the weight rho A g L^3 / sqrt(EI GJ) at which a strip clamped edge-on buckles
-    sideways, as w/L -> 0.
+    """Return the weight rho A g L^3 / sqrt(EI GJ) at which a strip buckles sideways.
+
+    The strip is clamped edge-on, in the limit w/L -> 0.
 
     A strip that cannot bend in its own plane stays straight until then. With x from the free end,
     EI its bending stiffness across the plane, GJ its twisting stiffness and eta the sideways slope,
 
-        eta'' + (weight / 2)^2 x^4 eta = 0,   eta'(0) = 0,   eta(1) = 0,   eta = sqrt(x) J_{-1/6}(weight x^3 / 6)
+        eta'' + (weight / 2)^2 x^4 eta = 0,   eta'(0) = 0,   eta(1) = 0,
+        eta = sqrt(x) J_{-1/6}(weight x^3 / 6)
 
     [Prandtl 1899]: six times the first zero of the Bessel function J_{-1/6}.
     """
@@ -102,8 +108,9 @@ def lateral_buckling_rod() -> float:
 
 
 def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
-    """Return the weight Gamma* = rho_A g L^3 / D at which a plate strip clamped edge-on buckles
-    sideways, to 5e-5.
+    """Return the weight Gamma* = rho_A g L^3 / D at which a plate strip buckles, to 5e-5.
+
+    The strip is clamped edge-on and buckles sideways.
 
     The strip of length L and width aspect * L is clamped along one short edge, with its width
     vertical, in displacement and slope; its other edges are free. rho_A is its mass per area, D = Y
@@ -163,8 +170,9 @@ def stick_slip(strain: ArrayLike) -> Floats:
 
 
 def stick_slip_strain(friction: ArrayLike) -> Floats:
-    """Return the strain at which a strip pressed end-on against a wall of this friction slips:
-    stick_slip's inverse.
+    """Return the strain at which a strip slips that is pressed end-on against a wall.
+
+    It is the inverse of `stick_slip`.
 
     Args: friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to
         1e-9), any shape. At a higher one the strip never slips.
@@ -183,24 +191,30 @@ def stick_slip_strain(friction: ArrayLike) -> Floats:
 
 @lru_cache(maxsize=1)
 def stick_slip_triple_point() -> tuple[float, float]:
-    """Return (strain, mu) where sticking, slipping and lying on the wall meet: there theta(1) = pi."""
+    """Return (strain, mu) at which sticking, slipping and lying on the wall meet.
+
+    There, theta(1) = pi.
+    """
     return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
 
 
 def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple[float, float]:
-    """Return (strain, Q/P) of the strip that fulfils one more condition on w(1) and (P, q, a), from
-    a guessed strain.
+    """Return (strain, Q/P) of the strip that fulfils a further condition.
+
+    The condition is on w(1) and (P, q, a); the search begins at a guessed strain.
 
     With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may
     be as small as it likes:
 
-        w'' = -P sin(a w) / a + q cos(a w),   w(0) = w'(1) = 0,   int sin(a w) / a = 0,   int (1 - cos(a w)) / a^2 = 1.
+        w'' = -P sin(a w) / a + q cos(a w),   w(0) = w'(1) = 0,
+        int sin(a w) / a = 0,   int (1 - cos(a w)) / a^2 = 1.
 
     For a = 0 its solution is w = (q / P) (1 - cos(k s) - k sin(k s)), tan k = k, P = k^2.
     """
 
     def change(_: Floats, y: Floats, p: Floats) -> Floats:
-        w, bend = y[0], y[1]
+        w = y[0]
+        bend = y[1]
         P, q, a = p
         sine = np.sin(a * w) / a
         return np.stack(
@@ -228,8 +242,9 @@ def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple
 
 
 def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
-    """Return the weight Gamma above which a curly rod hangs in a plane and below which it turns
-    three-dimensional.
+    """Return the weight Gamma above which a curly rod hangs in a plane.
+
+    Below it the rod turns three-dimensional.
 
     The rod has natural curvature phi / L about d3 and no natural twist, GJ/EI = C = 1/(1 +
     poisson), and is clamped with its tangent along gravity. The boundary is the Gamma at which the
@@ -245,7 +260,8 @@ def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
     Its linearised Kirchhoff equations out of the plane [mu0, mu1: moments about d1, d2; eta: slope
     of the tangent] are
 
-        mu0. = -k mu1,   mu1. = (k + q) mu0 - q mu0 / C - sigma eta,   eta. = -cos(theta) mu1 - sin(theta) mu0 / C
+        mu0. = -k mu1,   mu1. = (k + q) mu0 - q mu0 / C - sigma eta,
+        eta. = -cos(theta) mu1 - sin(theta) mu0 / C
 
     from mu0 = mu1 = 0, eta = 1 at the free end: the rotation about gravity being the other
     solution, the determinant of Jacobi's fields is eta. The planar rod is a minimum while eta has
@@ -264,9 +280,7 @@ def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
 
 
 def bend_twist_onset(poisson: float) -> tuple[float, float]:
-    """Return (phi, Gamma) of the least natural curvature at which a weight makes the rod
-    three-dimensional.
-    """
+    """Return (phi, Gamma) of the least natural curvature that makes the rod three-dimensional."""
     onset = _boundary(poisson).onset
     return onset.phi, onset.Lambda**3
 
@@ -284,8 +298,9 @@ class _BoundaryPoint:
 
 
 class _Boundary:
-    """The boundary curve of one Poisson's ratio, (Lambda, phi(Lambda)), followed from an anchor
-    along a ladder.
+    """The boundary curve of a Poisson's ratio, (Lambda, phi(Lambda)).
+
+    It is followed from an anchor along a ladder.
 
     The ladder of Lambda is climbed from the anchor always, so that no point depends on earlier
     calls.
@@ -313,7 +328,8 @@ class _Boundary:
             below, above = (
                 self._solve(best.Lambda * (1.0 + side * spread), best) for side in (-1.0, 1.0)
             )
-            slope, bend = above.phi - below.phi, above.phi - 2.0 * best.phi + below.phi
+            slope = above.phi - below.phi
+            bend = above.phi - 2.0 * best.phi + below.phi
             best = self._solve(best.Lambda * (1.0 - 0.5 * spread * slope / bend), best)
         return best
 
@@ -397,7 +413,8 @@ class _Boundary:
 def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:
     """d/dsigma of (theta, q, mu0, mu1, eta): see bend_twist."""
     theta, q, mu0, mu1, eta = y
-    sine, cosine = np.sin(theta), np.cos(theta)
+    sine = np.sin(theta)
+    cosine = np.cos(theta)
     return np.stack(
         [
             -(k + q),
@@ -410,8 +427,9 @@ def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:
 
 
 def _mesh(Lambda: float) -> Floats:
-    """Mesh over sigma / Lambda: fine where the rod curls, wide where it hangs straight to rounding
-    (sigma > 16).
+    """Return the mesh over sigma / Lambda.
+
+    It is fine where the rod curls, and wide where it hangs straight to rounding (sigma > 16).
     """
     if Lambda <= 16.0:
         return np.linspace(0.0, 1.0, 33)
@@ -426,14 +444,16 @@ def _boundary(poisson: float) -> _Boundary:
 
 
 def capstan(mu: ArrayLike, wrap: float, bending: float = 0.0) -> Floats:
-    """Return T2/T1, the ratio of the tensions of a heavy pull and a light one, of a strip that
-    slides over a cylinder.
+    """Return T2/T1, the ratio of a heavy pull and a light one, of a strip over a cylinder.
+
+    The strip slides.
 
     A strip without weight, of stiffness D against bending, goes over a cylinder of radius R. With B
     = D / (2 R^2) each free end meets the cylinder where 1 - cos(phi_i) = B / T_i, and presses on it
     there with sqrt(2 T_i B - B^2), which rubs, too:
 
-        N1 = T1 - B + mu sqrt(2 T1 B - B^2),   T2 - B - mu sqrt(2 T2 B - B^2) = N1 exp(mu (wrap - phi_1 - phi_2)).
+        N1 = T1 - B + mu sqrt(2 T1 B - B^2),
+        T2 - B - mu sqrt(2 T2 B - B^2) = N1 exp(mu (wrap - phi_1 - phi_2)).
 
     Without bending it is Euler's exp(mu wrap) [Euler 1769; Stuart 1961].
 
@@ -492,8 +512,9 @@ class HeavyFold:
     """Of the strip where it lands, likewise: what holds the upper layer back besides friction."""
 
     def pull(self, mu: ArrayLike, tail: ArrayLike) -> Floats:
-        """Return the horizontal force over rho g L_gb, away from the loop, at which the upper layer
-        slips.
+        """Return the force over rho g L_gb, away from the loop, at which the upper layer slips.
+
+        The force is horizontal.
 
         Friction bears mu (weight of the tail + landing force), and the loop holds back by its
         tension.
@@ -526,7 +547,8 @@ def heavy_fold(gap: float) -> HeavyFold:
     _within("gap", gap, 0.0, 0.5, open_below=True)
 
     def change(s: Floats, y: Floats, p: Floats) -> Floats:
-        (theta, kappa, _, _), (H, V, length) = y, p
+        (theta, kappa, _, _) = y
+        (H, V, length) = p
         bend = H * np.sin(theta) - (V + s * length) * np.cos(theta)
         return np.asarray(length * np.stack([kappa, bend, np.cos(theta), np.sin(theta)]))
 

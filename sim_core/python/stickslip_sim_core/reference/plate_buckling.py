@@ -1,8 +1,10 @@
-"""Lateral buckling of a plate strip under its own weight: plane stress, then Kirchhoff's plate, by
-Ritz's method.
+"""Lateral buckling of a plate strip under its own weight, by Ritz's method.
 
-The strip fills 0 <= x <= 1, |y| <= w / 2 (lengths in units of L), is clamped along x = 0 and pulled along -y, in its
-own plane, by its weight. Thickness h and Young's modulus Y enter the stiffnesses only, of which the answer is free:
+Plane stress comes first, then Kirchhoff's plate.
+
+The strip fills 0 <= x <= 1, |y| <= w / 2 (lengths in units of L). It is clamped along x = 0, and
+its weight pulls it along -y, in its plane. Thickness h and Young's modulus Y enter the stiffnesses
+only, and the answer does not depend on them:
 
 1. Plane stress. Displacements (u, v) with u = v = 0 at the clamp minimise 1/2 int N : eps - int
    (rho_A g) (-v), where N = Y h / (1 - nu^2) [(1 - nu) eps + nu tr(eps) I]. Every other edge is
@@ -61,7 +63,8 @@ def buckling_weight(
     aspect: float, poisson: float, *, degree: int = DEGREE, layers: int = LAYERS
 ) -> float:
     """Return Gamma = rho_A g L^3 / D at which a strip of width aspect * L buckles."""
-    x, y = _breaks_along(aspect, layers), _breaks_across(aspect, layers)
+    x = _breaks_along(aspect, layers)
+    y = _breaks_across(aspect, layers)
     N_xx, N_yy, N_xy = _membrane_forces(x, y, poisson, degree)
     along, even, odd = (
         _functions(breaks, degree, 2, start) for breaks, start in ((x, None), (y, 0), (y, 1))
@@ -86,7 +89,8 @@ def _breaks_along(aspect: float, layers: int) -> Floats:
     near = min(aspect, 1.0)
     breaks = [0.0, *(near * GRADING ** -np.arange(layers - 1.0, -1.0, -1.0))]
     while breaks[-1] < 1.0:
-        left, step = 1.0 - breaks[-1], min(breaks[-1], LONGEST)
+        left = 1.0 - breaks[-1]
+        step = min(breaks[-1], LONGEST)
         breaks.append(1.0 if left < 1.5 * step else breaks[-1] + step)
     return np.array(breaks)
 
@@ -96,8 +100,9 @@ def _breaks_across(aspect: float, layers: int) -> Floats:
 
 
 def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _Axis:
-    """Return the functions whose derivative of this order is one of Legendre's polynomials on one
-    element, orthonormal.
+    """Return orthonormal functions whose derivative is a Legendre polynomial on an element.
+
+    `order` says which derivative.
 
     They and their lower derivatives are zero at the first breakpoint. `start` adds the power of the
     coordinate that makes them complete among even (0) or odd (1) functions.
@@ -110,7 +115,8 @@ def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _A
     local = [np.eye(degree + 1)]
     for _ in range(order):
         local.append(np.stack([np.polynomial.legendre.legint(c, lbnd=-1.0) for c in local[-1]]))
-    elements, n = len(half), degree + 1
+    elements = len(half)
+    n = degree + 1
     values = [np.zeros((elements * count, elements * n)) for _ in range(order + 1)]
     for e in range(elements):
         norm = np.sqrt((np.arange(n) + 0.5) / half[e])
@@ -148,10 +154,9 @@ def _integral(
     two: _Axis,
     weight: Floats,
 ) -> Floats:
-    """Integrate weight(x, y) times derivatives of the products along * one times derivatives of
-    those along * two.
-    """
-    (a, b), (c, d) = orders_along, orders_across
+    """Integrate weight(x, y) times derivatives of the products of two sets of functions."""
+    (a, b) = orders_along
+    (c, d) = orders_across
     pairs = np.einsum("yk,yl->ykl", one.values[c], two.values[d])
     right = np.tensordot(weight, pairs, axes=1)
     full = np.einsum("xi,xj,xkl->ikjl", along.values[a], along.values[b], right, optimize=True)
@@ -166,7 +171,8 @@ def _product(
     two: _Axis,
 ) -> Floats:
     """The same with a weight of one."""
-    (a, b), (c, d) = orders_along, orders_across
+    (a, b) = orders_along
+    (c, d) = orders_across
     first = along.values[a].T @ (along.weights[:, None] * along.values[b])
     second = one.values[c].T @ (one.weights[:, None] * two.values[d])
     return np.asarray(np.kron(first, second))
@@ -195,12 +201,14 @@ def _membrane_forces(
     weight = -np.kron(along.weights @ along.values[0], even.weights @ even.values[0])
     stiffness = np.block([[uu, uv], [uv.T, vv]])
     found = np.linalg.solve(stiffness, np.concatenate([np.zeros(len(uu)), weight]))
-    u, v = found[: len(uu)].reshape(along.size, -1), found[len(uu) :].reshape(along.size, -1)
+    u = found[: len(uu)].reshape(along.size, -1)
+    v = found[len(uu) :].reshape(along.size, -1)
 
     def at(field: Floats, across: _Axis, i: int, j: int) -> Floats:
         return np.asarray(along.values[i] @ field @ across.values[j].T)
 
-    u_x, v_y = at(u, odd, 1, 0), at(v, even, 0, 1)
+    u_x = at(u, odd, 1, 0)
+    v_y = at(v, even, 0, 1)
     return u_x + poisson * v_y, v_y + poisson * u_x, shear * (at(u, odd, 0, 1) + at(v, even, 1, 0))
 
 

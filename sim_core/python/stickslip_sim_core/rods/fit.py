@@ -1,5 +1,6 @@
-"""Fits of a hanging rod to a measured centreline: three parameters, or natural curvature along the
-rod.
+"""Fits of a hanging rod to a measured centreline.
+
+A fit has three parameters, or natural curvature along the rod.
 
 Both move the natural rod until the *hung* rod, as the forward solver finds it, meets the
 centreline. The model is exact in its derivatives: two chains whose nodes include the P points,
@@ -87,8 +88,9 @@ class ParameterFit:
 
 @dataclass(frozen=True, eq=False)
 class NaturalFit:
-    """The rod of smoothest natural curvature that hangs along a centreline as nearly as its noise
-    warrants.
+    """The rod of smoothest natural curvature that hangs along a centreline.
+
+    It follows the centreline as nearly as the noise warrants.
     """
 
     natural_curvature: Floats
@@ -116,8 +118,9 @@ class NaturalFit:
 def fit_parameters(
     centerline: ArrayLike, *, gamma: float | None = None, stiffness: ArrayLike = STIFFNESS
 ) -> ParameterFit:
-    """Fit (gamma, phi0, phi1) to a centreline, by Levenberg's and Marquardt's method from several
-    starts.
+    """Fit (gamma, phi0, phi1) to a centreline.
+
+    The method is Levenberg's and Marquardt's, from several starts.
 
     The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may
     leave the ranges.
@@ -161,11 +164,15 @@ def fit_natural_curvature(
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 
-    Minimises |r(c) - centerline|^2 + w |D c|^2 over the coefficients c of a cubic spline per component, D their
-    first differences [P-splines, Eilers and Marx 1996], by Gauss-Newton steps. The weight w falls from where the rod is
-    uniform, which is `fit_parameters` with the clamp free to turn about its axis; the one with the least generalised
-    cross validation is kept [Golub, Heath and Wahba 1979], or, with `noise`, the first that brings the residual down to
-    it, but for one standard deviation of its chi-square [Morozov 1966].
+    With c the coefficients of a cubic spline per component, and D their first differences
+    [P-splines, Eilers and Marx 1996], Gauss-Newton steps minimise
+
+        |r(c) - centerline|^2 + w |D c|^2.
+
+    The weight w falls from a uniform rod, which is `fit_parameters` with a clamp that may turn
+    about its axis. The weight with the least generalised cross validation is chosen [Golub, Heath
+    and Wahba 1979]. With `noise`, it is the first weight that brings the residual down to the
+    noise, but for one standard deviation of its chi-square [Morozov 1966].
 
     A centreline does not tell how the frame turns about it: of all that hang along it the smoothest
     natural curvature is returned. What two such rods share, the natural shape, does not depend on
@@ -239,8 +246,9 @@ def fit_natural_curvature(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A hung rod: gamma, spline coefficients (B, 3), frames per chain, extrapolated centreline (P,
-    3).
+    """A hung rod, with its extrapolated centreline (P, 3).
+
+    Spline coefficients are (B, 3); each chain has its frames.
     """
 
     gamma: float
@@ -273,14 +281,16 @@ class _Model:
             bases.append(
                 np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles)
             )
-        K, clamp = rod_stiffness(stiffness, 1)[0], clamp_quaternions(CLAMP_FRAME, 1)[0]
+        K = rod_stiffness(stiffness, 1)[0]
+        clamp = clamp_quaternions(CLAMP_FRAME, 1)[0]
         return _Model(K, clamp, intervals, strides, tuple(bases))
 
     def relax(
         self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]
     ) -> _State | None:
         """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
-        hung, curves = [], []
+        hung = []
+        curves = []
         for k, basis, start in zip(self.strides, self.bases, frames, strict=True):
             q, stable = _sim_core.relax_chain(gamma, self.stiffness, basis @ coefficients, start)
             if not stable:
@@ -299,8 +309,9 @@ class _Model:
         return self.relax(gamma, coefficients, tuple(frames))
 
     def jacobian(self, state: _State) -> Floats:
-        """Derivatives of the centreline by log gamma and the coefficients, component by component:
-        (3 P, 1 + 3 B).
+        """Return derivatives of the centreline by log gamma and the coefficients: (3 P, 1 + 3 B).
+
+        Coefficients are ordered component by component.
         """
         parts = [
             _sim_core.chain_jacobian(
@@ -345,7 +356,10 @@ def _minimise(
     penalty: Floats,
     tolerance: float,
 ) -> _State:
-    """Minimise |residual|^2 + c^T penalty c over the free ones of (log gamma, coefficients), by damped Gauss-Newton."""
+    """Minimise |residual|^2 + c^T penalty c by damped Gauss-Newton steps.
+
+    `free` are the indices of the parameters (log gamma, coefficients) that may change.
+    """
 
     def cost(of: _State) -> float:
         c = _parameters(of)
@@ -368,7 +382,8 @@ def _minimise(
         if fresh:
             assert trial is not None
             change = _rms(trial.centerline - state.centerline)
-            state, value = trial, trial_value
+            state = trial
+            value = trial_value
             damping = 0.0 if damping < 1e-4 else 0.1 * damping
             if change <= tolerance:
                 break
@@ -435,10 +450,12 @@ def _centerline(centerline: ArrayLike) -> Floats:
 
 
 def _chain_curvature(quaternions: Floats) -> Floats:
-    """Curvature of a chain at its nodes, shape (N + 1, 3): of its elements, averaged, the end ones
-    repeated.
+    """Return the curvature of a chain at its nodes, shape (N + 1, 3).
+
+    It averages the curvatures of the elements, and repeats those at the ends.
     """
-    p, q = quaternions[:-1], quaternions[1:]
+    p = quaternions[:-1]
+    q = quaternions[1:]
     w = (p * q).sum(axis=1)
     v = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
     sine = np.linalg.norm(v, axis=1)

@@ -75,12 +75,14 @@ def natural_curvature(
     shape = np.shape(curvature)
     if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 4:
         raise ValueError(f"curvature: must have shape (..., P, 3) with P >= 4, got shape {shape}")
-    leading, points = shape[:-2], shape[-2]
+    leading = shape[:-2]
+    points = shape[-2]
     n = int(np.prod(leading))
     kappa = finite_array("curvature", np.reshape(curvature, (n, points, 3)), (n, points, 3))
     if np.shape(gamma) != leading:
         raise ValueError(
-            f"gamma: must have the leading shape of curvature {leading}, got shape {np.shape(gamma)}"
+            f"gamma: must have the leading shape of curvature {leading}, "
+            f"got shape {np.shape(gamma)}"
         )
     weight = finite_array("gamma", np.reshape(gamma, n), (n,))
     if (weight < 0).any():
@@ -106,8 +108,9 @@ def natural_curvature(
 
 
 def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) -> Floats:
-    """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on, for kappa (n, P, 3)
-    [1/L].
+    """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on.
+
+    kappa is (n, P, 3) [1/L].
 
     Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles
     and Norsett 1999].
@@ -156,7 +159,9 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
     ddt = np.stack([-(k1**2 + k2**2), k0 * k1 + slope[..., 2], k0 * k2 - slope[..., 1]], axis=2)
     ddt = (R @ ddt[..., None])[..., 0]
     left = (1.0 - s)[:, None]
-    f, df, ddf = left * t, left * dt - t, left * ddt - 2.0 * dt
+    f = left * t
+    df = left * dt - t
+    ddf = left * ddt - 2.0 * dt
     h = 1.0 / (points - 1)
     parts = (
         h / 2 * (f[:, :-1] + f[:, 1:])
@@ -171,8 +176,9 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
 def _amplification(
     kappa: Floats, R: Floats, world: Floats, natural: Floats, gamma: Floats, K: Floats
 ) -> tuple[Floats, Floats]:
-    """Expected and largest relative error of kappa_bar per relative smooth error of kappa, shapes
-    (n,).
+    """Return the expected and the largest error amplification of kappa_bar, shapes (n,).
+
+    Both are relative errors per relative smooth error of kappa.
 
     An error dk of kappa turns frames by dw = int_0^s R dk (world axes), so that dt = dw x t, dM =
     gamma int_s^1 (1 - u) dt x e_g and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).

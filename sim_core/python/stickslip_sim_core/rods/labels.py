@@ -17,8 +17,9 @@ from stickslip_sim_core.rods.solve import (
 
 
 def reach(centerline: ArrayLike) -> Floats:
-    """Return the largest distance of each rod from the vertical through its clamp, z being up: (n,)
-    [L].
+    """Return the largest distance of each rod from the vertical through its clamp: (n,) [L].
+
+    The axis z points up.
 
     `centerline` has positions (n, points, 3) [L] from the clamp on; where it is NaN, so is the
     distance.
@@ -85,7 +86,9 @@ def _self_contact_distance(r: Floats) -> float:
 
 def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
     """Distances between segments a0-a1 and b0-b1, each shape (k, 3) [Ericson 2004, Sec. 5.1.9]."""
-    u, v, w = a1 - a0, b1 - b0, a0 - b0
+    u = a1 - a0
+    v = b1 - b0
+    w = a0 - b0
     uu, uv, vv, uw, vw = ((x * y).sum(axis=1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     tiny = np.finfo(float).tiny
     determinant = uu * vv - uv**2
@@ -134,24 +137,32 @@ def other_minima(
     points: int = 150,
     solution: RodSolution | None = None,
 ) -> OtherMinima:
-    """Search for a stable equilibrium other than the one that `solve_rods` reaches from the natural
-    shape.
+    """Search for another stable equilibrium than `solve_rods` finds.
 
-    What such rods have is a curl of either hand. Each rod therefore starts again from the mirror
+    `solve_rods` reaches its equilibrium from the natural shape.
+
+    Such rods can curl with either hand. Each rod therefore starts again from the mirror
     image of its equilibrium. Over the thesis's ranges this start found every rod that 28 others
     did, straight, weakly curled, twisted either way, of two hands, random, or continued in the
     weight. Equilibria whose centrelines differ by more than 1e-3 L are distinct.
 
     Args:
-        gamma, phi0, phi1, poisson, elements, points: As for `solve_rods`.
-        solution: What `solve_rods` returned for exactly these arguments, to save solving again.
+        gamma: As for `solve_rods`.
+        phi0: As for `solve_rods`.
+        phi1: As for `solve_rods`.
+        poisson: As for `solve_rods`.
+        elements: As for `solve_rods`.
+        points: As for `solve_rods`.
+        solution: The result of `solve_rods` for exactly these arguments, to save solving again.
 
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value.
+    Raises:
+        ValueError: An argument breaks its rule; the message names the field, the rule and the
+            value.
     """
     weight = finite_array("gamma", gamma, (None,))
     n = len(weight)
-    twist, bend = finite_array("phi0", phi0, (n,)), finite_array("phi1", phi1, (n,))
+    twist = finite_array("phi0", phi0, (n,))
+    bend = finite_array("phi1", phi1, (n,))
     options = {"elements": elements, "points": points}
     found = (
         solve_rods(weight, twist, bend, poisson=poisson, **options)

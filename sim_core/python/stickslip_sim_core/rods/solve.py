@@ -1,5 +1,6 @@
-"""Equilibria of suspended rods: the family (gamma, phi0, phi1), and rods that vary along their
-length.
+"""Equilibria of suspended rods.
+
+There is the family (gamma, phi0, phi1), and there are rods that vary along their length.
 """
 
 from dataclasses import dataclass
@@ -37,8 +38,9 @@ RODS_AT_ONCE = 1024
 
 @dataclass(frozen=True, eq=False)
 class RodSolution:
-    """Equilibria of n rods at `points` points of uniform arc length s = 0 ... 1 (clamp ... free
-    end, both included).
+    """Equilibria of n rods at `points` points of uniform arc length s = 0 ... 1.
+
+    The clamp is at s = 0 and the free end at s = 1.
 
     Lengths are in units of the rod's length L, moments in EI/L. The world has z up, gravity along
     -z, and the clamp at the origin with d1 = -z (along gravity), d2 = +x, d3 = -y. A rod that did
@@ -206,7 +208,8 @@ def solve_general_rods(
     nodes = np.linspace(0.0, 1.0, elements // 2 + 1)
     output = np.linspace(0.0, 1.0, points)
     m = natural.shape[1]
-    to_grid, to_points = interpolation_matrix(m, grid), interpolation_matrix(m, output)
+    to_grid = interpolation_matrix(m, grid)
+    to_points = interpolation_matrix(m, output)
     to_slope = interpolation_matrix(m, nodes, derivative=1)
     start_to_grid = interpolation_matrix(start.shape[1], grid)
     parts = []
@@ -216,7 +219,8 @@ def solve_general_rods(
         starts = fields if start is natural else start_to_grid @ start[some]
         # The core checks it against `elements`. None is the largest of no rods.
         largest = max(np.linalg.norm(f, axis=2).max(initial=0.0) for f in (fields, starts))
-        slope, at_points = to_slope @ natural[some], to_points @ natural[some]
+        slope = to_slope @ natural[some]
+        at_points = to_points @ natural[some]
         arrays = (weight[some], K[some], clamp[some], fields, starts, slope, at_points)
         parts.append(_sim_core.solve_general_rods(*arrays, elements, largest))
     return RodSolution(*(np.concatenate(field) for field in zip(*parts, strict=True)))
@@ -239,8 +243,9 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
     )
     error = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(initial=0.0)
     if error > 1e-8 or (np.linalg.det(R) < 0).any():
+        determinant = np.linalg.det(R).min()
         raise ValueError(
-            f"clamp_frame: must be a rotation, got R^T R - 1 = {error:.1e}, det {np.linalg.det(R).min():.3g}"
+            f"clamp_frame: must be a rotation, got R^T R - 1 = {error:.1e}, det {determinant:.3g}"
         )
     from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
 
@@ -252,9 +257,7 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
 
 
 def bspline_matrix(intervals: int, s: Floats) -> Floats:
-    """Return the cubic B-splines on `intervals` equal intervals at s (p,), shape (p, intervals +
-    3).
-    """
+    """Return the cubic B-splines on equal intervals at s (p,), shape (p, intervals + 3)."""
     from scipy.interpolate import BSpline  # here, so that importing the package stays quick
 
     knots = np.arange(-3.0, intervals + 4.0) / intervals
@@ -270,8 +273,7 @@ def _interpolants(samples: int, derivative: int) -> "BSpline":
 
 
 def interpolation_matrix(samples: int, s: Floats, derivative: int = 0) -> Floats:
-    """Return the matrix (p, samples) from values at uniform arc length to the interpolant's values
-    at s (p,).
+    """Return the matrix (p, samples) that interpolates values at uniform arc length at s (p,).
 
     Four samples or more: the cubic spline with not-a-knot ends. Three, two, one: the parabola,
     line, constant.

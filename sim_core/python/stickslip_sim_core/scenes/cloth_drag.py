@@ -1,5 +1,6 @@
-"""Drop and drag: a square of cloth, held at two corners, is lowered onto a floor and dragged
-[thesis, 4.2.3].
+"""Drop and drag: cloth is lowered onto a floor and dragged [thesis, 4.2.3].
+
+The cloth is a square that is held at two corners.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,19 +28,29 @@ HOLDER = 0.01
 CLEARANCE = 0.01
 """Height of the lower edge over the floor at the start [m]."""
 
-DROP, DRAG, LEGS = 0.06, 0.3, 4
-"""Travel down, travel of each leg [m], and number of legs: there, back, there, back."""
+DROP = 0.06
+"""Travel of the holders down [m]."""
 
-SPEED, ACCELERATION = 0.01, 0.01
-"""Of the holders [m/s, m/s^2]."""
+DRAG = 0.3
+"""Travel of the holders in each leg [m]."""
+
+LEGS = 4
+"""Number of legs: there, back, there, back."""
+
+SPEED = 0.01
+"""Of the holders [m/s]."""
+
+ACCELERATION = 0.01
+"""Of the holders [m/s^2]."""
 
 FRAME_RATE = 2.4
 """[1/s]"""
 
 
 def travel(time: Floats, distance: Floats) -> Floats:
-    """Return the way [m] of holders that start and end at rest with `ACCELERATION` and cruise at
-    `SPEED`.
+    """Return the displacement [m] of holders that start and end at rest.
+
+    They accelerate with `ACCELERATION` and cruise at `SPEED`.
     """
     ramp = SPEED / ACCELERATION
     duration = distance / SPEED + ramp
@@ -58,8 +69,9 @@ def duration_of(distance: float) -> float:
 
 
 def holder_path(time: ArrayLike) -> Floats:
-    """Return the displacement (x, z) of the holders [m]: down, then to and fro [thesis, 4.2.3]:
-    ([T,] 2).
+    """Return the displacement (x, z) of the holders [m]: ([T,] 2).
+
+    They go down, then to and fro [thesis, 4.2.3].
     """
     legs = np.arange(LEGS)
     since = np.asarray(time, float)[..., None] - np.append(0.0, LEGS * [duration_of(DROP)])
@@ -144,7 +156,10 @@ KIND = cloth_kind(scene)
 
 
 def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
-    """Return the motion over a floor of friction mu; gravity is upright one second after the drop."""
+    """Return the motion over a floor of friction mu.
+
+    Gravity is upright one second after the drop.
+    """
     floor = [plane(mu)]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
@@ -155,7 +170,10 @@ def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence
 
 
 def holder_pose(time: ArrayLike) -> Floats:
-    """Return the pose of the holders, relative to their start, at a time or times [s]: ([T,] 3, 4)."""
+    """Return the pose of the holders, relative to their start: ([T,] 3, 4).
+
+    `time` is a time or times [s].
+    """
     pose = np.zeros((*np.shape(time), 3, 4))
     pose[..., :3] = np.eye(3)
     pose[..., ::2, 3] = holder_path(time)
@@ -173,8 +191,9 @@ def _forces(cloth: Cloth, hung: Hung) -> Record:
 
 
 def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
-    """Return the labels of a drop: those of the fabric, the bias, and the side of the holders on
-    which the cloth lay.
+    """Return the labels of a drop.
+
+    They are those of the fabric, the bias, and the side of the holders on which the cloth lay.
 
     `landed_side` is the sign of its mean x less that of the holders in the first frame after the
     drop; 0 without one.

@@ -22,8 +22,9 @@ UPRIGHT = 1.0
 
 
 def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
-    """Return the scene of a document: `Physics` of stickslip_schemas.scene, as JSON, with arrays
-    for files.
+    """Return the scene of a document.
+
+    The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays for files.
 
     Its run records, besides what all scenes record, sheets, holders and bodies being in the order
     of their names:
@@ -69,7 +70,9 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         return gravity.at(time), [at(time) for at in rigid]
 
-    length, end, calm = document["duration"], document["end"], document["calm"]
+    length = document["duration"]
+    end = document["end"]
+    calm = document["calm"]
     last = max([0.0, gravity.last, *(one.last for one in sheets), *(one.last for one in things)])
     tracks = {
         f"{one.name}.vertices": one.surface.at
@@ -136,7 +139,8 @@ def _touch(
     through = [one.name for one in sheets if not document["sheets"][one.name]["self_contact"]]
     if through and len(sheets) > 1:
         raise ValueError(
-            f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, got false"
+            f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, "
+            "got false"
         )
     if through:
         return None
@@ -152,10 +156,12 @@ class _Gravity:
             np.array(document["gravity"], float), (sum(len(one.start) for one in sheets), 1)
         )
         self._size = float(np.linalg.norm(document["gravity"]))
-        self._tilted, self._until = self._down, -np.inf
+        self._tilted = self._down
+        self._until = -np.inf
         self.bias = np.zeros(2)
         if document["bias"] is not None:
-            size, self._until = document["bias"]["size"], document["bias"]["until"]
+            size = document["bias"]["size"]
+            self._until = document["bias"]["until"]
             self.bias = np.random.default_rng(seed).uniform(-size, size, 2)
             self._tilted = self._down + self._size * np.append(self.bias, 0.0)
         self._hung = [
@@ -211,7 +217,9 @@ class _Forces:
         state = np.zeros(vertices, np.uint8)
         pulls = np.zeros((len(self._holders), 3))
         if cloth.total.steps:
-            reactions, contacts, pairs = cloth.reactions, cloth.contacts, cloth.pair_forces
+            reactions = cloth.reactions
+            contacts = cloth.contacts
+            pairs = cloth.pair_forces
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)
             np.add.at(
@@ -225,7 +233,8 @@ class _Forces:
             owner = np.where(
                 owner < 0, of_body[:, None], owner
             )  # skeletons of bodies have vertices of their own
-            first, last = owner[:, 0], owner[:, 3]
+            first = owner[:, 0]
+            last = owner[:, 3]
             for corner in range(4):
                 own = owner[:, corner]
                 pull = pairs.weights[:, corner, None] * pairs.forces

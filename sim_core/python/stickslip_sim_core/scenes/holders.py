@@ -1,5 +1,6 @@
-"""Holders: vertices of the cloth that move as rigid bodies, and the shape in which cloth hangs at
-rest under them.
+"""Holders: vertices of the cloth that move as rigid bodies.
+
+Cloth starts in the shape in which it hangs at rest under them.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,8 +53,9 @@ class Holder:
 
 
 class Hands:
-    """The holders of a scene, of which no two may hold the same vertex at a time, with what each
-    holds now.
+    """The holders of a scene, with the vertices that each holds now.
+
+    No two holders may hold the same vertex at a time.
 
     `positions` are those of all vertices at 0 s, (V, 3) [m].
     """
@@ -83,8 +85,9 @@ class Hands:
         return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return the positions of the held vertices at a time [s], or at times (T,): ([T,] K, 3)
-        [m].
+        """Return the positions of the held vertices at a time or times [s]: ([T,] K, 3) [m].
+
+        Times are (T,).
         """
         shape = np.shape(time)
         found = [np.empty((*shape, 0, 3))]
@@ -94,7 +97,7 @@ class Hands:
         return np.concatenate(found, axis=-2)
 
     def driving(self, motion: Callable[[float], tuple[Floats, Sequence[Body]]]) -> Motion:
-        """Return gravity, the held vertices and bodies, where `motion` returns gravity and bodies."""
+        """Add the positions of held vertices to a motion, which returns gravity and bodies."""
 
         def drive(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
             gravity, bodies = motion(time)
@@ -112,18 +115,26 @@ HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
 bias falls.
 """
 
-SETTLING_STEPS, SETTLING_DAMPING = 25, 5.0
-"""Steps with each factor, and their damping [1/s]."""
+SETTLING_STEPS = 25
+"""Steps with each factor."""
 
-FIRST_STEP, GROWTH = 0.002, 1.3
-"""First step [s], and growth of the next ones up to 50 ms: the flat cloth buckles when it is
-released.
-"""
+SETTLING_DAMPING = 5.0
+"""Damping of these steps [1/s]."""
 
-LONGEST, AT_REST, HANGING_STEPS_MAX = 1.0, 1e-8, 400
-"""Steps then grow to this length [s] until no vertex moves further than this in one [m]; at most so
-many steps.
-"""
+FIRST_STEP = 0.002
+"""First step [s]: the flat cloth buckles when it is released."""
+
+GROWTH = 1.3
+"""Growth of the next steps, up to 50 ms."""
+
+LONGEST = 1.0
+"""Steps of the settled cloth grow to this length [s]."""
+
+AT_REST = 1e-8
+"""Cloth is at rest when no vertex moves further than this in a step [m]."""
+
+HANGING_STEPS_MAX = 400
+"""The search for rest ends after this number of steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,19 +172,22 @@ def hung(
     seed: int,
     kernel: str | None = None,
 ) -> Hung:
-    """Return the shape at rest, under gravity along -z, of a cloth that is let down from where it
-    is flat.
+    """Return the shape at rest, under gravity along -z, of a cloth that is let down.
+
+    The cloth is flat at first.
 
     A cloth that is held at two corners has many shapes at rest. This one is reached as a tilt of
     gravity falls from 30 times a bias to the bias, which is drawn from the seed. It is settled
     until nothing moves, and its stability is checked.
 
     Args:
-        mesh, fabric: Of one sheet.
-        flat: (V, 3): where it is flat [m].
+        mesh: Of a single sheet.
+        fabric: Of the sheet.
+        flat: (V, 3): positions of the flat sheet [m].
         held: (K,): vertices under the holders.
         normal: (3,): of the flat sheet, the direction of the tilt.
-        seed, kernel: Of the bias; see `Cloth`.
+        seed: Of the bias.
+        kernel: Level of the kernels, see `Cloth`.
     """
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
     rng = np.random.default_rng(seed)
@@ -190,12 +204,14 @@ def hung(
         for _ in range(SETTLING_STEPS):
             cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
             dt = min(GROWTH * dt, HANGING.time_step)
-    moved, steps = np.inf, 0
+    moved = np.inf
+    steps = 0
     while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
         before = cloth.positions
         dt = min(1.5 * dt, LONGEST)
         cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
-        moved, steps = float(np.abs(cloth.positions - before).max()), steps + 1
+        moved = float(np.abs(cloth.positions - before).max())
+        steps = steps + 1
     softest = cloth.softest()
     reason = ""
     if not moved <= AT_REST:

@@ -110,7 +110,8 @@ class Keyframes:
     def pose(self, time: ArrayLike) -> Floats:
         """Return the motion x -> R x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
         found = self._path(time)
-        R, about = rotation(found[..., 3:]), np.asarray(self.about)
+        R = rotation(found[..., 3:])
+        about = np.asarray(self.about)
         return np.concatenate([R, (about + found[..., :3] - R @ about)[..., None]], axis=-1)
 
 
@@ -144,7 +145,8 @@ class Spin:
         angle = self.speed * np.where(
             t < self.ramp, 0.5 * t * t / (self.ramp or 1.0), t - 0.5 * self.ramp
         )
-        axis, about = np.asarray(self.axis, float), np.asarray(self.about, float)
+        axis = np.asarray(self.axis, float)
+        about = np.asarray(self.about, float)
         R = rotation(angle[..., None] * axis / np.linalg.norm(axis))
         return np.concatenate([R, (about - R @ about)[..., None]], axis=-1)
 
@@ -170,8 +172,9 @@ def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike],
 
 
 def _monotone(times: Floats, values: Floats) -> Floats:
-    """Return the slopes of monotone cubics (K, n) at keyframes: 0 at both ends and where a value
-    turns back.
+    """Return the slopes of monotone cubics (K, n) at keyframes.
+
+    They are 0 at both ends and where a value turns back.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -182,7 +185,10 @@ def _monotone(times: Floats, values: Floats) -> Floats:
 
 
 def rotation(turn: ArrayLike) -> Floats:
-    """Return the matrices (..., 3, 3) of rotation vectors (..., 3) [rad]; right angles are exact."""
+    """Return the matrices (..., 3, 3) of rotation vectors (..., 3) [rad].
+
+    Right angles are exact.
+    """
     from scipy.spatial.transform import Rotation
 
     vectors = np.asarray(turn, float)
@@ -194,8 +200,9 @@ def rotation(turn: ArrayLike) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class MovingMesh:
-    """Triangles that move smoothly through given frames, with the slopes of parabolas through three
-    of them.
+    """Triangles that move smoothly through given frames.
+
+    Slopes are those of parabolas through three frames.
 
     Before the first and after the last frame nothing moves.
 
@@ -225,10 +232,12 @@ class MovingMesh:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times))
-        path, times = np.asarray(self.frames, float), np.asarray(self.times)
+        path = np.asarray(self.frames, float)
+        times = np.asarray(self.times)
         shape: tuple[Any, ...] = ("vertices", 3)
         if self.rest is not None:
-            rest, weights = np.asarray(self.rest, float), np.asarray(self.weights, float)
+            rest = np.asarray(self.rest, float)
+            weights = np.asarray(self.weights, float)
             if (
                 rest.ndim != 2
                 or rest.shape[1] != 3
@@ -236,7 +245,8 @@ class MovingMesh:
                 or len(weights) != len(rest)
             ):
                 raise ValueError(
-                    f"rest, weights: must be (N, 3) and (N, bones), got {rest.shape} and {weights.shape}"
+                    "rest, weights: must be (N, 3) and (N, bones), "
+                    f"got {rest.shape} and {weights.shape}"
                 )
             if not (np.isfinite(rest).all() and np.isfinite(weights).all()):
                 raise ValueError("rest, weights: must be finite")
@@ -276,8 +286,9 @@ class MovingMesh:
         return np.asarray(start + self.strength * (now - start))
 
     def _placed(self, time: float) -> Floats:
-        """Return the vertices of the frames: of a skin, sum over bones of w (A x + b) [linear blend
-        skinning].
+        """Return the vertices of the frames.
+
+        A skin has the sum over bones of w (A x + b) [linear blend skinning].
         """
         path = self._path(time)
         if self.rest is None:

@@ -65,7 +65,9 @@ def sheet(
         fabric(given["material"]) if custom is None else custom_fabric(given["material"], **custom)
     )
     made = made.scaled(**given["factors"])
-    turn, origin, begin = rotation(given["turn"]), np.array(given["origin"], float), given["start"]
+    turn = rotation(given["turn"])
+    origin = np.array(given["origin"], float)
+    begin = given["start"]
     local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
     if begin["type"] == "stretched":
         local[:, :2] = (1.0 + np.array(begin["strain"])) * mesh.rest
@@ -81,7 +83,8 @@ def sheet(
     holders: dict[str, Holder] = {}
     tracks: dict[str, Callable[[ArrayLike], Floats]] = {}
     boxes: dict[str, Floats] = {}
-    last, taken = 0.0, np.zeros(len(start), dtype=bool)
+    last = 0.0
+    taken = np.zeros(len(start), dtype=bool)
     for key, holder in sorted(given["holders"].items()):
         held = _held(mesh, holder, f"{place}.holders.{key}")
         if (held & taken).any():
@@ -120,7 +123,8 @@ def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
 def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
     """Return which vertices a holder holds: (V,)."""
     rest = mesh.rest
-    low, high = rest.min(axis=0), rest.max(axis=0)
+    low = rest.min(axis=0)
+    high = rest.max(axis=0)
     slack = 1e-9 * float((high - low).max())
     held = np.zeros(len(rest), dtype=bool)
     if holder["vertices"] is not None:
@@ -142,7 +146,8 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
         ).all(axis=1)
         if not held.any():
             raise ValueError(
-                f"{place}: must hold a vertex, and none is in {holder['low']} to {holder['high']} [m]"
+                f"{place}: must hold a vertex, and none is in {holder['low']} to "
+                f"{holder['high']} [m]"
             )
     return held
 
@@ -170,8 +175,9 @@ def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
 
 
 def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[ArrayLike], Floats]:
-    """Return the pose at times, ([T,] 3, 4) [s], of what starts with axes `turn` (3, 3) at `origin`
-    (3,) [m].
+    """Return the pose ([T,] 3, 4) at times [s] of a part that moves.
+
+    It starts with axes `turn` (3, 3) at `origin` (3,) [m].
     """
 
     def at(time: ArrayLike) -> Floats:

@@ -163,12 +163,11 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
-        paths, forces, crossed = (
-            [cloth.positions],
-            [self.forces(cloth)],
-            [self._crossings(cloth.positions)],
-        )
-        calm, rest_time = 0, np.nan
+        paths = [cloth.positions]
+        forces = [self.forces(cloth)]
+        crossed = [self._crossings(cloth.positions)]
+        calm = 0
+        rest_time = np.nan
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
@@ -224,7 +223,7 @@ class Scene:
         return replace(run, labels={**run.labels, **self.labels(run)})
 
     def _crossings(self, positions: Floats) -> int:
-        """Return how many pairs of triangles cross; none where positions (V, 3) [m] are not finite."""
+        """Return how many pairs of triangles cross; 0 if positions (V, 3) [m] are not finite."""
         return (
             self_intersections(positions, self.mesh.triangles)
             if np.isfinite(positions).all()
@@ -232,9 +231,7 @@ class Scene:
         )
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
-        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move of
-        itself.
-        """
+        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move."""
         if self.still_from is None or time <= self.still_from:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
@@ -281,8 +278,9 @@ def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
 
 
 def cloth_kernel() -> str:
-    """Return the default level of the kernels: that of the environment variable, or the widest of
-    this processor.
+    """Return the default level of the kernels.
+
+    It is that of the environment variable, or the widest of this processor.
     """
     return build_info().cloth_kernel
 
@@ -302,6 +300,7 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
     """Return physics with fabrics instead of their names, the user's own numbers, and factors."""
     known = dict(physics)
     factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
-    name, numbers = known.pop("material"), known.pop("fabric", None)
+    name = known.pop("material")
+    numbers = known.pop("fabric", None)
     made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
     return {**known, "material": made.scaled(**factors)}
