@@ -51,7 +51,7 @@ class Index:
         self.manifest = manifest
         self.arrays = arrays
         self._check_shards = check_shards
-        self._contents = Contents(manifest, source.read_section)
+        self._contents = Contents(manifest, source.read_document)
         self._checked_sections: set[int] = set()
         self._shard_indexes: dict[tuple[str, int], Array] = {}
         self._labels: dict[str, Array] = {}
@@ -67,7 +67,7 @@ class Index:
     def __setstate__(self, state: dict[str, Any]) -> None:
         manifest = Manifest.model_validate_json(state["manifest"])
         self.__dict__.update(
-            state, manifest=manifest, _contents=Contents(manifest, state["source"].read_section)
+            state, manifest=manifest, _contents=Contents(manifest, state["source"].read_document)
         )
 
     # --- files
@@ -98,6 +98,16 @@ class Index:
         data = self.source.read(file)
         self._compare(file, sha256(data))
         return data
+
+    def read_document(self, file: FileEntry) -> bytes:
+        """Return a JSON document of the manifest's files, checked against its digest."""
+        data = self.source.read_document(file)
+        self._compare(file, sha256(data))
+        return data
+
+    def check_file(self, file: FileEntry) -> None:
+        """Check the size and the digest of a file; it is read in blocks."""
+        self._compare(file, self.source.computed_digest(file))
 
     def at(self, file: FileEntry) -> str:
         """Return the path or URL of a file, for messages."""
@@ -168,6 +178,11 @@ class Index:
             raise CorruptDataError(f"{what}: its chunk is missing in {self.at(file)}")
         if offset + length > file.size:
             raise CorruptDataError(f"{what}: its chunk reaches beyond the end of {self.at(file)}")
+        # A chunk is read whole, so its size must be one that the sample can have.
+        if length > codecs.largest_chunk(out.nbytes):
+            raise CorruptDataError(
+                f"{what}: its chunk has {length} bytes, more than {out.nbytes} can take"
+            )
         chunk = self.source.read(file, offset, length)
         with _naming(f"{what}, {self.at(file)}"):
             codecs.decode_sample(array, chunk, out)

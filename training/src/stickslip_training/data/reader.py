@@ -249,7 +249,7 @@ class DatasetReader:
                 raise InvalidDatasetError(
                     f"the manifest names {file.path}, which is not inside the dataset"
                 )
-            self.index.read_file(file)
+            self.index.check_file(file)
         for slot in np.flatnonzero(self.chosen).tolist():
             self.index.check_section(slot)
 
@@ -265,7 +265,7 @@ class DatasetReader:
                 found = inline.get(name)
             else:
                 file = self.index.file(f"{name}/{GROUP_NAME}", "metadata")
-                found = _parse_metadata(self.index.read_file(file), self.index.at(file))
+                found = _parse_metadata(self.index.read_document(file), self.index.at(file))
             size = self.manifest.spec.samples_per_file(array)
             _check_array(found, array, sample_count=len(self), samples_per_file=size)
 

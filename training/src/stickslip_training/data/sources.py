@@ -30,6 +30,8 @@ from stickslip_schemas.transport.proxies import through
 if TYPE_CHECKING:
     from stickslip_schemas.transport.objects import ObjectClient
 
+BLOCK_BYTES = 16 * 2**20
+"""Size of the blocks in which a file is read for its digest [bytes]."""
 READER_PATIENCE_SECONDS = 10.0
 """How long a failed request of a reader is repeated [s]: a server that restarts costs no epoch."""
 
@@ -117,18 +119,31 @@ class Source(ABC):
             )
         return fetched.data
 
-    def read_section(self, file: FileEntry) -> bytes:
-        """Return a section of the manifest.
+    def read_document(self, file: FileEntry) -> bytes:
+        """Return a JSON document, a section of the manifest for example.
 
         Raises:
-            CorruptDataError: It is larger than any section can be.
+            CorruptDataError: It is larger than any document can be.
         """
         if file.size > DOCUMENT_BYTES:
             raise CorruptDataError(
-                f"{self}/{file.path} has {file.size} bytes, and a section of a manifest has at "
-                f"most {DOCUMENT_BYTES}"
+                f"{self}/{file.path} has {file.size} bytes, and a document has at most "
+                f"{DOCUMENT_BYTES}"
             )
         return self.read(file)
+
+    def computed_digest(self, file: FileEntry) -> str:
+        """Return the SHA-256 of the file, which is read in blocks.
+
+        Raises:
+            CorruptDataError: The file has another size than the manifest says.
+        """
+        digester = hashlib.sha256()
+        # The manifest of a hostile server may state any size, and memory must not follow from it.
+        for offset in range(0, max(1, file.size), BLOCK_BYTES):
+            length = min(BLOCK_BYTES, file.size - offset)
+            digester.update(self.read(file, offset, length))
+        return digester.hexdigest()
 
     def digest(self, file: FileEntry) -> str | None:
         """Return the SHA-256 of the file; None if the whole file would have to be fetched."""
