@@ -35,6 +35,7 @@ from stickslip_services.api.routes.health import Metrics
 from stickslip_services.api.routes.pages import datasets as dataset_pages
 from stickslip_services.api.routes.pages import jobs as job_pages
 from stickslip_services.api.sse import Feeds
+from stickslip_services.catalog.inspector import MAX_PROCESSES
 from stickslip_services.client.errors import ClientError
 from stickslip_services.client.signing import sign
 from stickslip_services.database.database import Clock, Role
@@ -114,6 +115,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.metrics = metrics
     app.state.feeds = Feeds(context)
     app.state.renewals = workers.Batcher(partial(renew_leases, context))
+    app.state.upload_turns = asyncio.Semaphore(MAX_PROCESSES)
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with
     # one after the other.

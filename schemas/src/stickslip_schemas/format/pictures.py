@@ -40,7 +40,7 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
 
     Sizes are looked at before anything is decoded, so that a small file cannot ask for much memory.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     if len(data) > MAX_BYTES:
         raise UnfitPictureError(
@@ -77,6 +77,10 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
         return np.array(upright.convert("RGB"), dtype=np.uint8)
     except UnfitPictureError:
         raise
+    except UnidentifiedImageError as error:  # its message has the repr of a buffer
+        raise UnfitPictureError(
+            "a texture must be a whole PNG or JPEG file, and its beginning is that of none"
+        ) from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UnfitPictureError(
             f"a texture must be a whole PNG or JPEG file: {error}"[:300]

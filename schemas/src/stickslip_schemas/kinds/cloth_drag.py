@@ -269,6 +269,22 @@ class ClothDragSpec(ClipSpec):
             *(_mesh(self) if self.store_positions else ()),
         )
 
+    def looks_arrays(self) -> tuple[ArrayLayout, ...]:
+        return clip_arrays(self)
+
+    def check_arrays(self) -> tuple[ArrayLayout, ...]:
+        return solver_arrays(self)
+
+    @property
+    def fixed_bodies(self) -> tuple[dict[str, Any], ...]:
+        """The floor, at z = 0."""
+        return ({"type": "plane", "normal": [0, 0, 1]},)
+
+    @property
+    def held_corners(self) -> tuple[tuple[float, float], ...]:
+        """Both ends of the upper edge."""
+        return ((-1.0, 1.0), (1.0, 1.0))
+
 
 def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
     """Return the mesh and its motion.

@@ -25,6 +25,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     parameter_label,
     scene_arrays,
     scene_segments,
+    solver_arrays,
 )
 from stickslip_schemas.kinds.cloth.spec import (
     VIEWPOINT,
@@ -426,3 +427,51 @@ class ClothSceneSpec(ClipSpec):
             if name in self.named_axes
         )
         return (*clip_arrays(self), *labels, *scene_arrays(self, self.stage))
+
+    def scene_place(self, pointer: str) -> tuple[str, ...] | None:
+        word, *place = pointer.split("/")[1:]
+        is_of_physics = word == "scene" and place[0] != "looks"
+        return tuple(place) if is_of_physics else None
+
+    def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
+        from stickslip_schemas.scene.files import check_scene_file  # needs the extra `arrays`
+
+        check_scene_file(self.stage, place, data)
+
+    def unresolved_files(self) -> dict[str, str]:
+        return {
+            "/".join(("/scene", *map(str, place))): name
+            for place, name in self.scene.files()
+            if artifact_digest(name) is None
+        }
+
+    def looks_arrays(self) -> tuple[ArrayLayout, ...]:
+        return clip_arrays(self)
+
+    def check_arrays(self) -> tuple[ArrayLayout, ...]:
+        return solver_arrays(self)
+
+    @property
+    def scene_numbers(self) -> tuple[str, ...]:
+        return tuple(
+            name for name in self.stage.parameters if isinstance(self.stage.default(name), float)
+        )
+
+    def sample_scene(
+        self, numbers: Mapping[str, float], read: Callable[[str], bytes]
+    ) -> dict[str, Any] | None:
+        from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
+
+        # One parameter may set several places of the document.
+        values = {
+            place: numbers[name]
+            for name in self.scene_numbers
+            for place in self.stage.locations(name)
+        }
+        return with_arrays(self.stage.physics_with(values), read)
+
+    @property
+    def located_holders(self) -> tuple[int, ...]:
+        sheets = self.stage.sheets
+        holders = [sheets[sheet].holders[name] for sheet, name in self.stage.holders]
+        return tuple(number for number, holder in enumerate(holders) if holder.rim is None)

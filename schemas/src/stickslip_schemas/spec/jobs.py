@@ -285,6 +285,61 @@ class JobSpec(Document):
         """Artifacts that must be in the store, by JSON pointers into the spec."""
         return {}
 
+    def scene_place(self, pointer: str) -> tuple[str, ...] | None:
+        """Return the place in its scene of an artifact, by its JSON pointer into the spec.
+
+        None if the artifact is a texture.
+        """
+        return None
+
+    def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
+        """Raise UnfitFileError if a file is not what the scene of the spec needs at a place."""
+        raise NotImplementedError
+
+    def unresolved_files(self) -> dict[str, str]:
+        """Return files that the spec gives by name, and not by digest, by JSON pointers."""
+        return {}
+
+    # What pages show of a sample. A kind answers, so that common code knows no kind.
+
+    def looks_arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays that say how the samples look: pictures, cameras, light."""
+        return ()
+
+    def check_arrays(self) -> tuple[ArrayLayout, ...]:
+        """Return the arrays that say how well the samples were simulated."""
+        return ()
+
+    @property
+    def fixed_bodies(self) -> tuple[dict[str, Any], ...]:
+        """Bodies that no scene describes, for example a floor, as JSON like those of a scene."""
+        return ()
+
+    @property
+    def scene_numbers(self) -> tuple[str, ...]:
+        """Names of the labels that are numbers in the scene of a sample."""
+        return ()
+
+    def sample_scene(
+        self, numbers: Mapping[str, float], read: Callable[[str], bytes]
+    ) -> dict[str, Any] | None:
+        """Return the scene of a sample as JSON with the arrays of its files; None without one.
+
+        `numbers` are the values of `scene_numbers`; `read` returns an artifact by its digest.
+        Raises UnfitFileError.
+        """
+        return None
+
+    @property
+    def held_corners(self) -> tuple[tuple[float, float], ...]:
+        """Corners of the flat sheet that are held throughout, by their directions in the sheet."""
+        return ()
+
+    @property
+    def located_holders(self) -> tuple[int, ...]:
+        """Numbers of the holders in `holder_pose` that are at one place; a rim is all around."""
+        return ()
+
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
         """The axes by name, in the order of a product; the last one varies fastest."""

@@ -6,7 +6,8 @@ Certificates; and uploads of textures and of files of scenes.
 """
 
 from collections.abc import Callable
-from typing import Annotated, TypeVar
+from os import SEEK_END
+from typing import IO, Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -15,8 +16,7 @@ from stickslip_schemas.documents import responses
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.problems import FieldError, ProblemCode
 from stickslip_schemas.format.manifest import MANIFEST_NAME, SIGNATURE_NAME
-from stickslip_schemas.format.pictures import UnfitPictureError
-from stickslip_schemas.scene.files import UnfitFileError
+from stickslip_schemas.scene.errors import UnfitFileError
 from stickslip_schemas.store import Store
 
 from stickslip_services.api.artifacts import picture_format, serve
@@ -24,7 +24,7 @@ from stickslip_services.api.bodies import (
     CERTIFICATE_BYTES,
     JsonBody,
     content_type,
-    whole_body,
+    spooled_body,
     wrong_media_type,
 )
 from stickslip_services.api.problems import ProblemError
@@ -43,12 +43,12 @@ from stickslip_services.catalog.inputs import (
     find_certificate,
     list_certificates,
     register_certificate,
-    store_file,
-    store_texture,
 )
+from stickslip_services.catalog.uploads import store_scene_file, store_texture
 from stickslip_services.catalog.versions import find_dataset, find_file, find_version, list_datasets
 from stickslip_services.database.database import Database
 from stickslip_services.errors import NotFoundError
+from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import is_preview
 
 T = TypeVar("T")
@@ -171,7 +171,7 @@ def get_certificate(digest: str, request: Request, context: ContextDep) -> Respo
     responses=problem_responses(*BODY_PROBLEMS),
     openapi_extra=_PICTURE_BODY,
 )
-async def post_texture(request: Request, context: ContextDep) -> responses.TextureEntry:
+async def post_texture(request: Request) -> responses.TextureEntry:
     """Upload a texture: a square PNG or JPEG file, opaque, of 64 to 4096 pixels a side.
 
     It may be sent twice.
@@ -181,13 +181,14 @@ async def post_texture(request: Request, context: ContextDep) -> responses.Textu
     media_type = content_type(request)
     if media_type not in _PICTURES:
         raise wrong_media_type(" or ".join(_PICTURES), media_type)
-    data = await whole_body(request)
-    if not data.startswith(_PICTURES[media_type]):
-        raise _refused(
-            f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}",
-            data,
-        )
-    return await _stored(store_texture, context, data)
+    async with spooled_body(request) as file:
+        magic = _PICTURES[media_type]
+        if file.read(len(magic)) != magic:
+            rule = (
+                f"a texture must be a whole PNG or JPEG file, and of its Content-Type, {media_type}"
+            )
+            raise _refusal(rule, file)
+        return await _store(request, store_texture, file)
 
 
 @router.post(
@@ -196,24 +197,30 @@ async def post_texture(request: Request, context: ContextDep) -> responses.Textu
     responses=problem_responses(*BODY_PROBLEMS),
     openapi_extra=_FILE_BODY,
 )
-async def post_file(request: Request, context: ContextDep) -> responses.FileUpload:
+async def post_file(request: Request) -> responses.FileUpload:
     """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ),
     of at most 16 MiB.
 
     A file that no job names is deleted by `stickslip gc` after a day.
     """
-    return await _stored(store_file, context, await whole_body(request))
+    async with spooled_body(request) as file:
+        return await _store(request, store_scene_file, file)
 
 
-async def _stored(
-    store: Callable[[Database, Store, bytes], T], context: ContextDep, data: bytes
+async def _store(
+    request: Request, store: Callable[[Database, Store, IO[bytes]], T], file: IO[bytes]
 ) -> T:
+    """Store an upload when it is its turn; raise ProblemError if it is not fit for its use."""
+    context: Context = request.app.state.context
     try:
-        return await run_in_threadpool(store, context.database, context.store, data)
-    except (UnfitPictureError, UnfitFileError) as error:
-        raise _refused(str(error), data) from error
+        # Uploads wait here and not in a thread: all other routes share the same few threads.
+        async with request.app.state.upload_turns:
+            return await run_in_threadpool(store, context.database, context.store, file)
+    except UnfitFileError as error:
+        raise _refusal(str(error), file) from error
 
 
-def _refused(rule: str, data: bytes) -> ProblemError:
-    field = FieldError(pointer="", rule=rule, value=f'"{len(data)} bytes"')
+def _refusal(rule: str, file: IO[bytes]) -> ProblemError:
+    size = file.seek(0, SEEK_END)
+    field = FieldError(pointer="", rule=rule, value=f'"{size} bytes"')
     return ProblemError(422, ProblemCode.validation_failed, rule, fields=[field])

@@ -41,15 +41,17 @@ ones.
 MAX_BATCH = 64
 """Heartbeats that are answered with one statement: about 5 ms."""
 
-# A heartbeat or a report names thousands of tasks, so only its bytes are limited.
+MAX_CONTAINERS = 500_000
+"""Lists and objects in a heartbeat or a report, which name a thousand tasks."""
+
 _LEASE_REQUEST: JsonBody[worker_api.LeaseRequest] = JsonBody(
     worker_api.LeaseRequest, max_bytes=SMALL_BYTES, from_workers=True
 )
 _HEARTBEAT: JsonBody[worker_api.Heartbeat] = JsonBody(
-    worker_api.Heartbeat, max_containers=None, from_workers=True
+    worker_api.Heartbeat, max_containers=MAX_CONTAINERS, from_workers=True
 )
 _REPORT_BATCH: JsonBody[worker_api.ReportBatch] = JsonBody(
-    worker_api.ReportBatch, max_containers=None, from_workers=True
+    worker_api.ReportBatch, max_containers=MAX_CONTAINERS, from_workers=True
 )
 
 

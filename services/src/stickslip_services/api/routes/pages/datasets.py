@@ -18,7 +18,8 @@ from stickslip_schemas.store import Store
 
 from stickslip_services.api.artifacts import matches
 from stickslip_services.api.routes.common import ContextDep, Version
-from stickslip_services.catalog.inputs import find_certificate, known_scenes, list_certificates
+from stickslip_services.catalog.inputs import find_certificate, list_certificates
+from stickslip_services.catalog.scenes import known_scenes
 from stickslip_services.catalog.versions import (
     find_dataset,
     find_version,
