@@ -1,5 +1,6 @@
-"""What clips of cloth state of their own PSNR, against longer references at other instants, and
-what both cost.
+"""The stated PSNR of clips of cloth, against longer references at other instants.
+
+The script also prints the cost of both.
 
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
@@ -86,7 +87,8 @@ def main() -> None:
             end=", ",
         )
         print(
-            f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} instants",
+            f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} "
+            "instants",
             flush=True,
         )
         for channel, name in enumerate(groups[0]):

@@ -43,14 +43,16 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     cpu = time.process_time() - start
     total, steps = cloth.total, cloth.total.steps
     print(
-        f"| {vertices} | {cpu:.1f} | {hanging:.1f} | {steps} | {total.newton / steps:.2f} | {total.krylov / steps:.1f} "
+        f"| {vertices} | {cpu:.1f} | {hanging:.1f} | {steps} | {total.newton / steps:.2f} | "
+        f"{total.krylov / steps:.1f} "
         f"| {total.factorizations / steps:.2f} | {total.missed} | {total.unconverged} |",
         flush=True,
     )
     if vertices in BEFORE:
         cost, count, newton, krylov, factors = BEFORE[vertices]
         print(
-            f"| {vertices}, before | {cost:.1f} | | {count} | {newton:.2f} | {krylov:.1f} | {factors:.2f} | | 0 |"
+            f"| {vertices}, before | {cost:.1f} | | {count} | {newton:.2f} | {krylov:.1f} | "
+            f"{factors:.2f} | | 0 |"
         )
 
 

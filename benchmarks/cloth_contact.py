@@ -1,5 +1,4 @@
-"""Contact of cloth with cloth: what it costs, whether anything crosses in any step, and its
-protocols.
+"""Contact of cloth with cloth: its cost, crossings in any step, and its protocols.
 
     python benchmarks/cloth_contact.py [camel] [overhead] [stretched] [facets] [drops] [momentum]
         [protocols] [--only PREFIX] [--figures FOLDER]
@@ -88,9 +87,12 @@ def compare(material: str, vertices: int, frames: int) -> None:
     for mu in (None, 0.5):
         seconds[mu], cloth, crossed = dragged(material, vertices, frames, mu)
         print(
-            f"{material} {vertices} x {vertices}, {frames} frames, contact with itself {mu}: {seconds[mu]:.2f} CPU s, "
-            f"{cloth.total.unconverged} of {cloth.total.steps} steps unconverged, {crossed} end with a crossing, "
-            f"{cloth.total.newton} iterations, least distance {cloth.total.least_distance / THICKNESS:.4f} thicknesses",
+            f"{material} {vertices} x {vertices}, {frames} frames, contact with itself {mu}: "
+            f"{seconds[mu]:.2f} CPU s, "
+            f"{cloth.total.unconverged} of {cloth.total.steps} steps unconverged, {crossed} end "
+            "with a crossing, "
+            f"{cloth.total.newton} iterations, least distance "
+            f"{cloth.total.least_distance / THICKNESS:.4f} thicknesses",
             flush=True,
         )
     print(f"  ratio {seconds[0.5] / seconds[None]:.2f}", flush=True)
@@ -108,9 +110,12 @@ def stretched(vertices: int, frames: int) -> None:
     cloth = cloth_scene.scene(document).run()
     seconds = between - begin, time.process_time() - between
     print(
-        f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a stretched cloth "
-        f"{seconds[1]:.1f}: {seconds[1] / seconds[0]:.1f} times; {cloth.labels['unconverged_steps']} of "
-        f"{cloth.labels['steps']} steps unconverged, least distance {cloth.least_distance / THICKNESS:.4f} "
+        f"{vertices} x {vertices}, {frames} frames, over a floor {seconds[0]:.1f} CPU s, over a "
+        "stretched cloth "
+        f"{seconds[1]:.1f}: {seconds[1] / seconds[0]:.1f} times; "
+        f"{cloth.labels['unconverged_steps']} of "
+        f"{cloth.labels['steps']} steps unconverged, least distance "
+        f"{cloth.least_distance / THICKNESS:.4f} "
         f"thicknesses, {(cloth.self_intersections > 0).sum()} frames cross",
         flush=True,
     )
@@ -129,15 +134,18 @@ def tumble_all(only: str) -> None:
             continue
         seen = tumbles.watch(tumbles.tumble(name))
         print(
-            f"{name:11} {seen.seconds:7.2f} CPU s, {seen.unconverged_steps:3d} of {seen.steps:3d} steps unconverged, "
-            f"{seen.crossing_steps:3d} cross, least distance {seen.least_distance:.4f} thicknesses, "
+            f"{name:11} {seen.seconds:7.2f} CPU s, {seen.unconverged_steps:3d} of {seen.steps:3d} "
+            "steps unconverged, "
+            f"{seen.crossing_steps:3d} cross, least distance {seen.least_distance:.4f} "
+            "thicknesses, "
             f"{seen.newton / seen.steps:6.1f} iterations a step",
             flush=True,
         )
         if seen.crossing_steps or seen.unconverged_steps > UNCONVERGED_SHARE_MAX * seen.steps:
             failed.append(name)
     print(
-        f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: {', '.join(failed) or 'none'}"
+        f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: "
+        f"{', '.join(failed) or 'none'}"
     )
 
 
@@ -147,9 +155,12 @@ def momentum(name: str, steps: int) -> None:
     sums = tumbles.balance(seen.cloth)
     unit = THICKNESS * sums.size
     print(
-        f"{name} after {steps} steps, {sums.pairs} pairs, over the sum of their sizes (times the thickness): force "
-        f"{np.abs(sums.force).max() / sums.size:.1e}, moment {np.linalg.norm(sums.moment) / unit:.3f}, less that of "
-        f"friction across the distance {np.linalg.norm(sums.moment - sums.moment_of_friction) / unit:.1e}",
+        f"{name} after {steps} steps, {sums.pairs} pairs, over the sum of their sizes (times the "
+        "thickness): force "
+        f"{np.abs(sums.force).max() / sums.size:.1e}, moment "
+        f"{np.linalg.norm(sums.moment) / unit:.3f}, less that of "
+        "friction across the distance "
+        f"{np.linalg.norm(sums.moment - sums.moment_of_friction) / unit:.1e}",
         flush=True,
     )
 
@@ -160,8 +171,9 @@ def momentum_all() -> None:
 
 
 def over_facets() -> None:
-    """Draw a strip over a round cylinder and over cylinders of triangles, as short as the cells,
-    shorter and longer.
+    """Draw a strip over a round cylinder, and over cylinders of triangles.
+
+    The triangles are as short as the cells, shorter and longer.
 
     Then over a held cloth on such a cylinder, which is rough, with strips of cells of 5 to 2.5
     degrees.
@@ -201,7 +213,8 @@ def measure(name: str, settings: Mapping[str, Any], figures: Path | None) -> Non
     begin = time.process_time()
     result = protocols.run(name, "certified", **settings)
     print(
-        f"{name}: error {result.error:.2g} of {result.tolerance:g}, {time.process_time() - begin:.0f} CPU s"
+        f"{name}: error {result.error:.2g} of {result.tolerance:g}, "
+        f"{time.process_time() - begin:.0f} CPU s"
     )
     for curve in result.curves:
         print("  ", dict(curve.parameters), [f"{error:+.2e}" for error in curve.errors])

@@ -51,10 +51,12 @@ def simulate(args: argparse.Namespace, vertices: int, divisor: int) -> ClothRun:
     ).run()
     seconds = time.process_time() - start
     print(
-        f"  {vertices:3d} x {vertices:<3d} dt {1e3 * preset.time_step:7.3f} ms  {seconds:8.1f} CPU s  "
+        f"  {vertices:3d} x {vertices:<3d} dt {1e3 * preset.time_step:7.3f} ms  {seconds:8.1f} CPU "
+        "s  "
         f"{scene.labels['unconverged_steps']}/{scene.labels['steps']} steps unconverged  "
         f"worst residual {scene.labels['worst_residual']:.1e}  "
-        f"crossings {int(scene.self_intersections.max())}  {'valid' if scene.valid else scene.reason}",
+        f"crossings {int(scene.self_intersections.max())}  "
+        f"{'valid' if scene.valid else scene.reason}",
         flush=True,
     )
     return scene
@@ -99,10 +101,12 @@ def main() -> None:
 
     build = build_info()
     print(
-        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  load {os.getloadavg()[0]:.1f}"
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  load "
+        f"{os.getloadavg()[0]:.1f}"
     )
     print(
-        f"drop-and-drag of {args.material}, mu {args.mu:g}, {args.frames} frames, preset {args.preset}"
+        f"drop-and-drag of {args.material}, mu {args.mu:g}, {args.frames} frames, preset "
+        f"{args.preset}"
     )
     scenes = {(side, 1): simulate(args, side, 1) for side in sides}
     for divisor in sorted(set(args.divisors) - {1}):
@@ -126,7 +130,8 @@ def main() -> None:
             force = scene.record["contact_force"][steady]
             ratio = np.hypot(force[:, 0], force[:, 1]) / force[:, 2]
             print(
-                f"  {side} dt/{divisor}: |Ft|/Fn over mu, steady drag: median {np.median(ratio) / args.mu - 1.0:+.2e}"
+                f"  {side} dt/{divisor}: |Ft|/Fn over mu, steady drag: median "
+                f"{np.median(ratio) / args.mu - 1.0:+.2e}"
             )
 
 

@@ -1,5 +1,6 @@
-"""From a hanging rod back to its natural curvature: exact, how ill-conditioned, and from a noisy
-centreline.
+"""From a hanging rod back to its natural curvature.
+
+The cases are an exact centreline, how ill-conditioned the problem is, and a noisy centreline.
 
 OPENBLAS_NUM_THREADS=1 python benchmarks/inverse.py [--rods 50] [--figure docs/figures/inverse.png]
 
@@ -53,7 +54,8 @@ def quantiles(errors: Floats | list[float]) -> str:
 
 def exact_inverse(rng: np.random.Generator) -> None:
     print(
-        "\nexact inverse, curvature from solve_rods at 150 points: relative error of natural curvature"
+        "\nexact inverse, curvature from solve_rods at 150 points: relative error of natural "
+        "curvature"
     )
     n = 200
     for gamma in (100.0, 500.0, 1300.0):
@@ -65,7 +67,8 @@ def exact_inverse(rng: np.random.Generator) -> None:
         alone = natural_curvature(rods.curvature, None, weight)
         for name, result in (("curvature and frames", with_frames), ("curvature alone", alone)):
             print(
-                f"  gamma {gamma:6.0f}  {name:21s} {quantiles(rms(result.curvature - natural) / rms(natural))}"
+                f"  gamma {gamma:6.0f}  {name:21s} "
+                f"{quantiles(rms(result.curvature - natural) / rms(natural))}"
             )
         modes = np.polynomial.legendre.legvander(2 * S[:, 0] - 1, 4) * np.sqrt(2 * np.arange(5) + 1)
         error = np.einsum("pb,nbi->npi", modes, rng.normal(size=(n, 5, 3)) / np.sqrt(15))
@@ -74,7 +77,8 @@ def exact_inverse(rng: np.random.Generator) -> None:
         measured = rms(perturbed - natural) / rms(natural) / 0.01
         predicted, worst = alone.amplification, alone.amplification_max
         print(
-            f"  gamma {gamma:6.0f}  amplification of a smooth 1 % error: predicted {np.sqrt((predicted**2).mean()):.1f}"
+            f"  gamma {gamma:6.0f}  amplification of a smooth 1 % error: predicted "
+            f"{np.sqrt((predicted**2).mean()):.1f}"
             f" (median {np.median(predicted):.1f}, worst mode {np.median(worst):.1f}),"
             f" measured {np.sqrt((measured**2).mean()):.1f} (median {np.median(measured):.1f})"
         )
@@ -125,7 +129,8 @@ def distributed(
         end="",
     )
     print(
-        f"  noise found, median {np.median([f.noise for f in fits]):.5f}  CPU s per fit {seconds:.2f}"
+        f"  noise found, median {np.median([f.noise for f in fits]):.5f}  CPU s per fit "
+        f"{seconds:.2f}"
     )
 
 
@@ -184,7 +189,8 @@ def main() -> None:
 
     build = build_info()
     print(
-        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa "
+        f"{build.isa}"
     )
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     print(f"numpy {np.__version__}  python {platform.python_version()}  BLAS threads {threads}")

@@ -164,7 +164,8 @@ def main() -> None:
     outside = 0.0
     for part, seconds in sorted(spent.items(), key=lambda item: -item[1]):
         print(
-            f"    {part:45} {seconds:7.2f}  {seconds / total:6.1%}  {1e3 * seconds / tasks:6.1f} ms a task"
+            f"    {part:45} {seconds:7.2f}  {seconds / total:6.1%}  {1e3 * seconds / tasks:6.1f} "
+            "ms a task"
         )
         outside += seconds
     kept = sum(stages[stage] for stage in ("simulate", "render", "pack") if stage in stages)

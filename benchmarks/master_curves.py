@@ -35,7 +35,8 @@ def collocated(name: str, x: Floats, curve: Callable[[Floats], Floats]) -> None:
     coarse, fine = (with_tolerance(tolerance, lambda: curve(x)) for tolerance in (1e-8, 1e-10))
     errors = [np.abs(other / fine - 1.0).max() for other in (coarse, values)]
     print(
-        f"{name:18} {x[0]:8.2g} ... {x[-1]:8.6g}  tolerance 1e-8 {errors[0]:.0e}  1e-9 (used) {errors[1]:.0e}",
+        f"{name:18} {x[0]:8.2g} ... {x[-1]:8.6g}  tolerance 1e-8 {errors[0]:.0e}  1e-9 (used) "
+        f"{errors[1]:.0e}",
         end="",
     )
     print(f"  {1e3 * spent / len(x):.1f} ms a point")
@@ -71,7 +72,8 @@ def main() -> None:
                 end="",
             )
             print(
-                f"  degree 3 {coarse / fine - 1:7.0e}  4 (used) {used / fine - 1:7.0e}  {spent:.2f} s"
+                f"  degree 3 {coarse / fine - 1:7.0e}  4 (used) {used / fine - 1:7.0e}  "
+                f"{spent:.2f} s"
             )
 
 

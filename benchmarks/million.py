@@ -260,7 +260,8 @@ def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
     with made.database.write() as connection:
         simulated = SimulateOutput(record=record, labels={}).model_dump_json()
         update = text(
-            "UPDATE tasks SET state = 'succeeded', output = :output, digest = :digest, waiting_on = 0 WHERE seq = :seq"
+            "UPDATE tasks SET state = 'succeeded', output = :output, digest = :digest, waiting_on "
+            "= 0 WHERE seq = :seq"
         )
 
         def end(row: Row[Any], output: str) -> dict[str, Any]:
@@ -285,7 +286,8 @@ def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator
         row = connection.execute(text("SELECT seq, spec FROM jobs")).one()
         of_spec = parsed(json.loads(row.spec))
         rows = text(
-            "SELECT key, split, labels FROM samples WHERE job = :job AND slot >= :first AND slot < :end ORDER BY slot"
+            "SELECT key, split, labels FROM samples WHERE job = :job AND slot >= :first AND slot < "
+            ":end ORDER BY slot"
         )
         size = of_spec.samples_per_shard
         curves = [array for array in layout(of_spec) if not array.is_label]

@@ -91,7 +91,8 @@ def main() -> None:
     raw, size = sum(views.nbytes for views in pictures), sum(map(len, chunks))
     print(f"{SAMPLES} samples, {raw / 1e6:.1f} MB raw, {size / 1e6:.2f} MB encoded")
     print(
-        f"encode {encode * 1e3:.1f} ms, pack (all {len(layout(spec))} arrays) {packing * 1e3:.1f} ms CPU"
+        f"encode {encode * 1e3:.1f} ms, pack (all {len(layout(spec))} arrays) {packing * 1e3:.1f} "
+        "ms CPU"
     )
     print(f"pack / encode {packing / encode:.1%}")
 

@@ -1,5 +1,6 @@
-"""Time and memory of planning a job of many samples, over HTTP, into an empty and into a full
-queue.
+"""Time and memory of planning a job of many samples, over HTTP.
+
+The queue is empty or full.
 
     python benchmarks/plan.py [--samples 100000]
 

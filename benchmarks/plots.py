@@ -92,8 +92,9 @@ def plot(result: ProtocolResult) -> Figure:
 
 
 def _label(result: ProtocolResult, name: str, value: float) -> str:
-    """Return the label of a parameter: settings may have texts for its numbers, such as "0 height,
-    1 length".
+    """Return the label of a parameter.
+
+    Settings may have texts for its numbers, for example "0 height, 1 length".
     """
     texts = dict(
         part.split(" ", 1) for part in str(result.settings.get(name, "")).split(", ") if " " in part

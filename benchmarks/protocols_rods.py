@@ -1,5 +1,6 @@
-"""Acceptance of the rod solver on the physical protocols: errors against the master curves, and
-what they cost.
+"""Acceptance of the rod solver on the physical protocols.
+
+It prints errors against the master curves, and costs.
 
 python benchmarks/protocols_rods.py [--figures FOLDER]
 
@@ -25,7 +26,8 @@ from stickslip_sim_core.reference import master_curves
 
 def report(result: ProtocolResult, seconds: float) -> None:
     print(
-        f"\n{result.protocol}: {'passed' if result.passed else 'FAILED'}, tolerance {result.tolerance:g}",
+        f"\n{result.protocol}: {'passed' if result.passed else 'FAILED'}, tolerance "
+        f"{result.tolerance:g}",
         end="",
     )
     print(
@@ -54,7 +56,8 @@ def main() -> None:
 
     build = build_info()
     print(
-        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa "
+        f"{build.isa}"
     )
     print(
         f"numpy {np.__version__}  python {platform.python_version()}  load {os.getloadavg()[0]:.1f}"

@@ -92,7 +92,8 @@ def report_lease_and_complete(
         database_seconds() - other,
     )
     print(
-        f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, {done / wall:.0f} a second"
+        f"lease and complete, {batch} at a time: {1e3 * spent / done:.2f} CPU ms each, "
+        f"{done / wall:.0f} a second"
         + (
             f"; {1e3 * other / done:.2f} CPU ms of PostgreSQL"
             if "STICKSLIP_DATABASE" in os.environ
@@ -141,7 +142,8 @@ async def report_watchers(
         for ids in heard
     }
     print(
-        f"{count} watchers: {share:.0%} of a core; every one heard the same states: {len(told) == 1}"
+        f"{count} watchers: {share:.0%} of a core; every one heard the same states: "
+        f"{len(told) == 1}"
     )
 
 
@@ -180,7 +182,8 @@ async def report_clients(
     took.sort()
     p50, p95, p99 = (1e3 * took[int(share * len(took))] for share in (0.5, 0.95, 0.99))
     print(
-        f"{count} clients, one request a second each: p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms"
+        f"{count} clients, one request a second each: p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} "
+        "ms"
     )
 
 
@@ -242,13 +245,15 @@ async def report_idle_streams(
             await asyncio.to_thread(use, client)
         share = (cpu_seconds(server) - cpu) / seconds
         print(
-            f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load {os.getloadavg()[0]:.1f}"
+            f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load "
+            f"{os.getloadavg()[0]:.1f}"
         )
         for name, times in took.items():
             times.sort()
             p50, p99 = (1e3 * times[int(part * len(times))] for part in (0.5, 0.99))
             print(
-                f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest {1e3 * times[-1]:.0f} ms"
+                f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest "
+                f"{1e3 * times[-1]:.0f} ms"
             )
 
     await measure("no stream")
@@ -322,8 +327,10 @@ def report_heartbeats(
     took = (cpu_seconds(server) - cpu, database_seconds() - other, time.process_time() - own)
     spent, database, sender = (1e3 * seconds / total for seconds in took)
     print(
-        f"heartbeats with {held} leases, {senders} workers: {total / seconds:.0f} a second beside the load of this "
-        f"machine; {spent:.2f} CPU ms each, so one core takes {1e3 / spent:.0f} a second; {sender:.2f} CPU ms to send"
+        f"heartbeats with {held} leases, {senders} workers: {total / seconds:.0f} a second beside "
+        "the load of this "
+        f"machine; {spent:.2f} CPU ms each, so one core takes {1e3 / spent:.0f} a second; "
+        f"{sender:.2f} CPU ms to send"
         + (f", {database:.2f} of PostgreSQL" if "STICKSLIP_DATABASE" in os.environ else "")
     )
 

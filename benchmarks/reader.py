@@ -75,8 +75,9 @@ def npy(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
 
 
 def h5py(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
-    """Yield HDF5 with one chunk a clip: raw, and with the checksum that `stickslip export --hdf5`
-    adds.
+    """Yield HDF5 with a chunk for each clip: raw, and with a checksum.
+
+    `stickslip export --hdf5` adds the checksum.
     """
     import h5py as library
 
@@ -191,7 +192,8 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ResourceWarning)  # webdataset closes no file
     print(
-        f"benchmarks/reader.py --clips {options.clips} --batch-size {options.batch_size} --epochs {options.epochs}"
+        f"benchmarks/reader.py --clips {options.clips} --batch-size {options.batch_size} --epochs "
+        f"{options.epochs}"
     )
     print(f"python {platform.python_version()}, {packages()}")
     print(f"{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")

@@ -66,8 +66,9 @@ class Judged:
 
 
 def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats]:
-    """Return rods of a family that lie in all four frames: centrelines, strains and what they are
-    made from.
+    """Return rods of a family that lie in all four frames.
+
+    They are centrelines, strains, and the parameters that they are made from.
     """
     random, rig = np.random.Generator(np.random.PCG64(seed)), load_rig(RIG)
     ranges = HARD_RANGES if family == "hard" else RANGES
@@ -135,7 +136,8 @@ def print_report(judged: list[Judged], thesis: list[float]) -> None:
     mean = 100.0 * np.array([item.error.mean() for item in judged])
     largest = 100.0 * np.array([item.error.max() for item in judged])
     print(
-        f"{len(judged)} rods, {platform.machine()}, one process, one thread; errors in % of the length"
+        f"{len(judged)} rods, {platform.machine()}, one process, one thread; errors in % of the "
+        "length"
     )
     print(f"{'':24}{'median':>8}{'p95':>8}{'max':>8}")
     for name, values in (
@@ -160,7 +162,8 @@ def print_report(judged: list[Judged], thesis: list[float]) -> None:
         good = values[~bad]
         worst = f"{values[bad].min():.3f} to {values[bad].max():.3f}" if bad.any() else "-"
         print(
-            f"  {name:13} others up to {good.max():.3f} (median {np.median(good):.3f}), failures {worst}"
+            f"  {name:13} others up to {good.max():.3f} (median {np.median(good):.3f}), failures "
+            f"{worst}"
         )
 
 

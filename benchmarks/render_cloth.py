@@ -1,5 +1,6 @@
-"""CPU time and distance from 256 samples of a frame of cloth, by quality, with one shading for many
-textures.
+"""CPU time of a frame of cloth, and its distance from 256 samples, by quality.
+
+A shading serves many textures.
 
 Runs in Blender's interpreter, on a trajectory that `benchmarks/render_trajectory.py` has written:
 
@@ -154,8 +155,9 @@ class Bench:
         return pictures, traced - placed, ended - traced + self._per_frame(view)
 
     def _per_frame(self, view: View) -> float:
-        """Return the seconds that it takes to place everything: once a frame, the rest of `set_up`
-        once a clip.
+        """Return the seconds to place everything, once a frame.
+
+        The rest of `set_up` is done once a clip.
         """
         start = time.process_time()
         self.geometry.points(self.track[view.frame], view.frame)
@@ -227,17 +229,17 @@ def compare(bench: Bench, quality: str, sampling: ClothSampling, chosen: list[Vi
         if errors
     )
     print(
-        f"{quality:18} {seconds:.4f} CPU s; cloth {decibels(everything):.2f} dB ({textures}; {views}); floor near it "
-        f"{decibels(floor):.1f} dB; Cycles {1e3 * np.median(cycles):.0f} ms, all else {1e3 * np.median(rest):.0f} ms "
+        f"{quality:18} {seconds:.4f} CPU s; cloth {decibels(everything):.2f} dB ({textures}; "
+        f"{views}); floor near it "
+        f"{decibels(floor):.1f} dB; Cycles {1e3 * np.median(cycles):.0f} ms, all else "
+        f"{1e3 * np.median(rest):.0f} ms "
         f"({100 * np.median(rest) / np.median(cycles):.1f} %)",
         flush=True,
     )
 
 
 def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
-    """Print what a shading and its composition cost with a plain sheet, and with all that makes it
-    look like cloth.
-    """
+    """Print the cost of a shading and its composition, with a plain sheet and with all looks."""
     full, plain = bench.look, replace(bench.look, hem=0.0, translucency=0.0)
     seconds: dict[str, list[float]] = {"plain": [], "full": []}
     for _ in range(3):
@@ -249,15 +251,18 @@ def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
                 seconds[name].append(light + other)
     ratio = np.median(np.array(seconds["full"]) / np.array(seconds["plain"])) - 1
     print(
-        f"looks: {1e3 * np.median(seconds['plain']):.0f} ms plain, {1e3 * np.median(seconds['full']):.0f} ms with hem, "
-        f"thickness, translucency and creases: {100 * ratio:+.1f} % (median of {len(chosen) * 3} pairs)",
+        f"looks: {1e3 * np.median(seconds['plain']):.0f} ms plain, "
+        f"{1e3 * np.median(seconds['full']):.0f} ms with hem, "
+        f"thickness, translucency and creases: {100 * ratio:+.1f} % (median of {len(chosen) * 3} "
+        "pairs)",
         flush=True,
     )
 
 
 def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
-    """Print the cost of depth, segmentation, normals, texture coordinates and flow, and of a
-    shading.
+    """Print the cost of ground truth, and of a shading.
+
+    Ground truth is depth, segmentation, normals, texture coordinates and flow.
     """
     pictures, known, written = [], [], []
     with tempfile.TemporaryDirectory() as folder:
@@ -281,7 +286,8 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
     )
     print(
         f"ground truth: {1e3 * np.median(known):.0f} ms a frame, {of_trace:.1f} % of the "
-        f"{1e3 * np.median(whole):.0f} ms of a shading and its eight pictures; {of_all:.1f} % with writing it",
+        f"{1e3 * np.median(whole):.0f} ms of a shading and its eight pictures; {of_all:.1f} % with "
+        "writing it",
         flush=True,
     )
 
@@ -341,14 +347,17 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
     np.save(out, clips)
     blender, every = spent
     print(
-        f"{', '.join(map(str, look_of_clip.values()))}: {every / (shape[0] * shape[1]):.4f} CPU s per frame and "
-        f"texture; Blender {blender:.2f} s, all else {every - blender:.2f} s ({100 * (every / blender - 1):.1f} %); "
+        f"{', '.join(map(str, look_of_clip.values()))}: {every / (shape[0] * shape[1]):.4f} CPU s "
+        "per frame and "
+        f"texture; Blender {blender:.2f} s, all else {every - blender:.2f} s "
+        f"({100 * (every / blender - 1):.1f} %); "
         f"PSNR {labels}",
         flush=True,
     )
 
 
-def main() -> None:
+def parse_options() -> argparse.Namespace:
+    """Return the options of the command line."""
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("trajectory", type=Path)
     arguments.add_argument("--frames", type=int, default=12, help="instants, each in three views")
@@ -372,7 +381,28 @@ def main() -> None:
     arguments.add_argument(
         "--also", nargs="*", default=[], metavar="FRAME+WINDOW", help="other samplings"
     )
-    options = arguments.parse_args()
+    return arguments.parse_args()
+
+
+def compare_direct(bench: Bench, chosen: list[View]) -> None:
+    """Print the cost and the error of direct renderings, without the composition of textures."""
+    for samples in (16, 32):
+        errors, seconds = [], []
+        for view in chosen[:6]:
+            picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "guided"))
+            part, reference = bench.reference(view, Texture.floral)
+            errors.append(squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel())
+            seconds.append(spent)
+        print(
+            f"direct {samples:11} {np.median(seconds):.4f} CPU s; cloth {decibels(errors):.2f} "
+            "dB (floral)",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Compare the qualities, or print one of the costs that an option asks for."""
+    options = parse_options()
     if options.clip is not None:
         names = ("quality", "material", "viewpoint", "substrate", "creases")
         whole_clips(
@@ -398,19 +428,7 @@ def main() -> None:
     for quality, sampling in qualities.items():
         compare(bench, quality, sampling, chosen)
     if options.direct:
-        for samples in (16, 32):
-            errors, seconds = [], []
-            for view in chosen[:6]:
-                picture, spent = bench.direct(view, Texture.floral, Sampling(samples, "guided"))
-                part, reference = bench.reference(view, Texture.floral)
-                errors.append(
-                    squared(picture[part.slices], reference)[bench.cloth(view, part)].ravel()
-                )
-                seconds.append(spent)
-            print(
-                f"direct {samples:11} {np.median(seconds):.4f} CPU s; cloth {decibels(errors):.2f} dB (floral)",
-                flush=True,
-            )
+        compare_direct(bench, chosen)
     if options.substrates:
         for name in HARD:
             compare(

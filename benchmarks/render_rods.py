@@ -88,7 +88,8 @@ def main() -> None:
     print(f"bpy {app.version_string} ({app.build_hash.decode()}), {platform.machine()}, one thread")
     print(f"{options.rods} rods x 4 views; the rod covers {100 * rod.mean():.1f} % of the pixels")
     print(
-        f"{'quality':10} {'samples':>7} {'denoiser':>8} {'CPU ms/view':>11} {'PSNR frame':>10} {'PSNR rod':>8}"
+        f"{'quality':10} {'samples':>7} {'denoiser':>8} {'CPU ms/view':>11} {'PSNR frame':>10} "
+        f"{'PSNR rod':>8}"
     )
     named: dict[str, Sampling] = {str(name): sampling for name, sampling in SAMPLING.items()}
     for name, sampling in (named | (OTHERS if options.all else {})).items():
@@ -102,7 +103,8 @@ def main() -> None:
             f"{quality[0]:10.1f} {quality[1]:8.1f}"
         )
     print(
-        f"{'reference':10} {REFERENCE.samples:7} {REFERENCE.denoiser:>8} {reference.milliseconds:11.0f}"
+        f"{'reference':10} {REFERENCE.samples:7} {REFERENCE.denoiser:>8} "
+        f"{reference.milliseconds:11.0f}"
     )
 
 

@@ -61,7 +61,8 @@ def main() -> None:
 
     build = build_info()
     print(
-        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa {build.isa}"
+        f"stickslip-sim-core {build.version}  build {build.build_hash[:12]}  {build.compiler}  isa "
+        f"{build.isa}"
     )
     print(
         f"rod kernel {build.rod_kernel}  numpy {np.__version__}  python {platform.python_version()}"
@@ -85,14 +86,16 @@ def main() -> None:
             axis=1
         ) / np.sqrt(2)
         print(
-            f"\n{name}: {elements} elements, {rods.shape[1]} rods x {solution.centerline.shape[1]} points"
+            f"\n{name}: {elements} elements, {rods.shape[1]} rods x {solution.centerline.shape[1]} "
+            "points"
         )
         print(
             f"  CPU s, median of {repeats}: {statistics.median(times):.3f}  (min {min(times):.3f})"
         )
         print(f"  converged {solution.converged.mean():.2%}  stable {solution.stable.mean():.2%}")
         print(
-            f"  sweeps per rod: mean {solution.iterations.mean():.1f}  max {solution.iterations.max()}"
+            f"  sweeps per rod: mean {solution.iterations.mean():.1f}  max "
+            f"{solution.iterations.max()}"
         )
         print(f"  centreline error / L:      {quantiles(distance)}")
         print(f"  curvature error / max|k|:  {quantiles(curvature)}")

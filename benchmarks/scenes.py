@@ -86,8 +86,9 @@ class Clock:
 
 
 def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> dict[str, Any]:
-    """Return what came of a sample: its code and reason if it is not valid, and CPU seconds by
-    part.
+    """Return the outcome of a sample.
+
+    It has its code, its reason if it is not valid, and CPU seconds by part.
     """
     begin, clock = time.process_time(), Clock()
     given = simulation.inputs(files.__getitem__)
@@ -203,7 +204,8 @@ def main() -> None:
             [*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"]
         )
         said = {
-            "what": "Validity and CPU time of the built-in scenes, all parameters over their declared ranges",
+            "what": "Validity and CPU time of the built-in scenes, all parameters over their "
+            "declared ranges",
             "command": COMMAND,
             "commit": commit(),
             "conditions": "one thread; two cores shared with other work; CPU time of this process",

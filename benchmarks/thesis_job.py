@@ -1,5 +1,6 @@
-"""The thesis's 10,000 rods through the service: how long, how many accepted, and where samples were
-lost.
+"""The thesis's 10,000 rods through the service.
+
+It prints the time, the accepted samples, and the stages that lost samples.
 
 python benchmarks/thesis_job.py [--rendered 300] [--port 9310] [--pages DIR]
 
@@ -111,10 +112,13 @@ def describe(client: httpx.Client, where: str) -> str:
         )
     near = contact[np.isfinite(contact)]
     return (
-        f"  accepted {manifest.valid_count} of {manifest.sample_count} ({manifest.acceptance_rate:.2%})"
+        f"  accepted {manifest.valid_count} of {manifest.sample_count} "
+        f"({manifest.acceptance_rate:.2%})"
         f"{f'; lost: {reasons}' if reasons else '; nothing was lost'}; {size / 1e6:.1f} MB\n"
-        f"  multistable {multistable.mean():.2%}; come back to themselves {len(near) / len(slots):.2%}, "
-        f"nearest {near.min(initial=np.inf):.4f} L; reach median {np.median(reach):.3f}, largest {reach.max():.3f} L"
+        f"  multistable {multistable.mean():.2%}; come back to themselves "
+        f"{len(near) / len(slots):.2%}, "
+        f"nearest {near.min(initial=np.inf):.4f} L; reach median {np.median(reach):.3f}, largest "
+        f"{reach.max():.3f} L"
     )
 
 
@@ -130,7 +134,8 @@ def main() -> None:
             load = os.getloadavg()[0]
             seconds, where = run_job(client, spec)
             print(
-                f"{spec['name']}: {seconds:.1f} s from submission to dataset (load average before: {load:.1f})"
+                f"{spec['name']}: {seconds:.1f} s from submission to dataset (load average before: "
+                f"{load:.1f})"
             )
             print(describe(client, where))
             if options.pages:
