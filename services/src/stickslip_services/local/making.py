@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.documents.tasks import SimulateOutput, SimulateTask, TaskResult
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
@@ -199,7 +199,9 @@ def _write(
 ) -> None:
     import numpy as np
 
-    (out / RESULT_NAME).write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
+    # pydantic writes null for numbers that are not finite, as JSON asks.
+    result = TypeAdapter(dict[str, Any]).dump_json(said, indent=2)
+    (out / RESULT_NAME).write_bytes(result + b"\n")
     if not arrays:
         return
     times = np.arange(spec.instants) / spec.instants_per_second

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
@@ -136,7 +137,12 @@ class Content:
             }
             for array in self.arrays
         }
-        return (json.dumps(self.identity() | {"arrays": arrays}, indent=2) + "\n").encode()
+        return strict_json(self.identity() | {"arrays": arrays}, indent=2) + b"\n"
+
+
+def strict_json(document: dict[str, Any], *, indent: int | None = None) -> bytes:
+    """Return a JSON document [RFC 8259], in which null stands for numbers that are not finite."""
+    return TypeAdapter(dict[str, Any]).dump_json(document, indent=indent)
 
 
 def to_directory(
@@ -228,8 +234,8 @@ def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> No
     """Write `train-000000.tar` and so on: for each sample `SLOT.json` with its labels, and a
     `SLOT.ARRAY.npy` for each other array.
 
-    Categories are codes, as in the version; `dataset.json` names them. Infinity and NaN are written
-    as Python's json reads them.
+    Categories are codes, as in the version; `dataset.json` names them. Numbers that are not finite
+    are null.
     """
     for split, number, _, slots in content.parts():
         with tarfile.open(
@@ -240,7 +246,7 @@ def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> No
             }
             for place, slot in enumerate(slots):
                 sample = {name: values[place] for name, values in labels.items()}
-                _add(tar, f"{slot:08d}.json", json.dumps(sample).encode())
+                _add(tar, f"{slot:08d}.json", strict_json(sample))
                 for array in content.arrays:
                     if not array.is_label:
                         buffer = io.BytesIO()
@@ -287,7 +293,7 @@ def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
         labels = {
             array.name: content.read(array.name, alone)[0].tolist() for array in content.labels
         }
-        (folder / "labels.json").write_text(json.dumps(labels, indent=2) + "\n")
+        (folder / "labels.json").write_bytes(strict_json(labels, indent=2) + b"\n")
         written: list[str] = []
         first = 1
         for sheet in sheets:

@@ -11,7 +11,6 @@ Labels are columns of the episodes.
 Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
 """
 
-import json
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.arrays import Array
-from stickslip_training.export.formats import Content, OnBytes
+from stickslip_training.export.formats import Content, OnBytes, strict_json
 
 FILES = 1000
 """Files of a folder."""
@@ -122,9 +121,9 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
         directory / "meta" / "tasks.parquet"
     )
     totals = {name: _merged([stats[name] for stats in every]) for name in every[0]}
-    (directory / "meta" / "stats.json").write_text(json.dumps(totals))
+    (directory / "meta" / "stats.json").write_bytes(strict_json(totals))
     info = _info(episodes, names, views, float(rate), arrays["video"].shape)
-    (directory / "meta" / "info.json").write_text(json.dumps(info, indent=2))
+    (directory / "meta" / "info.json").write_bytes(strict_json(info, indent=2))
 
 
 def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
