@@ -58,7 +58,7 @@ def test_narrow_terminals_show_fewer_columns_and_break_no_word(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "40")
-    rows = [
+    rows: list[tuple[output.Cell, ...]] = [
         ("ds-0123456789abcdef:v1", "a-long-name", "succeeded"),
         ("ds-1", "b", output.Styled("failed", "red")),
     ]

@@ -5,6 +5,7 @@ import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -184,7 +185,7 @@ def test_a_signed_version_is_not_passed_off_as_another(
     with Client(origin.url) as client:
         answer = client.request
 
-        def other(method: str, path: str, **rest: object) -> object:
+        def other(method: str, path: str, **rest: Any) -> object:
             return answer(method, path.replace("/versions/2", "/versions/1"), **rest)
 
         client.request = other  # type: ignore[method-assign,assignment]

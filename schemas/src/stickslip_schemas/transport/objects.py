@@ -255,7 +255,7 @@ def _endpoint(bucket: str) -> str:
 
 
 def _summary(error: Exception) -> str:
-    """Return the first line of an error, which says what failed.
+    """Return the first line of an error, which names the fault.
 
     The others are the structure of a Rust value.
     """

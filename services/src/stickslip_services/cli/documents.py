@@ -22,7 +22,7 @@ from stickslip_services.client.errors import ClientError
 from stickslip_services.errors import CommandError
 
 SCENE_SUFFIXES = (".yaml", ".yml", ".json")
-"""Of a `scene` that is a file; other names are those of built-in scenes."""
+"""Suffixes of a `scene` that is a file; all other names mean built-in scenes."""
 MAX_VALUES = 1_000_000
 """Most values of a document, with aliases written out."""
 MAX_FILE_BYTES = 16 * 2**20

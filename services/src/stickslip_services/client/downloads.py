@@ -103,7 +103,7 @@ class Downloader:
         raise DamagedError(f"{file.path} arrived damaged {ATTEMPTS} times: {fault}")
 
     def _fetch(self, file: FileEntry, part: Path) -> str:
-        """Append the bytes of a file that its part lacks; return what is wrong with them, or ''.
+        """Append the bytes of a file that its part lacks; return their fault, or an empty text.
 
         Raises:
             TransportError: The connection failed.

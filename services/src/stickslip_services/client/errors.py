@@ -33,7 +33,7 @@ class ForeignFilesError(ClientError):
 
 
 class DamagedError(ClientError):
-    """Received bytes differ from those that the manifest lists."""
+    """Received bytes differ from the bytes that the manifest lists."""
 
 
 class UnsignedError(ClientError):

@@ -71,7 +71,7 @@ def read_event(message: Message, url: str) -> Event | None:
     """Return the event of a message; None for one that only newer versions know.
 
     Raises:
-        UnexpectedError: The data are not those of the event.
+        UnexpectedError: The data do not fit the event.
     """
     model = EVENT_MODELS.get(message.name)
     return None if model is None else parse(model, message.data.encode(), url)

@@ -119,7 +119,7 @@ def pull(
     Raises:
         ForeignFilesError: `target` holds other files. Nothing was written.
         SelectionError: The dataset has no such array or label, or no sample is chosen.
-        DamagedError: Received bytes differ from those that the manifest lists.
+        DamagedError: Received bytes have other digests than the manifest lists.
         UnsignedError: Nobody signed the version. Nothing was written.
         ChangedError: The signature is not that of the version. Nothing was written.
         UnknownSignerError: No allowed signer signed the version. Nothing was written.
