@@ -213,6 +213,7 @@ FLAGS: list[tuple[str, int, str]] = [
     ("validate BOMB", 1, "must hold at most 1000000 values, with aliases written out"),
     ("scene check absent.yaml", 1, "there is no file absent.yaml"),
     ("scene check folder/absent", 1, "there is no file folder/absent"),
+    ("scene check TAGS", 1, "low: sets sheets.cloth.mesh.size.0: Input should be greater than 0"),
     ("scene check EMPTY", 1, "is empty: it must hold a mapping"),
     ("submit OK --priority 101", 2, "'--priority': 101 is not in the range -100<=x<=100"),
     ("submit OK --priority -101", 2, "'--priority': -101 is not in the range -100<=x<=100"),
@@ -355,6 +356,9 @@ FILES = {
     "TWICE": "kind: rod_hang\nkind: cloth_drag\n",
     "BROKEN": "axes: [",
     "BYTES": "\udcff",
+    "TAGS": "{format: stickslip-scene/1, duration: 1, default_friction: 0.3, parameters: {width: "
+    "{sets: [sheets.cloth.mesh.size.0], low: -1, high: 2, unit: m, description: width}}, sheets: "
+    "{cloth: {material: gray-interlock, mesh: {type: grid, size: [1, 1], cells: [1, 1]}}}}",
     "PICTURE": "\udc89PNG\r\n",
     "EMPTY": "# a comment",
     "DEEP": "[" * 5000,

@@ -219,4 +219,20 @@ def refuse_as(error: ValidationError, scene: BaseModel, location: Location, valu
     """Raise a ValidationError for a value that another part of a document, a scene, makes wrong."""
     first = error.errors(include_url=False)[0]
     rule = first["msg"].removeprefix("Value error, ") + unit_of(first, type(scene))
-    refuse(scene, location, f"sets {'.'.join(map(str, first['loc']))}: {rule}", value)
+    path = ".".join(_path_in(scene.model_dump(mode="json"), first["loc"]))
+    refuse(scene, location, f"sets {path}: {rule}", value)
+
+
+def _path_in(document: Any, location: Location) -> list[str]:
+    """Return the steps of a location that lead into a document.
+
+    pydantic adds the tags of unions, which nobody has written.
+    """
+    steps = []
+    for step in location:
+        try:
+            document = document[step]
+        except (KeyError, IndexError, TypeError):
+            continue  # a tag is no key of an object and no position in a list
+        steps.append(str(step))
+    return steps
