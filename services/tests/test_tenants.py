@@ -346,6 +346,30 @@ def test_an_admin_sees_every_project(tenants: Tenants) -> None:
     assert answer.status_code == 200
 
 
+def test_a_project_does_not_see_the_name_that_another_gave_a_dataset(tenants: Tenants) -> None:
+    """Both have specified the same samples: the dataset is shared, and its name is not."""
+    context: Context = tenants.app.state.context
+    worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
+    spec = {"gamma": (17.0, 18.0)}
+    names = {tenants.alpha: "alpha-secret", tenants.beta: None}
+    datasets_of = {}
+    for client, name in names.items():
+        job = client.post("/v1/jobs", json=rods(name=name, **spec)).json()["id"]
+        worker.work()
+        datasets_of[client] = client.get(f"/v1/jobs/{job}").json()["dataset"]["dataset"]
+    assert datasets_of[tenants.alpha] == datasets_of[tenants.beta]
+    path = f"/v1/datasets/{datasets_of[tenants.beta]}"
+    assert tenants.alpha.get(path).json()["name"] == "alpha-secret"
+    assert tenants.beta.get(path).json()["name"] is None
+    for page in (path, "/v1/datasets", "/datasets", f"{path.removeprefix('/v1')}/v1"):
+        answer = tenants.beta.get(page)
+        assert answer.is_success
+        assert "alpha-secret" not in answer.text, page
+    tenants.beta.post("/v1/jobs", json=rods(name="beta-s", **spec))
+    assert tenants.beta.get(path).json()["name"] == "beta-s"
+    assert tenants.alpha.get(path).json()["name"] == "alpha-secret"
+
+
 def test_only_requests_without_a_project_find_versions_without_a_job(context: Context) -> None:
     """`stickslip reindex` registers versions of a store whose jobs are unknown."""
     with context.database.write() as connection:

@@ -32,10 +32,14 @@ from stickslip_schemas.format.manifest import (
 )
 from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel, is_unavailable
 
-from stickslip_services.access.principals import is_visible_version
+from stickslip_services.access.principals import (
+    current_principal,
+    is_visible_project,
+    is_visible_version,
+)
 from stickslip_services.client.signing import is_signature, sign
 from stickslip_services.database.database import PageRequest, document_of, read_page
-from stickslip_services.database.tables import dataset_versions, datasets
+from stickslip_services.database.tables import dataset_versions, datasets, jobs
 from stickslip_services.errors import NotFoundError
 
 HEADS_AT_ONCE = 128
@@ -223,24 +227,24 @@ def damaged_files(
 
 def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
     """Return a page of datasets, newest first."""
-    shown = partial(_shown_dataset, connection)
+    to_dataset = partial(_dataset_of, connection)
     return read_page(
         connection,
-        select(datasets).where(_is_own()),
+        select(datasets).where(_is_visible_dataset()),
         page,
         datasets.c.seq,
-        lambda rows: map(shown, rows),
+        lambda rows: map(to_dataset, rows),
     )
 
 
 def find_dataset(connection: Connection, dataset: str) -> Dataset:
     """Return a dataset with its committed versions; raise NotFoundError."""
     row = connection.execute(
-        select(datasets).where(datasets.c.id == dataset, _is_own())
+        select(datasets).where(datasets.c.id == dataset, _is_visible_dataset())
     ).one_or_none()
     if row is None:
         raise NotFoundError(f"there is no dataset {dataset[:100]!r}")
-    return _shown_dataset(connection, row)
+    return _dataset_of(connection, row)
 
 
 def find_version(connection: Connection, dataset: str, version: int) -> DatasetVersion:
@@ -275,21 +279,44 @@ of its files.
 """
 
 
-def _is_own() -> ColumnElement[bool]:
+def _is_visible_dataset() -> ColumnElement[bool]:
     return exists().where(dataset_versions.c.dataset == datasets.c.id, is_visible_version())
 
 
-def _shown_dataset(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
+def _dataset_of(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Dataset:
+    """Return the dataset of a row as the principal sees it: its versions, and its own name."""
+    columns = dataset_versions.c
     versions = connection.execute(
         select(dataset_versions)
-        .where(
-            dataset_versions.c.dataset == row.id,
-            dataset_versions.c.manifest.is_not(None),
-            is_visible_version(),
-        )
-        .order_by(dataset_versions.c.version)
+        .where(columns.dataset == row.id, columns.manifest.is_not(None), is_visible_version())
+        .order_by(columns.version)
     )
-    shown = (
+    documents = tuple(
         document_of(DatasetVersion, version, group=version.group_digest) for version in versions
     )
-    return document_of(Dataset, row, versions=tuple(shown))
+    name = _visible_name(connection, row.id, row.name)
+    return document_of(Dataset, row, name=name, versions=documents)
+
+
+def _visible_name(connection: Connection, dataset: str, first_name: str | None) -> str | None:
+    """Return the name of a dataset for the principal.
+
+    Projects share what they have specified alike, but not the names that they gave it. So a project
+    sees the name in the first of its own jobs that has one. `first_name`, which the dataset got
+    with its first version, is for those who see all projects, and for versions without a job.
+    """
+    if current_principal().sees_all:
+        return first_name
+    columns = dataset_versions.c
+    makes_it = (jobs.c.publish_task == columns.publish_task) & (columns.dataset == dataset)
+    if connection.scalar(select(~exists().where(makes_it))):
+        return first_name
+    query = (
+        select(jobs.c.name)
+        .join(dataset_versions, makes_it)
+        .where(jobs.c.name.is_not(None), is_visible_project(jobs.c.project))
+        .order_by(jobs.c.seq)
+        .limit(1)
+    )
+    name: str | None = connection.scalar(query)
+    return name
