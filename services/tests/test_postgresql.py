@@ -537,6 +537,23 @@ def test_other_databases_are_refused_without_their_password(
     assert rule + shown in result.stderr
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        "postgresql://me:first@second@host/x",
+        "postgresql://me:first@second/third@host/x",
+        "postgresql://me:first@second@host:54x/x",
+        "postgresql://me:first@second@host/",
+        "mysql://me:first@second@host/x",
+    ],
+)
+def test_no_part_of_a_password_with_an_at_sign_is_shown(value: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="not shown because it may hold a password") as raised:
+        Settings.chosen(data=tmp_path, database=value)
+    for part in ("first", "second", "third"):
+        assert part not in str(raised.value)
+
+
 def test_a_password_is_not_shown(tmp_path: Path) -> None:
     settings = Settings.chosen(
         data=tmp_path, database="postgresql://me:s3cret@host/name?sslpassword=s3cret"

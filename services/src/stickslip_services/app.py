@@ -56,6 +56,9 @@ logger = logging.getLogger(__name__)
 PLAN_SECONDS = 0.2
 """Polling interval for jobs to plan [s]."""
 
+CTRL_C_STATUS = 130
+"""Exit status after Ctrl-C, as of a shell: 128 + SIGINT."""
+
 GRACE_SECONDS = 3
 """Time that open requests (event streams) have to end after a signal [s]."""
 
@@ -222,7 +225,11 @@ def _serve(settings: Settings, listener: socket.socket) -> int:
     )
     protocol.allow_many_files()
     server = _Server(config, settings.url)
-    server.run(sockets=[listener])
+    try:
+        server.run(sockets=[listener])
+    # uvicorn raises the signal again when it has stopped; Ctrl-C is no error.
+    except KeyboardInterrupt:
+        return CTRL_C_STATUS
     return 0 if server.started else 1
 
 

@@ -20,6 +20,22 @@ from stickslip_services.errors import SettingsError
 R = TypeVar("R")
 
 
+_DATABASE_FORM = "a URL of the form postgresql://USER@HOST/NAME"
+
+
+def _without_secrets(value: str, url: URL | None) -> str:
+    """Return a wrong URL of a database for a message, without a password.
+
+    Where the user, the password and the host of a malformed URL begin and end is a guess. So if
+    there could be a password, only a URL that has been parsed is shown.
+    """
+    if url is not None and value.count("@") <= 1:
+        return repr(url.set(query={}).render_as_string(hide_password=True))
+    if {"@", "?"} & set(value):
+        return "something else, which is not shown because it may hold a password"
+    return repr(value[:100])
+
+
 class Settings(BaseSettings):
     """Paths, addresses, limits and times of the coordinator."""
 
@@ -130,22 +146,23 @@ class Settings(BaseSettings):
     @field_validator("database")
     @classmethod
     def _is_postgresql(cls, database: SecretStr | None) -> SecretStr | None:
-        if database is not None:
-            value = database.get_secret_value()
-            try:
-                url = make_url(value)
-            except (ArgumentError, ValueError):
-                url = None
-            if url is None or url.drivername != "postgresql" or not url.database:
-                if url is not None:
-                    shown = repr(url.set(query={}).render_as_string(hide_password=True))
-                elif {"@", "?"} & set(value):
-                    shown = "something else, which is not shown because it may hold a password"
-                else:
-                    shown = repr(value[:100])
-                raise ValueError(
-                    f"database must be a URL of the form postgresql://USER@HOST/NAME, and is {shown}"
-                )
+        if database is None:
+            return None
+        value = database.get_secret_value()
+        try:
+            url = make_url(value)
+        except (ArgumentError, ValueError):
+            url = None
+        if url is None or url.drivername != "postgresql" or not url.database:
+            shown = _without_secrets(value, url)
+            raise ValueError(f"database must be {_DATABASE_FORM}, and is {shown}")
+        # SQLAlchemy splits at the first @, and takes the rest of the password for the host.
+        user_part = value.partition("://")[2].rpartition("/")[0]
+        if user_part.count("@") > 1:
+            raise ValueError(
+                f"database must be {_DATABASE_FORM}, with @ in a password written as %40; it has "
+                "more than one @, and is not shown because it may hold a password"
+            )
         return database
 
     @model_validator(mode="after")
