@@ -1,7 +1,10 @@
-"""Kill -9 anything in the middle of jobs of rods and start again: every sample once, every hash
-right.
+"""Kill -9 anything in the middle of jobs of rods and start again.
 
-STICKSLIP_KILLS=50 pytest -m slow tests/test_chaos.py -s      chosen deaths, random ones, and the longest gap
+Every sample is there once, and every hash is right.
+
+    STICKSLIP_KILLS=50 pytest -m slow tests/test_chaos.py -s
+
+prints the longest gap of chosen deaths and of random ones.
 
 The last of the tests has two coordinators and two dispatchers on one PostgreSQL database and one
 bucket.
@@ -318,7 +321,8 @@ def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixtu
         worst_load = max(worst_load, os.getloadavg()[0])
         with capsys.disabled():
             print(
-                f"{number + 1:3} {victim:28} {gaps[victim][-1]:5.1f} s, load {os.getloadavg()[0]:.1f}",
+                f"{number + 1:3} {victim:28} {gaps[victim][-1]:5.1f} s, load "
+                f"{os.getloadavg()[0]:.1f}",
                 flush=True,
             )
     over = [service.finished(job) for job in watch.jobs]
@@ -335,7 +339,8 @@ def test_jobs_survive_random_kills(service: Service, capsys: pytest.CaptureFixtu
         print(f"{count} kills (seed {seed}): each of {len(over) * RODS} samples once")
         for victim, seconds in sorted(gaps.items()):
             print(
-                f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until something was finished"
+                f"    {victim:28} {len(seconds):3} times, {max(seconds):5.1f} s at most until "
+                "something was finished"
             )
         print(
             f"    longest gap without progress {watch.longest:.1f} s, load {worst_load:.1f} at most"
@@ -398,7 +403,8 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
         wait = watch.wait_for_progress()
         with capsys.disabled():
             print(
-                f"{number + 1:3} {node.data.name} {victim:28} {wait:5.1f} s, load {os.getloadavg()[0]:.1f}",
+                f"{number + 1:3} {node.data.name} {victim:28} {wait:5.1f} s, load "
+                f"{os.getloadavg()[0]:.1f}",
                 flush=True,
             )
     over = [nodes[0].finished(job, timeout=600) for job in watch.jobs]
@@ -422,7 +428,8 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
         check_dataset(store, job["dataset"], many_rods(number), builds)
     with capsys.disabled():
         print(
-            f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed calls collected"
+            f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed "
+            "calls collected"
         )
         print(f"    longest gap without progress {watch.longest:.1f} s")
 

@@ -1,4 +1,4 @@
-"""Cloth on real parts: spec, core, Blender, Zarr, training, and one simulation for all its renders."""
+"""Cloth on real parts: spec, core, Blender, Zarr, training; a simulation serves its renders."""
 
 import subprocess
 from pathlib import Path

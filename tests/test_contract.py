@@ -1,4 +1,4 @@
-"""What two packages both say: the contract in the schemas, and what the core and the renderer do."""
+"""The contract in the schemas agrees with the core and the renderer."""
 
 import inspect
 from pathlib import Path

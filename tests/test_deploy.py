@@ -163,7 +163,10 @@ def test_shellcheck(path: Path) -> None:
 def test_yamllint() -> None:
     config = """
         extends: default
-        rules: {line-length: {max: 140}, document-start: disable, comments: {min-spaces-from-content: 1}}
+        rules:
+          line-length: {max: 140}
+          document-start: disable
+          comments: {min-spaces-from-content: 1}
     """
     found = [*DEPLOY.rglob("*.yaml"), *(ROOT / "examples").glob("*.yaml")]
     files = [
@@ -259,7 +262,8 @@ def start_job(place: Path, *, state: str, worker: str) -> "subprocess.Popen[byte
     for path, text in (
         (
             programs / "scontrol",
-            f'echo "$@" >> {place}/scontrol\n[ "$1" = show ] && echo "   JobState={state} Reason=None"',
+            f'echo "$@" >> {place}/scontrol\n[ "$1" = show ] && echo "   JobState={state} '
+            'Reason=None"',
         ),
         (shared / ".venv/bin/python", f'echo "$@" > {place}/worker\n{worker}'),
     ):

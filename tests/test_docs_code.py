@@ -1,8 +1,9 @@
 """Every code block of README.md and of the documentation site runs as it is printed.
 
-Python blocks of a page run one after the other in one namespace, and so do shell blocks, whose variables live on;
-all in a directory of their own with `examples/`. YAML blocks are specs or scenes: they are checked, and written to the
-file that their first line names. What a comment after `print(...)` promises must be printed. The service is a real one.
+Python blocks of a page run one after the other in one namespace, and so do shell blocks, whose
+variables live on. They run in a fresh directory with `examples/`. YAML blocks are specs or scenes:
+they are checked, and written to the file that their first line names. The output of `print(...)`
+must be that of the comment after it. The service is a real one.
 A block after `<!-- skip: REASON -->` is not run.
 """
 

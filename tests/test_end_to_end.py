@@ -54,7 +54,9 @@ def cli(service: Service, *arguments: str, status: int = 0) -> str:
 
 
 def files_url(service: Service, job: dict[str, Any]) -> str:
-    return f"{service.url}/v1/datasets/{job['dataset']['dataset']}/versions/{job['dataset']['version']}/files/"
+    dataset = job["dataset"]
+    version = f"{dataset['dataset']}/versions/{dataset['version']}"
+    return f"{service.url}/v1/datasets/{version}/files/"
 
 
 def manifest_of(directory: Path) -> Manifest:
@@ -240,11 +242,13 @@ def test_a_flipped_bit_in_a_pulled_shard_is_told(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "pointer", "value"),
     [
-        ({"kind": "cloth_drag", "axes": {"material": "silk", "mu": 0.1, "texture": "dots", "viewpoint": "left"}},
+        ({"kind": "cloth_drag",
+          "axes": {"material": "silk", "mu": 0.1, "texture": "dots", "viewpoint": "left"}},
          "/axes/material", "silk"),
         ({"axes": {"gamma": -1, "phi0": 1, "phi1": 6}}, "/axes/gamma", "-1"),
         ({"axes": {"gamma": [], "phi0": 1, "phi1": 6}}, "/axes/gamma", "[]"),
-        ({"axes": {"gamma": {"type": "linspace", "start": 1, "stop": 2, "num": 10**12}, "phi0": 1, "phi1": 6}},
+        ({"axes": {"gamma": {"type": "linspace", "start": 1, "stop": 2, "num": 10**12},
+                   "phi0": 1, "phi1": 6}},
          "/axes/gamma/num", "1000000000000"),
     ],
 )  # fmt: skip

@@ -47,7 +47,8 @@ FROM scratch
 COPY . /
 RUN apt-get update \\
  && apt-get install --yes --no-install-recommends {packages} \\
- && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /usr/share/doc/* /usr/share/locale/* /usr/share/man/*
+ && rm -rf /var/lib/apt/lists/* /var/cache/apt/* \\
+ && rm -rf /usr/share/doc/* /usr/share/locale/* /usr/share/man/*
 """
 
 # Arguments: the root, the data directory, and the command. Ray needs shared memory and pseudo
@@ -59,7 +60,9 @@ mount --bind "$root" "$root"
 mount --options remount,bind,ro "$root"
 mount --types proc proc "$root/proc"
 mount --rbind /dev "$root/dev"
-for place in tmp home/stickslip; do mount --types tmpfs --options mode=1777 tmpfs "$root/$place"; done
+for place in tmp home/stickslip; do
+  mount --types tmpfs --options mode=1777 tmpfs "$root/$place"
+done
 mount --bind "$data" "$root/data"
 cd "$root"
 exec chroot --userspec=10001:10001 "$root" "$@"
@@ -225,7 +228,10 @@ def test_images_are_small(images: Images, name: str, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize("name", LIMITS)
 def test_nobody_is_root_and_nothing_can_be_changed(images: Images, name: str, data: Path) -> None:
     assert images.config(name)["User"] == str(USER)
-    script = "id -u; for place in / /opt/stickslip /etc; do touch $place/x 2>&1 || true; done; touch /tmp/x /data/x"
+    script = (
+        "id -u; for place in / /opt/stickslip /etc; do touch $place/x 2>&1 || true; done; "
+        "touch /tmp/x /data/x"
+    )
     said = run(*images.command(name, data, ["sh", "-c", script])).splitlines()
     assert said[0] == str(USER)
     assert [line.rpartition(": ")[2] for line in said[1:]] == ["Read-only file system"] * 3
@@ -249,7 +255,10 @@ def test_the_coordinator_has_only_what_it_needs(images: Images, data: Path) -> N
     said = run(*images.command("coordinator", data, images.entry("coordinator", "--openapi")))
     assert json.loads(said) == json.loads((ROOT / "docs" / "openapi.json").read_text())
     names = "ray", "torch", "bpy", "pip", "stickslip_workers", "stickslip_sim_core"
-    asked = f"from importlib.util import find_spec; print([name for name in {names} if find_spec(name)])"
+    asked = (
+        f"from importlib.util import find_spec; print([name for name in {names} if "
+        "find_spec(name)])"
+    )
     assert (
         run(*images.command("coordinator", data, ["/opt/stickslip/.venv/bin/python", "-c", asked]))
         == "[]"

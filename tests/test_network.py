@@ -37,7 +37,7 @@ def test_work_goes_on_whatever_happens_to_machines(
             print(f"    {what:55} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
     def lost(name: str, how: str) -> None:
-        """Expect that the coordinator notices the loss of a machine, and that others do its work."""
+        """Expect that the loss of a machine is noticed, and that others do its work."""
         held = lab.held(name)
         ran = [seq for seq, state in held.items() if state == "running"]
         say(
@@ -216,7 +216,8 @@ PROVIDER = """
 from ray.autoscaler._private.fake_multi_node.node_provider import FakeMultiNodeProvider
 
 class Provider(FakeMultiNodeProvider):
-    # Ray takes no `memory` among the resources of a node that it starts, and finds out how much there is.
+    # Ray takes no `memory` among the resources of a node that it starts: it finds out how much
+    # the node has.
     def _create_node_with_resources_and_labels(self, node_config, tags, count, resources, labels):
         resources = {name: value for name, value in resources.items() if name != "memory"}
         super()._create_node_with_resources_and_labels(node_config, tags, count, resources, labels)
@@ -290,7 +291,10 @@ def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         config = tmp_path / "autoscaling.yaml"
         config.write_text(AUTOSCALING.format(address=address, head=head))
-        ray = f"ray start --head --node-ip-address={machine.address} --port=6379 --num-cpus=0 --include-dashboard=false"
+        ray = (
+            f"ray start --head --node-ip-address={machine.address} --port=6379 --num-cpus=0 "
+            "--include-dashboard=false"
+        )
         ray += (
             f" --object-store-memory=134217728 --disable-usage-stats --autoscaling-config={config}"
         )
@@ -319,7 +323,8 @@ def test_an_autoscaler_adds_nodes_for_a_job_and_removes_them(
         with capsys.disabled():
             down, load = time.monotonic() - begin, os.getloadavg()[0]
             print(
-                f"    0 -> 2 nodes after {up:.1f} s, 2 -> 0 {down:.1f} s after the job, load {load:.1f}",
+                f"    0 -> 2 nodes after {up:.1f} s, 2 -> 0 {down:.1f} s after the job, load "
+                f"{load:.1f}",
                 flush=True,
             )
     assert states == ["succeeded"]

@@ -162,7 +162,10 @@ def test_wheels_install_into_a_bare_environment(wheels: Path, tmp_path: Path) ->
         [str(programs / "stickslip"), "--version"], capture_output=True, text=True, env=bare
     )
     assert version.stdout.strip() == f"stickslip {VERSION}"
-    code = "import stickslip_sim_core; from stickslip_sim_core import _sim_core; print(_sim_core.__file__)"
+    code = (
+        "import stickslip_sim_core; from stickslip_sim_core import _sim_core; "
+        "print(_sim_core.__file__)"
+    )
     python = [str(programs / "python"), "-c", code]
     done = subprocess.run(python, capture_output=True, text=True, env=bare, cwd=tmp_path)
     assert done.stdout.startswith(str(place)), done.stdout + done.stderr

@@ -85,7 +85,8 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     missing = [name for name, path in programs.items() if path is None]
     if missing:
         pytest.skip(
-            f"{', '.join(missing)} not installed: apt-get install slurmctld slurmd slurm-client munge"
+            f"{', '.join(missing)} not installed: apt-get install slurmctld slurmd slurm-client "
+            "munge"
         )
     shared = tmp_path / "shared"
     shared.mkdir()

@@ -1,5 +1,6 @@
-"""Sensitivity of the cloth solver to its constants: small scenes that run with each of them halved
-and doubled.
+"""Sensitivity of the cloth solver to its constants.
+
+Small scenes run with each constant halved and doubled.
 
 `python -m stickslip_testing.constants OUT.json` runs them all and writes what changes (4 CPU
 minutes).
@@ -83,9 +84,7 @@ class Change:
 
 
 def scaled(name: str, factor: float) -> float:
-    """Return a constant times a factor, within `LARGEST`, and rounded to an integer >= 1 where it
-    is a count.
-    """
+    """Return a constant times a factor, within `LARGEST`; counts are integers >= 1."""
     value = min(_sim_core.cloth_constants()[name] * factor, LARGEST.get(name, np.inf))
     return float(max(1, round(value))) if name in COUNTS else value
 
@@ -170,8 +169,9 @@ def valley(preset: SolverSettings) -> Cloth:
 
 
 def strip(preset: SolverSettings) -> Cloth:
-    """A wavy strip is pushed and pulled over a floor by its end, by steps of the controller's
-    choice.
+    """A wavy strip is pushed and pulled over a floor by its end.
+
+    The controller chooses the steps.
     """
     mesh = meshes.grid(0.02, 0.12, 3, 16)
     held = np.flatnonzero(mesh.rest[:, 1] > 0.06 - 1e-9)

@@ -1,5 +1,6 @@
-"""Strips that are drawn over cylinders of triangles and of cloth, where the capstan has a round
-one.
+"""Strips that are drawn over cylinders of triangles and of cloth.
+
+The capstan protocol has a round cylinder.
 """
 
 from typing import ClassVar
@@ -55,8 +56,9 @@ class OverCloth(OverTriangles):
 
 
 def tube(facets: int, breadth: float, mu: float) -> Surface:
-    """Return a cylinder of triangles along y, wider than such a strip, the middle of which touches
-    at the radius.
+    """Return a cylinder of triangles along y, wider than such a strip.
+
+    The middles of its edges touch at the radius.
     """
     angle = 2.0 * np.pi * np.arange(facets) / facets
     ring = (capstan.RADIUS - THICKNESS) * np.column_stack(
@@ -75,9 +77,7 @@ def tube(facets: int, breadth: float, mu: float) -> Surface:
 
 
 def cover(facets: int, breadth: float) -> tuple[meshes.Mesh, Floats]:
-    """Return a sheet around the arc that the strip lies on and 30 degrees more, and its vertices
-    (V, 3) [m].
-    """
+    """Return a sheet around the strip's arc and 30 degrees more, and its vertices (V, 3) [m]."""
     angle = 2.0 * np.pi / facets
     cells = int(np.ceil((capstan.WRAP + np.pi / 6.0) / angle))
     radius = capstan.RADIUS - THICKNESS

@@ -1,9 +1,11 @@
-"""Everyday scenes of cloth with a known answer or bound: each is right, refused, or not valid for
-the true reason.
+"""Everyday scenes of cloth with a known answer or bound.
+
+Each is right, refused, or not valid for the true reason.
 """
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,27 +25,36 @@ ALONG_Y = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 Bodies = Callable[[float], list[Body]]
 
 
+class Hands(NamedTuple):
+    """Vertices that are held, and their positions at a time, from those at the start."""
+
+    held: ArrayLike
+    path: Callable[[Floats, float], Floats] = lambda start, _: start
+
+
+NO_HANDS = Hands(())
+
+
 def _run(
     cells: int,
     bodies: Bodies,
     *,
     height: float = 1e-3,
     seconds: float = 0.2,
-    held: ArrayLike = (),
-    path: Callable[[Floats, float], Floats] = lambda start, _: start,
+    hands: Hands = NO_HANDS,
     fps: float = 50.0,
     damping: float = 0.0,
     turn: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
 ) -> tuple[str, Cloth]:
     mesh = meshes.grid(SIDE, SIDE, cells, cells)
-    hands = np.asarray(held, int)
-    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=hands)
+    held = np.asarray(hands.held, int)
+    cloth = Cloth(mesh, fabric("gray-interlock"), preset_named("certified"), held=held)
     start = np.column_stack([mesh.rest, np.full(len(mesh.rest), height)]) @ np.asarray(turn).T
     cloth.set_state(start, bodies=bodies(0.0))
     for frame in range(1, round(seconds * fps) + 1):
         cloth.advance(
             frame / fps,
-            lambda t: (cloth.gravity, path(start[hands], t), bodies(t)),
+            lambda t: (cloth.gravity, hands.path(start[held], t), bodies(t)),
             damping=lambda _: damping,
         )
     return checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))[0], cloth
@@ -106,8 +117,9 @@ def table_corner(cells: int) -> str:
 
 
 def _thrown(cells: int, speed: float) -> str:
-    """A ball of two cells that goes 0.2 m, from 5 cm below, does not go through a held napkin
-    unseen.
+    """A ball of two cells, thrown by 0.2 m, does not pass through a held napkin unseen.
+
+    It starts 5 cm below the napkin.
     """
     radius = 2.0 * SIDE / cells
 
@@ -115,7 +127,7 @@ def _thrown(cells: int, speed: float) -> str:
         return [sphere(0.5, radius, origin=[0.0, 0.0, -radius - 0.05 + speed * t])]
 
     rim = _rim(cells).astype(int)
-    code, cloth = _run(cells, bodies, seconds=0.2 / speed, held=rim, fps=50.0 * speed)
+    code, cloth = _run(cells, bodies, seconds=0.2 / speed, hands=Hands(rim), fps=50.0 * speed)
     middle = cloth.positions[len(cloth.positions) // 2, 2]
     return code or (
         "right"
@@ -135,8 +147,9 @@ def pushed_ball(cells: int) -> str:
 
 
 def paddle(cells: int) -> str:
-    """A floor that turns by 20 rad/s for 0.05 s throws no vertex faster than twice its own fastest
-    point there.
+    """A floor that turns by 20 rad/s for 0.05 s throws no vertex too fast.
+
+    The limit is twice the largest speed of the floor.
     """
 
     def bodies(t: float) -> list[Body]:
@@ -155,14 +168,13 @@ def holders_into_floor(cells: int) -> str:
         cells,
         lambda _: [plane(0.5)],
         height=0.01,
-        held=[0, cells],
-        path=lambda start, t: start - np.array([0.0, 0.0, 0.3 * t]),
+        hands=Hands([0, cells], lambda start, t: start - np.array([0.0, 0.0, 0.3 * t])),
     )[0]
 
 
 def hanging(cells: int) -> str:
     """Two held corners bear the weight within 5 %."""
-    code, cloth = _run(cells, lambda _: [], held=[0, cells], seconds=1.0, damping=10.0)
+    code, cloth = _run(cells, lambda _: [], hands=Hands([0, cells]), seconds=1.0, damping=10.0)
     share = cloth.reactions[cloth.held, 2].sum() / (cloth.masses.sum() * GRAVITY)
     return code or (
         "right" if abs(share - 1.0) < 0.05 else f"wrong: holders bear {share:.3g} of the weight"
@@ -207,8 +219,9 @@ def sticks(cells: int) -> str:
 
 
 def slides_into_corner(cells: int) -> str:
-    """A corner of a floor and two walls, turned until all three bear, carries the corner of a
-    napkin within 5 %.
+    """A corner of a floor and two walls carries the corner of a napkin within 5 %.
+
+    It is turned until all three bear.
     """
     along, up = np.array([1.0, -1.0, 0.0]) / 2.0, np.array([-1.0, -1.0, 1.0]) / 6.0**0.5
     axes = np.column_stack([up - along, up + along, np.array([1.0, 1.0, 2.0]) / 6.0**0.5])
@@ -232,7 +245,8 @@ def slides_into_corner(cells: int) -> str:
 def stretched_rim(cells: int) -> str:
     """A rim that grows by 40 %."""
     rim = _rim(cells).astype(int)
-    return _run(cells, lambda _: [], held=rim, path=lambda start, t: start * (1.0 + 2.0 * t))[0]
+    hands = Hands(rim, lambda start, t: start * (1.0 + 2.0 * t))
+    return _run(cells, lambda _: [], hands=hands)[0]
 
 
 def start_in_floor(cells: int) -> str:
@@ -263,8 +277,9 @@ def shaken_floor(cells: int) -> str:
 
 
 def shaken_from_rest(cells: int) -> str:
-    """A floor that begins to shake after 0.5 s, in periods of the longest step, takes the cloth
-    along within 5 %.
+    """A floor that begins to shake after 0.5 s takes the cloth along within 5 %.
+
+    Its period is the longest step.
     """
 
     def bodies(t: float) -> list[Body]:
@@ -286,9 +301,8 @@ def jumping_floor(cells: int) -> str:
 
 def jumping_holder(cells: int) -> str:
     """A holder that is 1 cm further from one instant to the next."""
-    return _run(
-        cells, lambda _: [], held=[0, cells], path=lambda start, t: start + 0.01 * (t > 0.15)
-    )[0]
+    hands = Hands([0, cells], lambda start, t: start + 0.01 * (t > 0.15))
+    return _run(cells, lambda _: [], hands=hands)[0]
 
 
 def squeezed(cells: int) -> str:

@@ -44,8 +44,9 @@ def write_film(
     shake: Floats,
     quality: int = 20,
 ) -> None:
-    """Write pictures (height, width, 3), 0 to 255, of a pinhole camera as an H.264 film through a
-    lens.
+    """Write pictures (height, width, 3), 0 to 255, as an H.264 film through a lens.
+
+    They are those of a pinhole camera.
 
     Each is moved by its row of `shake` (F, 2) [px]. `quality` is x264's constant rate factor:
     larger is worse.

@@ -138,7 +138,8 @@ def _counter_faults(connection: Connection) -> list[str]:
     ):
         if by_job[job][stage, state] != count:
             faults.append(
-                f"job {job} counts {count} {stage} {state}, and there are {by_job[job][stage, state]}"
+                f"job {job} counts {count} {stage} {state}, and there are "
+                f"{by_job[job][stage, state]}"
             )
     grouped = connection.execute(
         select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, func.count())

@@ -42,7 +42,8 @@ while True:
 
 
 NURSERY = """
-# Lines of JSON on standard input, each the start of a process: code, arguments, log, environment. Prints its number.
+# Each line of JSON on standard input starts a process: code, arguments, log, environment.
+# Prints its number.
 import importlib, json, os, random, signal, sys
 import stickslip_services.app, stickslip_testing.servers, stickslip_testing.worker, zarr
 
@@ -72,8 +73,9 @@ for line in sys.stdin:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Return the process that starts others: it has imported what they need, which takes 2 s of CPU
-    time each time.
+    """Return the process that starts others.
+
+    It has imported what they need, which takes 2 s of CPU time each time.
     """
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", NURSERY], text=True, **pipes)  # type: ignore[call-overload,no-any-return]

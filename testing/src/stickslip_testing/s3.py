@@ -1,6 +1,4 @@
-"""A real S3 server in a process of its own, and a proxy in front of it that does what networks and
-clouds do.
-"""
+"""A real S3 server in a process, and a proxy with the faults of networks and clouds."""
 
 import http.client
 import os
@@ -53,78 +51,83 @@ class Proxy:
         self.fault = fault
 
 
+class _Handler(BaseHTTPRequestHandler):
+    """Passes requests on, with the faults of its proxy."""
+
+    proxy: Proxy
+    protocol_version = "HTTP/1.1"
+
+    def do(self) -> None:
+        self.proxy.counts[self.command] += 1
+        fault = self.proxy.fault(self.command, self.path)
+        self.proxy.counts[fault] += 1
+        size = int(self.headers.get("Content-Length", 0))
+        if (
+            fault == "torn upload"
+        ):  # part of the body arrives, then the line is cut, to the server too
+            self._pass_on(self.rfile.read(size // 2), size)
+            return self._hang_up()
+        body = self.rfile.read(size)
+        if fault == "late":
+            time.sleep(0.3)
+        if fault in ("503", "409", "500", "501"):
+            return self._answer(
+                int(fault),
+                {"Content-Type": "application/xml"},
+                f"<Error>{fault}</Error>".encode(),
+            )
+        # S3 looks and writes at once; moto does one after the other, and lets two writers of
+        # one object win.
+        conditional = self.command == "PUT" and "If-None-Match" in self.headers
+        with self.proxy.one_by_one if conditional else nullcontext():
+            status, headers, answer = self._ask(body)
+        if fault == "lost answer":  # done, but nobody hears of it
+            return self._hang_up()
+        if fault == "torn download":
+            self._answer(status, headers, answer, stop=len(answer) // 2)
+            return self._hang_up()
+        return self._answer(status, headers, answer)
+
+    do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = do  # noqa: N815
+
+    def _ask(self, body: bytes) -> tuple[int, dict[str, str], bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.proxy.server, timeout=60)
+        connection.request(self.command, self.path, body, dict(self.headers.items()))
+        response = connection.getresponse()
+        answer = response.read()
+        connection.close()
+        return response.status, dict(response.getheaders()), answer
+
+    def _pass_on(self, part: bytes, size: int) -> None:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", self.proxy.server)) as line:
+            head = "".join(f"{name}: {value}\r\n" for name, value in self.headers.items())
+            line.sendall(f"{self.command} {self.path} HTTP/1.1\r\n{head}\r\n".encode() + part)
+
+    def _answer(
+        self, status: int, headers: dict[str, str], body: bytes, *, stop: int | None = None
+    ) -> None:
+        self.send_response_only(status)
+        for name, value in headers.items():
+            if name.lower() not in ("connection", "transfer-encoding", "content-length"):
+                self.send_header(name, value)
+        length = headers.get("Content-Length") if self.command == "HEAD" else None
+        self.send_header("Content-Length", length or str(len(body)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body[:stop])
+
+    def _hang_up(self) -> None:
+        self.close_connection = True
+        with suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
 def _handler(proxy: Proxy) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def do(self) -> None:
-            proxy.counts[self.command] += 1
-            fault = proxy.fault(self.command, self.path)
-            proxy.counts[fault] += 1
-            size = int(self.headers.get("Content-Length", 0))
-            if (
-                fault == "torn upload"
-            ):  # part of the body arrives, then the line is cut, to the server too
-                self._pass_on(self.rfile.read(size // 2), size)
-                return self._hang_up()
-            body = self.rfile.read(size)
-            if fault == "late":
-                time.sleep(0.3)
-            if fault in ("503", "409", "500", "501"):
-                return self._answer(
-                    int(fault),
-                    {"Content-Type": "application/xml"},
-                    f"<Error>{fault}</Error>".encode(),
-                )
-            # S3 looks and writes at once; moto does one after the other, and lets two writers of
-            # one object win.
-            conditional = self.command == "PUT" and "If-None-Match" in self.headers
-            with proxy.one_by_one if conditional else nullcontext():
-                status, headers, answer = self._ask(body)
-            if fault == "lost answer":  # done, but nobody hears of it
-                return self._hang_up()
-            if fault == "torn download":
-                self._answer(status, headers, answer, stop=len(answer) // 2)
-                return self._hang_up()
-            return self._answer(status, headers, answer)
-
-        do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = do  # noqa: N815
-
-        def _ask(self, body: bytes) -> tuple[int, dict[str, str], bytes]:
-            connection = http.client.HTTPConnection("127.0.0.1", proxy.server, timeout=60)
-            connection.request(self.command, self.path, body, dict(self.headers.items()))
-            response = connection.getresponse()
-            answer = response.read()
-            connection.close()
-            return response.status, dict(response.getheaders()), answer
-
-        def _pass_on(self, part: bytes, size: int) -> None:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", proxy.server)) as line:
-                head = "".join(f"{name}: {value}\r\n" for name, value in self.headers.items())
-                line.sendall(f"{self.command} {self.path} HTTP/1.1\r\n{head}\r\n".encode() + part)
-
-        def _answer(
-            self, status: int, headers: dict[str, str], body: bytes, *, stop: int | None = None
-        ) -> None:
-            self.send_response_only(status)
-            for name, value in headers.items():
-                if name.lower() not in ("connection", "transfer-encoding", "content-length"):
-                    self.send_header(name, value)
-            length = headers.get("Content-Length") if self.command == "HEAD" else None
-            self.send_header("Content-Length", length or str(len(body)))
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(body[:stop])
-
-        def _hang_up(self) -> None:
-            self.close_connection = True
-            with suppress(OSError):
-                self.connection.shutdown(socket.SHUT_RDWR)
-
-        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-            pass
-
-    return Handler
+    """Return a handler of the requests of a proxy."""
+    return type("Handler", (_Handler,), {"proxy": proxy})
 
 
 class _Server(socketserver.ThreadingTCPServer):

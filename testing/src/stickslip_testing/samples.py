@@ -1,5 +1,6 @@
-"""Samples of a spec by way of its models: slow, plain, and what `stickslip_schemas.plan.points`
-must agree with.
+"""Samples of a spec by its models: slow and plain.
+
+`stickslip_schemas.plan.points` must agree with them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -55,7 +56,7 @@ def simulation_key(simulation: Simulation, builds: Builds) -> str:
 
 
 def render_key(render: Render, of_simulation: str, builds: Builds) -> str:
-    """Return the content key of a render: its trajectory, its appearance and the renderer's build."""
+    """Return the content key of a render: trajectory, appearance and the renderer's build."""
     return content_key(
         "render",
         {
@@ -67,8 +68,9 @@ def render_key(render: Render, of_simulation: str, builds: Builds) -> str:
 
 
 def split_of(spec: JobSpec, point: Mapping[str, Any]) -> int:
-    """Return the number of the split of a sample: a hash of its physics, so that no build or order
-    moves it.
+    """Return the number of the split of a sample: a hash of its physics.
+
+    No build or order moves a sample to another split.
 
     With `by: clip` it is a hash of all its axes.
     """

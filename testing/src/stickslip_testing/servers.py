@@ -124,8 +124,9 @@ def serving(app: FastAPI) -> Iterator[str]:
 
 @contextmanager
 def served(data: Path) -> Iterator[RunningServer]:
-    """Serve a coordinator with the data directory `data` from a thread of this process, which
-    starts in 0.2 s.
+    """Serve a coordinator with the data directory `data` from a thread of this process.
+
+    It starts in 0.2 s.
     """
     with serving(make_app(Settings(data=data, durable=False))) as url:
         yield RunningServer(url, data)

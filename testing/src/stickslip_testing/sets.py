@@ -1,6 +1,4 @@
-"""New test sets: the maintainers' tool `benchmarks/training/freeze_set.py`, and tests with sets of
-their own.
-"""
+"""New test sets, for `benchmarks/training/freeze_set.py` and for tests."""
 
 import json
 from io import BytesIO
@@ -14,8 +12,9 @@ from stickslip_training.data.reader import DatasetReader, Split
 def frozen(
     name: str, about: str, spec: dict[str, Any], split: Split | None, reader: DatasetReader
 ) -> tuple[bytes, bytes]:
-    """Return the files NAME.json and NAME.npz of a new set, whose published version the reader has
-    open.
+    """Return the files NAME.json and NAME.npz of a new set.
+
+    The reader has its published version open.
     """
     task = TASKS[reader.kind]
     slots = reader.slots(split)

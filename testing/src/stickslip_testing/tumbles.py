@@ -1,5 +1,6 @@
-"""Cloth that falls, is crumpled, folds and piles up, by seed: small scenes that are hard on contact
-with itself.
+"""Cloth that falls, is crumpled, folds and piles up, by seed.
+
+These small scenes are hard on contact with itself.
 
 `watch` runs one, and after every step looks for crossings by comparing all edges with all
 triangles.
@@ -120,8 +121,9 @@ def balance(cloth: Cloth) -> Balance:
 def crossings(
     positions: Floats, triangles: NDArray[np.int32], others: Floats, cut: NDArray[np.int32]
 ) -> int:
-    """Count the edges of `triangles` that cross a triangle of `cut`: each with each, except where
-    they share a vertex.
+    """Count the edges of `triangles` that cross a triangle of `cut`.
+
+    Edges and triangles that share a vertex do not count.
 
     The ends p and q of the edge lie on both sides of the triangle's plane, by more than `FLAT`, and
     the volumes of p, q and each side of the triangle have one sign.
@@ -184,8 +186,9 @@ def drop(seed: int, preset: SolverSettings) -> Tumble:
 
 
 def crumple(seed: int, preset: SolverSettings) -> Tumble:
-    """Four walls, which are surfaces, push a wavy sheet on a floor together, to a quarter of its
-    area.
+    """Four walls push a wavy sheet on a floor together, to a quarter of its area.
+
+    The walls are surfaces.
     """
     rng = np.random.default_rng(seed)
     mesh = (
@@ -238,8 +241,9 @@ def wall(turn: int, mu: float) -> Surface:
 
 
 def folding(seed: int, preset: SolverSettings) -> Tumble:
-    """A strip is let down onto a floor, by its upper edge, faster than it can slide away, and folds
-    to and fro.
+    """A strip is let down onto a floor by its upper edge, and folds to and fro.
+
+    It comes down faster than it can slide away.
     """
     rng = np.random.default_rng(seed)
     cells = int(rng.integers(16, 25))

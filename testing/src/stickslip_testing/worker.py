@@ -1,5 +1,6 @@
-"""A worker that runs no simulation: it finishes tasks at once with invented data, which it stores
-as a real one.
+"""A worker that runs no simulation.
+
+It finishes tasks at once with invented data, which it stores as a real worker does.
 """
 
 import warnings
@@ -339,8 +340,9 @@ class PretendWorker:
 
 
 def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> bytes:
-    """Return the file of an array: an axis of the grid, recorded, or of values that grow from
-    sample to sample.
+    """Return the file of an array.
+
+    Its values are an axis of the grid, recorded, or growing from sample to sample.
     """
     size = task.spec.samples_per_shard
     ramp, of_axis = (
