@@ -19,9 +19,10 @@ HEAD = """# Every key of a spec
 
 <!-- Written by tools/spec_reference.py from the models that check specs; do not edit. -->
 
-A spec is a YAML or JSON document with a `kind` and the axes of a parameter grid. This page lists every key with its
-range, unit and cost. `stickslip validate FILE` checks a spec and counts its samples, also without a service. CPU times
-are of one core of a shared virtual AMD EPYC ([measurements](measurements.md)).
+A spec is a YAML or JSON document with a `kind` and the axes of a parameter grid. This page lists
+every key with its range, unit and cost. `stickslip validate FILE` checks a spec and counts its
+samples, also without a service. CPU times are of one core of a shared virtual AMD EPYC
+([measurements](measurements.md)).
 
 ## Axes
 
@@ -31,9 +32,11 @@ An axis, under `axes`, has one of these forms:
 |---|---|---|
 | one value | `0.5` | that value |
 | list | `[0.1, 0.2]` | these values, without repetition |
-| linspace | `{type: linspace, start: 0, stop: 1, num: 5}` | `num` equal steps from `start` to `stop`, both included |
-| random | `{type: random, low: 0, high: 1, num: 5, seed: 0}` | `num` independent uniform values in [low, high) |
-| sobol | `{type: sobol, low: 0, high: 1, num: 5, seed: 0}` | `num` values of a scrambled Sobol sequence |
+| linspace | `{type: linspace, start: 0, stop: 1, num: 5}` | `num` even steps, both ends included |
+| random | `{type: random, low: 0, high: 1, num: 5}` | `num` independent values in [low, high) |
+| sobol | `{type: sobol, low: 0, high: 1, num: 5}` | `num` values of a scrambled Sobol sequence |
+
+A random or Sobol axis may have a `seed`, 0 by default.
 
 An axis of names, such as `material`, takes one name or a list. A job has at most 1,000,000 samples.
 """

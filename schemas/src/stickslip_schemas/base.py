@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -264,6 +264,30 @@ _OF_JOBS = {
     Reason.waiting_for_worker,
     Reason.preset_not_certified,
 }
+
+
+def location_as_written(
+    location: Sequence[int | str], document: Any, *, keep_last: bool = False
+) -> tuple[int | str, ...]:
+    """Return a location of pydantic without parts that the document does not have.
+
+    pydantic adds parts itself, such as tags of unions and positions in a list that was written
+    as one value. `keep_last` keeps the last part if it is a field or an item that the document
+    lacks.
+    """
+    written: list[int | str] = []
+    value = document
+    for depth, part in enumerate(location):
+        is_last = depth == len(location) - 1
+        if isinstance(value, Mapping) and part in value:
+            value = value[part]
+        elif isinstance(value, list | tuple) and isinstance(part, int) and part < len(value):
+            value = value[part]
+        # A scalar has no parts, so nothing of it can be missing.
+        elif not (is_last and keep_last and isinstance(value, Mapping | list | tuple)):
+            continue
+        written.append(part)
+    return tuple(written)
 
 
 _NUMBER_RULES = (

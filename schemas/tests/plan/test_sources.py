@@ -7,7 +7,9 @@ import pytest
 from stickslip_schemas.plan.builds import digests, sources
 
 PACKAGE = {
-    "__init__.py": "from stickslip_made.deep.tool import saw\nfrom stickslip_made.other import file\n",
+    "__init__.py": (
+        "from stickslip_made.deep.tool import saw\nfrom stickslip_made.other import file\n"
+    ),
     "work.py": """
 from typing import TYPE_CHECKING
 from stickslip_made import saw

@@ -121,7 +121,7 @@ WRONG: list[tuple[Any, ...]] = [
     (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
     (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 6.2832 [rad]"),
     (f"{UPPER}.thickness", 0.0, "", "greater than or equal to 0.00001 [m]"),
-    (f"{UPPER}.self_contact", False, "", "must be true where there are several sheets"),
+    (f"{UPPER}.self_contact", False, "", "must be true if there are several sheets"),
     (
         f"{UPPER}.factors",
         {"density": 0.01},

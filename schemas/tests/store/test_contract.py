@@ -329,9 +329,22 @@ def test_stores_are_opened_by_path_and_by_url(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["ftp://host/store", "file://host/store", "http://host/store", "", "s3:", "s3:/bucket", "s3:///store", "S3://bucket",
-     "s3://user@bucket", "s3://bucket?region=x", "s3://[", "file:store", "name:of a directory"],
-)  # fmt: skip
+    [
+        "ftp://host/store",
+        "file://host/store",
+        "http://host/store",
+        "",
+        "s3:",
+        "s3:/bucket",
+        "s3:///store",
+        "S3://bucket",
+        "s3://user@bucket",
+        "s3://bucket?region=x",
+        "s3://[",
+        "file:store",
+        "name:of a directory",
+    ],
+)
 def test_other_urls_are_refused(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(

@@ -81,8 +81,9 @@ def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndar
     Raise CorruptChunkError.
     """
     frame = _without_crc(chunk, "chunk")
-    if out is not None and (size := _content_size(frame)) != out.nbytes:
-        # The decoder would fill a part of `out` and leave the rest as it was, without a word.
+    size = _content_size(frame)
+    # The decoder would fill a part of `out` and leave the rest as it was, without a word.
+    if out is not None and size != out.nbytes:
         raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
     return Zstd().decode(frame, out)  # type: ignore[no-any-return]  # untyped library
 
@@ -101,6 +102,7 @@ def decode_clip(chunk: bytes, out: np.ndarray) -> None:
 
 
 def encode_sample(array: ArrayLayout, values: np.ndarray) -> bytes:
+    """Return the encoded chunk of one sample of an array."""
     settings = packing(array)
     return encode_chunk(values) if settings is None else _packed(_turned(array, values), settings)
 
@@ -172,7 +174,7 @@ def encode_shard(chunks: Sequence[bytes | None]) -> bytes:
     offset = 0
     for position, chunk in enumerate(chunks):
         if chunk is not None:
-            index[position] = offset, len(chunk)
+            index[position] = (offset, len(chunk))
             offset += len(chunk)
     return b"".join(chunk for chunk in chunks if chunk is not None) + _with_crc(index.tobytes())
 
@@ -190,6 +192,7 @@ def decode_shard_index(data: bytes, chunk_count: int) -> np.ndarray:
 
 def _packed(data: np.ndarray, packing: Packing) -> bytes:
     ordered = np.ascontiguousarray(data).astype(data.dtype.newbyteorder("<"), copy=False)
+    # blosc copies memory as it is, so it must have the order of the chunk first.
     shuffle = {"noshuffle": blosc.NOSHUFFLE, "shuffle": blosc.SHUFFLE}[packing.shuffle]
     return _with_crc(bytes(blosc.Blosc(packing.cname, packing.clevel, shuffle).encode(ordered)))
 
@@ -200,9 +203,11 @@ def _unpack(chunk: bytes, out: np.ndarray) -> None:
     size = int.from_bytes(frame[4:8], "little")  # of blosc's header
     if len(frame) < 16 or size != out.nbytes:
         raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
+    # In the order of the chunk, nothing has to be copied.
     if out.flags.c_contiguous:
         blosc.decompress(frame, out)
         return
+    # Otherwise decode into a buffer of this thread, and copy into the order of `out`.
     ordered = getattr(_scratch, "ordered", None)
     if ordered is None or ordered.shape != out.shape or ordered.dtype != out.dtype:
         ordered = _scratch.ordered = np.empty(out.shape, dtype=out.dtype)
@@ -214,10 +219,11 @@ def _with_crc(data: bytes) -> bytes:
     return data + int(google_crc32c.value(data)).to_bytes(_CRC_BYTES, "little")
 
 
-def _without_crc(data: bytes, what: str) -> memoryview:
+def _without_crc(data: bytes, part: str) -> memoryview:
     """Return the bytes before the checksum, without a copy of them."""
+    # The checksum of data and its own checksum is a constant: one pass, and no copy.
     if len(data) < _CRC_BYTES or google_crc32c.value(data) != _RESIDUE:
-        raise CorruptChunkError(f"the crc32c of the {what} does not hold")
+        raise CorruptChunkError(f"the crc32c of the {part} does not hold")
     return memoryview(data)[:-_CRC_BYTES]
 
 
@@ -225,10 +231,12 @@ def _content_size(frame: memoryview) -> int | None:
     """Return the decoded size that a zstd frame states, or None [RFC 8878, 3.1.1.1]."""
     if len(frame) < 6 or bytes(frame[:4]) != b"\x28\xb5\x2f\xfd":
         return None
+    # Byte 4 says how many bytes the window, the dictionary and the size of the content have.
     descriptor = frame[4]
     single_segment = descriptor >> 5 & 1
     width = (single_segment, 2, 4, 8)[descriptor >> 6]
     start = 5 + (1 - single_segment) + (0, 1, 2, 4)[descriptor & 3]
     if width == 0 or len(frame) < start + width:
         return None
+    # A size of two bytes is stored less 256, for one byte holds all smaller ones.
     return int.from_bytes(frame[start : start + width], "little") + (256 if width == 2 else 0)

@@ -53,14 +53,17 @@ SECTION_SAMPLES = 10_000
 
 
 def section_samples(spec: JobSpec) -> int:
+    """Return the number of samples of each section but the last."""
     return max(1, SECTION_SAMPLES // spec.samples_per_shard) * spec.samples_per_shard
 
 
 def has_sections(spec: JobSpec) -> bool:
+    """Return whether a version of a spec has sections."""
     return spec.sample_count > SECTION_SAMPLES
 
 
 def section_path(number: int) -> str:
+    """Return the path of a section inside of the version."""
     return f"manifest/{number}.json"
 
 
@@ -195,11 +198,11 @@ class Manifest(Document):
             section_path(number)
             for number in range(-(-self.sample_count // section_samples(self.spec)))
         ]
-        found = [section.path for section in self.sections]
-        if found != expected:
+        paths = [section.path for section in self.sections]
+        if paths != expected:
             raise ValueError(
                 f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got "
-                f"{found[:5]}"
+                f"{paths[:5]}"
             )
         if self.sample_keys or self.rejections:
             raise ValueError(
@@ -231,7 +234,7 @@ class Contents:
         self._samples = (
             section_samples(manifest.spec) if manifest.sections else manifest.sample_count
         )
-        # Caches that threads may share.
+        # `lru_cache` is safe for threads. At most two sections are in memory, each of some MB.
         self.section = lru_cache(self.KEPT)(self._section)
         self._files_of = lru_cache(1)(
             lambda number: {file.path: file for file in self.section(number).files}
@@ -260,10 +263,11 @@ class Contents:
 
         At most one section is read.
         """
-        found = self._own_files.get(path)
+        entry = self._listed_files.get(path)
         shard = _SHARD.match(path)
-        if found is not None or shard is None or not self.manifest.sections:
-            return found
+        if entry is not None or shard is None or not self.manifest.sections:
+            return entry
+        # The number of the shard is in its path, and tells the section that lists it.
         slot = int(shard[1]) * self.manifest.spec.samples_per_shard
         return (
             self._files_of(self.number_of(slot)).get(path)
@@ -272,7 +276,7 @@ class Contents:
         )
 
     @cached_property
-    def _own_files(self) -> dict[str, FileEntry]:
+    def _listed_files(self) -> dict[str, FileEntry]:
         return {file.path: file for file in [*self.manifest.files, *self.manifest.sections]}
 
     def rejections(self) -> Iterator[Rejection]:
@@ -295,9 +299,10 @@ class Contents:
             )
         entry = manifest.sections[number]
         data = self._read(entry)
-        if (found := sha256(data)) != entry.sha256:
+        digest = sha256(data)
+        if digest != entry.sha256:
             raise BrokenSectionError(
-                f"{entry.path} has SHA-256 {found}, and {MANIFEST_NAME} says {entry.sha256}"
+                f"{entry.path} has SHA-256 {digest}, and {MANIFEST_NAME} says {entry.sha256}"
             )
         try:
             section = ManifestSection.model_validate_json(data)
@@ -305,10 +310,12 @@ class Contents:
             raise BrokenSectionError(
                 f"{entry.path} is no section of a manifest: {error}"
             ) from error
-        slots = number * self._samples, min((number + 1) * self._samples, manifest.sample_count)
-        if (section.first, section.end) != slots:
+        # A section of another version may be whole, too: it must be of these samples.
+        first = number * self._samples
+        end = min(first + self._samples, manifest.sample_count)
+        if (section.first, section.end) != (first, end):
             raise BrokenSectionError(
-                f"{entry.path} must list the samples {slots[0]} to {slots[1] - 1}, and lists "
+                f"{entry.path} must list the samples {first} to {end - 1}, and lists "
                 f"{section.first} to "
                 f"{section.end - 1}"
             )
@@ -333,19 +340,22 @@ def with_manifest_digest(group: bytes, manifest: Sha256) -> bytes:
 def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
     """Return the digest of the manifest.
 
-    Raise BrokenSealError where one of the three files is not as it was made.
+    Raises BrokenSealError if one of the three files has changed.
     """
     digests = {MANIFEST_NAME: sha256(manifest), GROUP_NAME: sha256(group)}
-    stated = _stated(seal)
-    for name, found in digests.items():
-        if stated.get(name) != found:
+    # The seal names both files.
+    stated = _seal_digests(seal)
+    for name, digest in digests.items():
+        if stated.get(name) != digest:
             raise BrokenSealError(
-                f"{name} has SHA-256 {found}, and {SEAL_NAME} says {stated.get(name)}"
+                f"{name} has SHA-256 {digest}, and {SEAL_NAME} says {stated.get(name)}"
             )
+    # The seal itself has no other bytes: a changed line break shows.
     if seal != seal_text(*digests.values()):
         raise BrokenSealError(
             f"{SEAL_NAME} must have one line each for {', '.join(digests)}, and no other line"
         )
+    # The root's metadata names the manifest, so that a Zarr reader can find it.
     try:
         named = json.loads(group)["attributes"][MANIFEST_ATTRIBUTE]
     except (ValueError, KeyError, TypeError) as error:
@@ -361,7 +371,7 @@ def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
     return digests[MANIFEST_NAME]
 
 
-def _stated(seal: bytes) -> dict[str, str]:
+def _seal_digests(seal: bytes) -> dict[str, str]:
     try:
         lines = [line.split("  ") for line in seal.decode("ascii").splitlines()]
         return {name: digest for digest, name in lines}

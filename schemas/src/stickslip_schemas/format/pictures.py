@@ -38,7 +38,7 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
 
     Raise UnfitPictureError.
 
-    Sizes are looked at before anything is decoded, so that a small file cannot ask for much memory.
+    Sizes are checked before anything is decoded, so that a small file cannot ask for much memory.
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
 
@@ -48,6 +48,7 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
         )
     low, high = SIDES
     try:
+        # The header alone is read here. Our own limit of the size follows.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             picture = Image.open(io.BytesIO(data), formats=FORMATS)
@@ -63,15 +64,15 @@ def read_picture(data: bytes) -> npt.NDArray[np.uint8]:
                 f"mode is {picture.mode}"
                 + (", animated" if getattr(picture, "is_animated", False) else "")
             )
-        if (
-            picture.format == "PNG" and data[24] > 8
-        ):  # Pillow would cut the lower bits of RGB off without a word
+        # Byte 24 of a PNG file has the bits of a channel. Pillow would cut the lower ones off.
+        if picture.format == "PNG" and data[24] > 8:
             raise UnfitPictureError(
                 f"a texture must have at most 8 bits a channel, and it has {data[24]}"
             )
         upright = ImageOps.exif_transpose(picture)
         if upright.mode in ("RGBA", "LA") or "transparency" in upright.info:
             upright = upright.convert("RGBA")
+            # Cloth has no holes.
             if upright.getchannel("A").getextrema()[0] != 255:
                 raise UnfitPictureError("a texture must be opaque, and it has transparent pixels")
         return np.array(upright.convert("RGB"), dtype=np.uint8)
@@ -144,6 +145,7 @@ def sheet(tiles: Sequence[Pictures], columns: int) -> Pictures:
 
     The last row is filled with white.
     """
+    # White tiles fill the last row.
     columns = min(columns, len(tiles))
     filled = [*tiles, *[np.full_like(tiles[0], 255)] * (-len(tiles) % columns)]
     rows = [

@@ -1,25 +1,35 @@
 """The kinds of dataset: every module of this package is one, and has the name of its kind."""
 
+from collections.abc import Iterable
+from functools import reduce
 from importlib import import_module
+from operator import or_
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Annotated, Union
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
+from stickslip_schemas.base import Document
 from stickslip_schemas.spec.jobs import JobSpec, Render, Simulation
 
 
 def _spec_type(kind: str) -> type[JobSpec]:
     """Return the class of specs that the module of a kind defines."""
     module = import_module(f"{__name__}.{kind}")
-    (found,) = (
+    # Base classes are imported; the class of the kind is defined in the module itself.
+    (spec_type,) = (
         value
         for value in vars(module).values()
         if isinstance(value, type)
         and issubclass(value, JobSpec)
         and value.__module__ == module.__name__
     )
-    return found
+    return spec_type
+
+
+def _union(types: Iterable[type[Document]]) -> Any:
+    """Return the union of models that pydantic tells apart by their `kind`."""
+    return Annotated[reduce(or_, types), Field(discriminator="kind")]
 
 
 KINDS: dict[str, type[JobSpec]] = {
@@ -32,12 +42,9 @@ if TYPE_CHECKING:  # checkers know what all kinds have in common
     AnySimulation = Simulation
     AnyRender = Render
 else:
-    _BY_KIND = Field(discriminator="kind")
-    AnyJobSpec = Annotated[Union[tuple(KINDS.values())], _BY_KIND]  # noqa: UP007
-    AnySimulation = Annotated[
-        Union[tuple(spec.simulation_type for spec in KINDS.values())], _BY_KIND
-    ]  # noqa: UP007
-    AnyRender = Annotated[Union[tuple(spec.render_type for spec in KINDS.values())], _BY_KIND]  # noqa: UP007
+    AnyJobSpec = _union(KINDS.values())
+    AnySimulation = _union(spec.simulation_type for spec in KINDS.values())
+    AnyRender = _union(spec.render_type for spec in KINDS.values())
 
 job_spec_adapter: TypeAdapter[JobSpec] = TypeAdapter(AnyJobSpec)
 """Validates and dumps the spec of any kind."""

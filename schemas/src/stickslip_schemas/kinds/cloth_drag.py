@@ -235,7 +235,7 @@ class ClothDragSpec(ClipSpec):
         return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
-        about = {
+        descriptions = {
             name: field.description or "" for name, field in ClothDragAxes.model_fields.items()
         }
         return (
@@ -243,7 +243,7 @@ class ClothDragSpec(ClipSpec):
             codes("material", self.names("material")),
             array("mu", "friction coefficient"),
             *(
-                array(name, about[name])
+                array(name, descriptions[name])
                 for name in ("density", "bending", "stretching")
                 if name in self.named_axes
             ),
@@ -293,7 +293,8 @@ def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
     all the same: a repeated row costs some bytes, an array without the dimension `sample` would be
     an exception in every reader.
     """
-    vertex, corners = {"vertex": spec.mesh**2}, {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
+    vertex = {"vertex": spec.mesh**2}
+    corners = {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
     positions = "positions of the vertices [m]; the floor is z = 0"
     return (
         over_time(

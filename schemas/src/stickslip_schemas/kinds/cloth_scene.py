@@ -39,6 +39,7 @@ from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.parameters import (
     LOOKS_AXES,
+    Location,
     ParameterName,
     Value,
     refuse,
@@ -82,11 +83,12 @@ class _BuiltIn(BeforeValidator):
     def __get_pydantic_json_schema__(
         self, core: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        document, name = (
-            handler(core),
-            {"type": "string", "description": "the name of a built-in scene"},
-        )
-        return document if handler.mode == "serialization" else {"anyOf": [name, document]}
+        document = handler(core)
+        # A scene is always written out whole.
+        if handler.mode == "serialization":
+            return document
+        name = {"type": "string", "description": "the name of a built-in scene"}
+        return {"anyOf": [name, document]}
 
 
 class ClothSceneAxes(Document):
@@ -212,14 +214,11 @@ class ClothSceneSpec(ClipSpec):
                         value,
                     )
         for corner in self._corners():
+            values: dict[Location, Any] = {}
+            for name, value in corner.items():
+                values.update(dict.fromkeys(self.stage.locations(name), value))
             try:
-                self.stage.physics_with(
-                    {
-                        location: v
-                        for name, v in corner.items()
-                        for location in self.stage.locations(name)
-                    }
-                )
+                self.stage.physics_with(values)
             except ValidationError as error:
                 refuse_as(error, self.stage, ("axes",), corner)
         return self
@@ -227,9 +226,8 @@ class ClothSceneSpec(ClipSpec):
     def _corners(self) -> Iterator[dict[str, Any]]:
         """Yield points that stand for all others.
 
-        These are all names, and the ends of ranges of numbers, one by one and two together.
-
-        Rules between two numbers are linear, so what holds at all ends holds between them.
+        These are all names, and the ends of ranges of numbers, one by one and two together. Rules
+        between two numbers are linear, so a rule that holds at all ends holds between them.
         """
         ends: dict[str, list[Any]] = {}
         for name, axis in (self.axes.__pydantic_extra__ or {}).items():
@@ -237,8 +235,9 @@ class ClothSceneSpec(ClipSpec):
             is_number = isinstance(self.stage.default(name), float)
             ends[name] = [min(values), max(values)] if is_number else values
             yield from ({name: value} for value in ends[name])
-        for one, other in combinations(ends, 2):
-            yield from ({one: a, other: b} for a, b in product(ends[one], ends[other]))
+        for first, second in combinations(ends, 2):
+            for a, b in product(ends[first], ends[second]):
+                yield {first: a, second: b}
 
     @cached_property
     def stage(self) -> Scene:
@@ -251,12 +250,11 @@ class ClothSceneSpec(ClipSpec):
     @cached_property
     def _parameter_fields(self) -> dict[str, tuple[str, ...]]:
         """Fields of documents that each parameter sets."""
-        return {
-            name: tuple(
-                "/".join(map(str, ("scene", *location))) for location in self.stage.locations(name)
-            )
-            for name in self.stage.parameters
-        }
+        fields: dict[str, tuple[str, ...]] = {}
+        for name in self.stage.parameters:
+            locations = self.stage.locations(name)
+            fields[name] = tuple("/".join(map(str, ("scene", *steps))) for steps in locations)
+        return fields
 
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
@@ -264,21 +262,18 @@ class ClothSceneSpec(ClipSpec):
 
         A parameter without an axis has its default.
         """
-        given = self.axes.__pydantic_extra__ or {}
-        default = {
-            name: self.stage.default(name) for name in self.stage.parameters if name not in given
-        }
-        unvaried = {
-            name: ListAxis[Any](type="list", values=(value,)) for name, value in default.items()
-        }
-        if self.combine == "zip":
-            unvaried = {}
-        parameters: dict[str, AnyAxis] = {**given, **unvaried}
-        looks = {name: getattr(self.axes, name) for name in LOOKS_AXES}
-        return {
-            **dict(sorted(parameters.items())),
-            **{name: axis for name, axis in looks.items() if axis is not None},
-        }
+        parameters: dict[str, AnyAxis] = dict(self.axes.__pydantic_extra__ or {})
+        # Zipped axes have one length, so a default cannot stand among them.
+        if self.combine != "zip":
+            for name in self.stage.parameters.keys() - parameters.keys():
+                default = self.stage.default(name)
+                parameters[name] = ListAxis[Any](type="list", values=(default,))
+        named = dict(sorted(parameters.items()))
+        for name in LOOKS_AXES:
+            axis = getattr(self.axes, name)
+            if axis is not None:
+                named[name] = axis
+        return named
 
     @property
     def instants(self) -> int:  # type: ignore[override]
@@ -316,26 +311,24 @@ class ClothSceneSpec(ClipSpec):
 
     def render_settings(self) -> dict[str, Any] | None:
         looks = self.stage.looks
-        of_rig = (
-            {"rig": looks.cameras, "rig_digest": rig_digest(looks.cameras)}
-            if isinstance(looks.cameras, str)
-            else {}
-        )
-        light = {"lamp": looks.light} if isinstance(looks.light, LampNumbers) else {}
-        floor = {"finish": looks.floor} if isinstance(looks.floor, FloorNumbers) else {}
-        return {
-            **(super().render_settings() or {}),
-            **of_rig,
-            "scene": self.stage.staged(),
-            "lighting": OF_SCENE if light else str(looks.light),
-            "substrate": OF_SCENE if floor else str(looks.floor),
-            **light,
-            **floor,
-        }
+        settings = {**(super().render_settings() or {}), "scene": self.stage.staged()}
+        # Cameras, light and floor are names, or numbers of the scene.
+        if isinstance(looks.cameras, str):
+            settings["rig"] = looks.cameras
+            settings["rig_digest"] = rig_digest(looks.cameras)
+        settings["lighting"] = str(looks.light)
+        if isinstance(looks.light, LampNumbers):
+            settings["lighting"] = OF_SCENE
+            settings["lamp"] = looks.light
+        settings["substrate"] = str(looks.floor)
+        if isinstance(looks.floor, FloorNumbers):
+            settings["substrate"] = OF_SCENE
+            settings["finish"] = looks.floor
+        return settings
 
     @cached_property
-    def _own(self) -> Mapping[str, Mapping[str, Any]]:
-        """What the scene defines names to be, by axis."""
+    def _scene_definitions(self) -> Mapping[str, Mapping[str, Any]]:
+        """Definitions of names in the scene, by axis."""
         looks = self.stage.looks
         return {
             "viewpoint": looks.cameras if isinstance(looks.cameras, dict) else {},
@@ -353,34 +346,29 @@ class ClothSceneSpec(ClipSpec):
             return tuple(
                 FRAMING if cameras is None else (camera.name for camera in load_rig(cameras))
             )
-        return (*super().built_in(axis), *self._own.get(axis, {}))
+        return (*super().built_in(axis), *self._scene_definitions.get(axis, {}))
 
     def meaning(self, axis: str, name: str) -> Any:
-        return super().meaning(axis, name) or self._own.get(axis, {}).get(name)
+        return super().meaning(axis, name) or self._scene_definitions.get(axis, {}).get(name)
 
     def cameras(self) -> tuple[Camera, ...]:
         """Return the cameras by name.
 
         Cameras that frame all that moves differ from sample to sample and are not among them.
         """
-        given = self.stage.looks.cameras
-        rig = load_rig(given) if isinstance(given, str) else ()
-        return (
-            *rig,
-            *(
-                view.camera(name)
-                for name, view in {**self._own["viewpoint"], **self.viewpoints}.items()
-            ),
-        )
+        looks_cameras = self.stage.looks.cameras
+        rig = load_rig(looks_cameras) if isinstance(looks_cameras, str) else ()
+        views = {**self._scene_definitions["viewpoint"], **self.viewpoints}
+        return (*rig, *(view.camera(name) for name, view in views.items()))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:
-        files = ((location, artifact_digest(name)) for location, name in self.scene.files())
-        return {
-            "/".join(("/scene", *map(str, location))): digest
-            for location, digest in files
-            if digest
-        } | super().artifacts
+        pointers = dict(super().artifacts)
+        for location, name in self.scene.files():
+            digest = artifact_digest(name)
+            if digest:
+                pointers["/".join(("/scene", *map(str, location)))] = digest
+        return pointers
 
     @property
     def certified_preset(self) -> str:
@@ -414,11 +402,11 @@ class ClothSceneSpec(ClipSpec):
         """
         if stage is Stage.render:
             return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
-        shown = (
-            f"{v:.1g}" if isinstance(v, float) else str(v)
-            for v in (point.get(name) for name in self._parameter_fields)
-        )
-        return ", ".join((self._cost_of_scene, *shown))
+        words = [self._cost_of_scene]
+        for name in self._parameter_fields:
+            value = point.get(name)
+            words.append(f"{value:.1g}" if isinstance(value, float) else str(value))
+        return ", ".join(words)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         labels = (

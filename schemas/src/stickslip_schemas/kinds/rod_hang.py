@@ -131,7 +131,7 @@ class RodHangSpec(JobSpec):
             ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
         )
         pixels = {"view": len(self.cameras()), "y": 224, "x": 224, "rgb": 3}
-        seen = (
+        pictures = (
             array("views", "sRGB pictures", "uint8", pixels, per_sample=True),
             array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),
         )
@@ -144,7 +144,7 @@ class RodHangSpec(JobSpec):
                 array(name, text, "float32", points | of, is_recorded=True)
                 for name, of, text in curves
             ),
-            *(() if self.views is None else seen),
+            *(() if self.views is None else pictures),
             array("gamma", "weight over bending stiffness [Eq. 5.2a of the thesis]"),
             array("phi0", "natural twist times L [rad]"),
             array("phi1", "natural curvature times L [rad]"),

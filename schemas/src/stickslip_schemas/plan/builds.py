@@ -138,10 +138,10 @@ def _imports(path: Path) -> Iterator[str]:
     """Yield the modules of ours that a file imports."""
     for node in _import_nodes(_parse(path)):
         if isinstance(node, ast.Import):
-            # import stickslip_x.y
+            # An import of whole modules.
             yield from (alias.name for alias in node.names if alias.name.startswith(OURS))
         elif (node.module or "").startswith(OURS):
-            # from stickslip_x import y: `y` may be a module, or a name from anywhere else
+            # An import of names: each may be a module, or passed on from another one.
             for alias in node.names:
                 yield _defining_module(str(node.module), alias.name)
 

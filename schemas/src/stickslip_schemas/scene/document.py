@@ -20,6 +20,8 @@ from stickslip_schemas.scene.parameters import (
 )
 from stickslip_schemas.scene.parts import (
     BY_NAME,
+    LARGEST,
+    SMALLEST,
     Body,
     FileMesh,
     FromFile,
@@ -30,6 +32,7 @@ from stickslip_schemas.scene.parts import (
     Sheet,
     Time,
     Vector,
+    unit_hint,
 )
 from stickslip_schemas.spec.jobs import PresetName
 from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, Texture, did_you_mean
@@ -113,55 +116,57 @@ class Physics(Document):
 
     @property
     def frames(self) -> int:
+        """Number of frames, the first one at 0 s included."""
         longest = self.duration if self.end is None else self.end.at_most
         return int((longest or 0.0) * self.frame_rate * (1.0 + 1e-12)) + 1
 
     @property
     def holders(self) -> tuple[tuple[str, str], ...]:
         """Sheet and name of each holder, in the order of arrays."""
-        return tuple(
-            (sheet, holder) for sheet, given in self.sheets.items() for holder in given.holders
-        )
+        names: list[tuple[str, str]] = []
+        for sheet_name, sheet in self.sheets.items():
+            names += [(sheet_name, holder) for holder in sheet.holders]
+        return tuple(names)
 
     def pairs(self) -> Iterator[tuple[str, str]]:
         """Yield each two things that may touch.
 
         Sheets touch each other, themselves and bodies.
         """
-        for one, other in combinations_with_replacement(self.sheets, 2):
-            if one != other or self.sheets[one].self_contact:
-                yield one, other
-        yield from ((sheet, body) for body in self.bodies for sheet in self.sheets)
+        for first, second in combinations_with_replacement(self.sheets, 2):
+            if first != second or self.sheets[first].self_contact:
+                yield first, second
+        for body in self.bodies:
+            for sheet in self.sheets:
+                yield sheet, body
 
-    def mu(self, one: str, other: str) -> float:
+    def mu(self, first: str, second: str) -> float:
+        """Return the coefficient of friction of two things that may touch."""
         for pair in self.friction:
-            if set(pair.between) == {one, other}:
+            if set(pair.between) == {first, second}:
                 return pair.mu
+        # The document has been checked: a pair without a coefficient has the default one.
         assert self.default_friction is not None
         return self.default_friction
 
     def files(self) -> Iterator[tuple[Location, str]]:
-        """Yield the files that the physics names: their location in the document, and their name."""
+        """Yield the location in the document and the name of each file of the physics."""
         motions: list[tuple[Location, Motion | None]] = []
         for name, sheet in self.sheets.items():
             if isinstance(sheet.mesh, FileMesh):
                 yield ("sheets", name, "mesh", "file"), sheet.mesh.file
             if isinstance(sheet.start, FromFile) and sheet.start.file is not None:
                 yield ("sheets", name, "start", "file"), sheet.start.file
-            motions += [
-                (("sheets", name, "holders", key, "motion"), held.motion)
-                for key, held in sheet.holders.items()
-            ]
+            for key, holder in sheet.holders.items():
+                motions.append((("sheets", name, "holders", key, "motion"), holder.motion))
         for name, body in self.bodies.items():
             if isinstance(body, MeshBody):
                 yield ("bodies", name, "file"), body.file
             if not isinstance(body, Plane):
                 motions.append((("bodies", name, "motion"), body.motion))
-        yield from (
-            ((*location, "path"), motion.path)
-            for location, motion in motions
-            if motion and motion.path
-        )
+        for location, motion in motions:
+            if motion and motion.path:
+                yield (*location, "path"), motion.path
 
     @model_validator(mode="after")
     def _known_materials(self) -> Self:
@@ -179,12 +184,8 @@ class Physics(Document):
     @model_validator(mode="after")
     def _within_bounds(self) -> Self:
         if (self.duration is None) == (self.end is None):
-            refuse(
-                self,
-                ("duration",),
-                "one of duration [s] and end must be given, and not both",
-                self.duration,
-            )
+            rule = "one of duration [s] and end must be given, and not both"
+            refuse(self, ("duration",), rule, self.duration)
         if self.frames > MAX_FRAMES:
             rule = (
                 f"length [s] times frame_rate [1/s] must be at most {MAX_FRAMES} frames, and gives "
@@ -193,74 +194,60 @@ class Physics(Document):
             refuse(self, ("frame_rate",), rule, self.frame_rate)
         vertices = sum(sheet.mesh.shape[0] for sheet in self.sheets.values())
         if vertices > MAX_VERTICES:
-            refuse(
-                self, ("sheets",), f"must have at most {MAX_VERTICES} vertices together", vertices
-            )
+            rule = f"must have at most {MAX_VERTICES} vertices together"
+            refuse(self, ("sheets",), rule, vertices)
         for name, sheet in self.sheets.items():
-            if not sheet.self_contact and len(self.sheets) > 1:
-                refuse(
-                    self,
-                    ("sheets", name, "self_contact"),
-                    "must be true where there are several sheets",
-                    False,
-                )
-            count = sheet.mesh.shape[0]
-            if count * self.frames > MAX_TRACK:
-                rule = (
-                    f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and "
-                    f"{self.frames}"
-                )
-                refuse(self, ("sheets", name, "mesh"), rule, count * self.frames)
-            for key, held in sheet.holders.items():
-                if count and held.vertices and max(held.vertices) >= count:
-                    location = (
-                        "sheets",
-                        name,
-                        "holders",
-                        key,
-                        "vertices",
-                        held.vertices.index(max(held.vertices)),
-                    )
-                    refuse(
-                        self,
-                        location,
-                        f"must be a vertex of the sheet, below {count}",
-                        max(held.vertices),
-                    )
+            self._check_sheet(name, sheet)
         return self
+
+    def _check_sheet(self, name: str, sheet: Sheet) -> None:
+        location = ("sheets", name)
+        if not sheet.self_contact and len(self.sheets) > 1:
+            rule = "must be true if there are several sheets"
+            refuse(self, (*location, "self_contact"), rule, False)
+        # The length along the warp or the weft, whichever is larger. A mesh in a file is
+        # measured when the file is read.
+        if not isinstance(sheet.mesh, FileMesh):
+            extent = max(sheet.mesh.size)
+            if not SMALLEST <= extent <= LARGEST:
+                rule = f"the longer side must be {SMALLEST:g} to {LARGEST:g} m"
+                rule += unit_hint(extent)
+                refuse(self, (*location, "mesh", "size"), rule, list(sheet.mesh.size))
+        count = sheet.mesh.shape[0]
+        if count * self.frames > MAX_TRACK:
+            rule = (
+                f"vertices times frames must be at most {MAX_TRACK}, and there are {count} and "
+                f"{self.frames}"
+            )
+            refuse(self, (*location, "mesh"), rule, count * self.frames)
+        # The number of vertices of a file is 0 before the file is read.
+        for key, holder in sheet.holders.items():
+            if count and holder.vertices and max(holder.vertices) >= count:
+                last = max(holder.vertices)
+                position = holder.vertices.index(last)
+                rule = f"must be a vertex of the sheet, below {count}"
+                refuse(self, (*location, "holders", key, "vertices", position), rule, last)
 
     @model_validator(mode="after")
     def _friction_of_each_two(self) -> Self:
-        if twice := sorted(set(self.sheets) & set(self.bodies)):
-            refuse(
-                self,
-                ("bodies", twice[0]),
-                "sheets and bodies must have names of their own",
-                twice[0],
-            )
-        there = {frozenset(pair) for pair in self.pairs()}
-        named: set[frozenset[str]] = set()
-        for location, pair in enumerate(self.friction):
-            two = frozenset(pair.between)
-            if two not in there:
-                refuse(
-                    self,
-                    ("friction", location, "between"),
-                    "must name two that may touch",
-                    list(pair.between),
-                )
-            if two in named:
-                refuse(
-                    self,
-                    ("friction", location, "between"),
-                    "must name two once",
-                    list(pair.between),
-                )
-            named.add(two)
-        if self.default_friction is None and (
-            missing := sorted(sorted(two) for two in there - named)
-        ):
-            rule = "must name each two that may touch where there is no default_friction; missing: "
+        shared_names = sorted(set(self.sheets) & set(self.bodies))
+        if shared_names:
+            rule = "sheets and bodies must have names of their own"
+            refuse(self, ("bodies", shared_names[0]), rule, shared_names[0])
+        # A pair has no order, and a sheet with itself is a pair of one name.
+        touching = {frozenset(pair) for pair in self.pairs()}
+        listed: set[frozenset[str]] = set()
+        for position, entry in enumerate(self.friction):
+            pair = frozenset(entry.between)
+            location = ("friction", position, "between")
+            if pair not in touching:
+                refuse(self, location, "must name two that may touch", list(entry.between))
+            if pair in listed:
+                refuse(self, location, "must name two once", list(entry.between))
+            listed.add(pair)
+        missing = sorted(sorted(pair) for pair in touching - listed)
+        if self.default_friction is None and missing:
+            rule = "must name each two that may touch if there is no default_friction; missing: "
             refuse(self, ("friction",), f"{rule}{missing[0][0]} with {missing[0][-1]}", None)
         return self
 
@@ -276,32 +263,23 @@ class Staged(Physics):
         return next(name for name in self.sheets if name not in self.looks.sheets)
 
     def files(self) -> Iterator[tuple[Location, str]]:
-        """Yield the files that the scene names: their location in the document, and their name."""
+        """Yield the location in the document and the name of each file of the scene."""
         yield from super().files()
-        for name, look in self.looks.sheets.items():
-            if look.texture not in list(Texture):
-                yield ("looks", "sheets", name, "texture"), look.texture
+        for name, appearance in self.looks.sheets.items():
+            if appearance.texture not in list(Texture):
+                yield ("looks", "sheets", name, "texture"), appearance.texture
 
     @model_validator(mode="after")
-    def _looks_of_what_is_there(self) -> Self:
-        for what in ("sheets", "bodies"):
-            there = getattr(self, what)
-            for name in getattr(self.looks, what):
-                if name not in there:
-                    hint = did_you_mean(name, there)
-                    refuse(
-                        self,
-                        ("looks", what, name),
-                        f"must be one of {', '.join(there) or 'none'}{hint}",
-                        name,
-                    )
+    def _looks_of_known_things(self) -> Self:
+        for group in ("sheets", "bodies"):
+            known = getattr(self, group)
+            for name in getattr(self.looks, group):
+                if name not in known:
+                    rule = f"must be one of {', '.join(known) or 'none'}{did_you_mean(name, known)}"
+                    refuse(self, ("looks", group, name), rule, name)
         if len(self.looks.sheets) == len(self.sheets):
-            refuse(
-                self,
-                ("looks", "sheets"),
-                "must leave one sheet to the axis texture",
-                list(self.looks.sheets),
-            )
+            rule = "must leave one sheet to the axis texture"
+            refuse(self, ("looks", "sheets"), rule, list(self.looks.sheets))
         return self
 
 
@@ -339,14 +317,16 @@ class Scene(Staged):
         return value
 
     def physics_with(self, values: Mapping[Location, Any]) -> Physics:
-        """Return the physics with other values at locations of the document; raise ValidationError."""
+        """Return the physics with other values at locations; raise ValidationError."""
         return Physics.model_validate(with_values(self.physics(), values))
 
     @model_validator(mode="after")
     def _parameters_fit(self) -> Self:
-        document, taken = self.physics(), dict[Location, str]()
+        document = self.physics()
+        owners: dict[Location, str] = {}
         for name, parameter in self.parameters.items():
-            parameter.check(self, name, document, taken)
+            parameter.check(self, name, document, owners)
+            # The scene must be right with each parameter at its ends.
             for end, value in parameter.extremes:
                 try:
                     self.physics_with(dict.fromkeys(self.locations(name), value))

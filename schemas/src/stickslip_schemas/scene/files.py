@@ -1,16 +1,17 @@
-"""The files of a scene: limits, references by digest, and the arrays that they hold.
+"""The files of a scene: references by digest, and the arrays that files hold.
 
-What a file is for follows from its location in the document: a flat pattern, a start, a body, a motion
-or a texture.
+The location of a file in the document says what the file is for: a flat pattern, a start, a body, a
+motion or a texture.
 """
 
+import csv
 import io
+import re
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,15 +19,21 @@ import numpy.typing as npt
 from stickslip_schemas.base import ARTIFACT, sha256
 from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
 from stickslip_schemas.scene.errors import UnfitFileError as UnfitFileError
-from stickslip_schemas.scene.gate import MAX_FILE_BYTES, MAX_TRIANGLES, check_file
+from stickslip_schemas.scene.gate import MAX_TRIANGLES, check_file, is_path_table
+from stickslip_schemas.scene.mesh_files import FARTHEST, Polygons, has_order, read_polygons
 from stickslip_schemas.scene.parameters import Location, value_at, with_values
-from stickslip_schemas.scene.parts import MeshBody
+from stickslip_schemas.scene.parts import LARGEST, SMALLEST, MeshBody, unit_hint
+from stickslip_schemas.scene.polygons import Floats, Indices, triangulate, weld
 
-FARTHEST = 100.0
-"""Largest coordinate in a file [m]."""
+MESH_SUFFIXES = (".obj", ".ply", ".stl")
+"""Ends of the names of mesh files."""
 
-Floats = npt.NDArray[np.float64]
-Triangles = npt.NDArray[np.int64]
+FLATTEST = 1e-12
+"""Least height of a triangle [m]."""
+
+PATH_COLUMNS = ("time", "x", "y", "z", "rx", "ry", "rz")
+"""Columns of a motion in a CSV file: [s], [m], [rad]."""
+
 Arrays = dict[str, npt.NDArray[Any]]
 
 _Shapes = dict[str, tuple[str | int, ...]]
@@ -41,101 +48,83 @@ _SKIN: _Shapes = {
 
 
 def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str, bytes]]:
-    """Return a scene with references by digest instead of names of files, and these files by
-    digest.
+    """Return a scene with references in place of names of files, and the files by digest.
 
-    `read` returns the bytes of a file by its name. Raises UnfitFileError for a file that is not
-    what the scene needs there; the message begins with the location.
+    `read` returns the bytes of a file by its name. Raises UnfitFileError for a file that the scene
+    cannot use there; the message begins with the location.
     """
     values: dict[Location, Any] = {}
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     for location, name in scene.files():
         if name.startswith(ARTIFACT):
             continue
         try:
             data = read(name)
-            if (
-                counts := _counts(
-                    location, {} if location[0] == "looks" else read_file(location, data)
-                )
-            ) is not None:
-                values[(*location[:-1], "counts")] = counts
-        except (UnfitFileError, OSError) as error:
-            rule = (
-                str(error)
-                if isinstance(error, UnfitFileError)
-                else f"must be readable: {error.strerror}"
-            )
-            raise UnfitFileError(f"{'.'.join(map(str, location))}: {rule}, in {name}") from error
+            # Textures are checked by `format.pictures`, which needs another extra.
+            arrays = {} if location[0] == "looks" else read_file(location, data)
+            counts = _pattern_counts(location, arrays)
+        except UnfitFileError as error:
+            raise UnfitFileError(f"{_dotted(location)}: {error}, in {name}") from error
+        except OSError as error:
+            rule = f"must be readable: {error.strerror}"
+            raise UnfitFileError(f"{_dotted(location)}: {rule}, in {name}") from error
+        if counts is not None:
+            values[(*location[:-1], "counts")] = counts
         digest = sha256(data)
-        found[digest] = data
+        files[digest] = data
         values[location] = f"{ARTIFACT}{digest}"
-    return Scene.model_validate(with_values(scene.model_dump(mode="json"), values)), found
+    document = with_values(scene.model_dump(mode="json"), values)
+    return Scene.model_validate(document), files
 
 
 def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any]:
-    """Return physics as JSON, but with the arrays of files (see `read_file`) instead of references
-    to them.
+    """Return physics as JSON, with the arrays of files (see `read_file`) in place of references.
 
     `read` returns the bytes of an artifact by its digest. Raises UnfitFileError.
     """
-    files = Physics.files(physics)
-    arrays = {
-        location: read_file(location, read(name.removeprefix(ARTIFACT))) for location, name in files
-    }
-    found: dict[str, Any] = with_values(
-        physics.model_dump(mode="json", include=set(Physics.model_fields)), arrays
-    )
-    return found
+    arrays = {}
+    for location, name in Physics.files(physics):
+        arrays[location] = read_file(location, read(name.removeprefix(ARTIFACT)))
+    document = physics.model_dump(mode="json", include=set(Physics.model_fields))
+    with_files: dict[str, Any] = with_values(document, arrays)
+    return with_files
 
 
-def frames_of(files: Sequence[Path], scene: Scene, name: str) -> bytes:
-    """Return a folder of OBJ files, one a frame of the body that names it, as one NPZ file.
+def weld_notes(physics: Physics, read: Callable[[str], bytes]) -> Iterator[str]:
+    """Yield a sentence for each body of which vertices at equal positions were welded.
 
-    Raise UnfitFileError.
+    `read` returns the bytes of an artifact by its digest.
     """
-    rates = [
-        body.frame_rate
-        for body in scene.bodies.values()
-        if isinstance(body, MeshBody) and body.file == name
-    ]
-    if not files or not rates or rates[0] is None:
-        raise UnfitFileError("must hold OBJ files, one a frame, of a body with a frame_rate [1/s]")
-    frames = [read_obj(file.read_bytes()) for file in files]
-    for file, (vertices, triangles, _) in zip(files, frames, strict=True):
-        if vertices.shape != frames[0][0].shape or not np.array_equal(triangles, frames[0][1]):
-            raise UnfitFileError(
-                f"{file.name} must have the vertices and faces of {files[0].name}, in the same "
-                "order"
-            )
-    packed = io.BytesIO()
-    times = np.arange(len(files)) / rates[0]
-    np.savez(
-        packed,
-        positions=np.stack([vertices for vertices, _, _ in frames]),
-        triangles=frames[0][1],
-        times=times,
-    )
-    return packed.getvalue()
+    for location, name in Physics.files(physics):
+        if location[0] == "bodies" and location[-1] == "file":
+            body = _read_body(read(name.removeprefix(ARTIFACT)))
+            if body.welded_count:
+                yield (
+                    f"{_dotted(location)}: {body.welded_count} of {body.vertex_count} vertices "
+                    "were at the position of another one, and were welded to it."
+                )
 
 
 def check_scene_file(scene: Scene, location: Location, data: bytes) -> None:
-    """Raise UnfitFileError where a file in the store is not what a scene needs, or has not the
-    counts that it gives.
+    """Raise UnfitFileError if a scene cannot use a file at a location.
+
+    The counts that the document states must be those of the file.
     """
-    found, document = read_file(location, data), scene.physics()
-    counts = _counts(location, found)
-    if counts is not None and (said := value_at(document, (*location[:-1], "counts"))) != list(
-        counts
-    ):
-        raise UnfitFileError(
-            f"counts must be the vertices and triangles of the file, {list(counts)}, and are {said}"
-        )
-    if location[0] == "sheets" and location[2] == "start":
-        vertices, expected = found["positions"], scene.sheets[str(location[1])].mesh.shape[0]
-        if len(vertices) != expected:
+    arrays = read_file(location, data)
+    counts = _pattern_counts(location, arrays)
+    if counts is not None:
+        stated = value_at(scene.physics(), (*location[:-1], "counts"))
+        if stated != list(counts):
             raise UnfitFileError(
-                f"must have the vertices of its sheet, {expected}, and has {len(vertices)}"
+                f"counts must be the vertices and triangles of the file, {list(counts)}, and are "
+                f"{stated}"
+            )
+    if location[0] == "sheets" and location[2] == "start":
+        count = len(arrays["positions"])
+        expected = scene.sheets[str(location[1])].mesh.shape[0]
+        if count != expected:
+            raise UnfitFileError(
+                f"must have the vertices of its sheet, {expected}, and has {count}"
             )
 
 
@@ -150,182 +139,202 @@ def read_file(location: Location, data: bytes) -> Arrays:
     """
     check_file(data)
     if location[-1] == "path":
-        return _path(data)
+        return _read_path(data)
     if location[0] == "bodies":
-        return _body(data)
-    return _start(data) if location[2] == "start" else _pattern(data)
-
-
-def _counts(location: Location, found: Arrays) -> tuple[int, int] | None:
-    """Return the numbers of vertices and triangles of a flat pattern."""
-    return (
-        (len(found["rest"]), len(found["triangles"]))
-        if location[0] == "sheets" and "rest" in found
-        else None
-    )
+        return _read_body(data).arrays
+    return _read_start(data) if location[2] == "start" else _read_pattern(data)
 
 
 def counts_of(data: bytes) -> tuple[int, int] | None:
-    """Return the numbers of vertices and triangles of an OBJ file; None of an NPZ or CSV file.
+    """Return the numbers of vertices and triangles of a mesh file; None of an NPZ or CSV file.
 
-    Raise UnfitFileError.
+    Raises UnfitFileError.
     """
     check_file(data)
     if data.startswith(b"PK"):
         return None
-    if data.startswith(b"time"):
-        _path(data)
-    else:
-        vertices, triangles, _ = read_obj(data)
-        return len(vertices), len(triangles)
-    return None
+    if is_path_table(data):
+        _read_path(data)
+        return None
+    polygons = read_polygons(data)
+    # A polygon of n corners is cut into n - 2 triangles.
+    return len(polygons.positions), int((polygons.sizes - 2).sum())
 
 
-def _pattern(data: bytes) -> Arrays:
-    vertices, triangles, flat = read_obj(data)
-    if flat is None:
-        raise UnfitFileError(
-            "must have texture coordinates (vt), one for each vertex: the flat pattern [m]"
-        )
-    u, v = (flat[triangles[:, corner]] - flat[triangles[:, 0]] for corner in (1, 2))
+def _dotted(location: Location) -> str:
+    return ".".join(map(str, location))
+
+
+def _pattern_counts(location: Location, arrays: Arrays) -> tuple[int, int] | None:
+    """Return the numbers of vertices and triangles of a flat pattern; None of other files."""
+    if location[0] != "sheets" or "rest" not in arrays:
+        return None
+    return len(arrays["rest"]), len(arrays["triangles"])
+
+
+# ---- Meshes -----------------------------------------------------------------------------------
+
+
+def _read_pattern(data: bytes) -> Arrays:
+    polygons = read_polygons(data, with_pattern=True)
+    rest = polygons.pattern
+    assert rest is not None
+    # Polygons are cut in the flat pattern: the start may be folded.
+    triangles = triangulate(rest, polygons.corners, polygons.sizes)
+    _check_extent(rest)
+
+    # 2 A = u x v: negative if a triangle is turned against the pattern.
+    u = rest[triangles[:, 1]] - rest[triangles[:, 0]]
+    v = rest[triangles[:, 2]] - rest[triangles[:, 0]]
     area = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     if not (area > 0).all():
-        location = int(np.argmin(area))
+        triangle = int(np.argmin(area))
         raise UnfitFileError(
-            f"all triangles of the flat pattern must have areas above 0 m^2; {location} has "
-            f"{area[location]:g}"
+            f"all triangles of the flat pattern must have areas above 0 m^2; {triangle} has "
+            f"{area[triangle]:g}"
         )
-    _check_edges(triangles, len(vertices))
-    if len(np.unique(triangles)) != len(vertices):
+    _check_corners(triangles)
+    _check_edges(triangles, len(rest))
+    if len(np.unique(triangles)) != len(rest):
         raise UnfitFileError("must have no vertex without a triangle")
-    return {"rest": flat, "positions": vertices, "triangles": triangles}
+    _check_sewn(rest, polygons.positions)
+    return {"rest": rest, "positions": polygons.positions, "triangles": triangles}
 
 
-def _body(data: bytes) -> Arrays:
-    if not data.startswith(b"PK"):
-        vertices, triangles, _ = read_obj(data)
-        _check_edges(triangles, len(vertices))
-        _check_areas(vertices, triangles)
-        return {"positions": vertices[None], "triangles": triangles, "times": np.zeros(1)}
-    found = _arrays(data, _SKIN if "rest" in _names(data) else _FRAMES)
-    triangles = found["triangles"].astype(np.int64)
-    count = found["rest" if "rest" in found else "positions"].shape[-2]
-    _ascending(found["times"])
-    if (
-        wrong := found["triangles"][
-            (triangles != found["triangles"]) | (triangles < 0) | (triangles >= count)
-        ]
-    ).size:
-        raise UnfitFileError(f"triangles must be vertices, 0 to {count - 1}, and has {wrong[0]}")
-    _check_edges(triangles, count)
-    _check_areas(found["rest"] if "rest" in found else found["positions"][0], triangles)
-    return {**found, "triangles": triangles}
+def _check_sewn(rest: Floats, positions: Floats) -> None:
+    """Raise UnfitFileError if vertices of a sheet are there twice, so that it falls apart.
+
+    They are not welded: lists of held vertices and files of starts count them.
+    """
+    same = weld(np.column_stack([rest, positions]))
+    repeated = len(rest) - len(same.kept)
+    if repeated:
+        again = int(np.setdiff1d(np.arange(len(rest)), same.kept)[0])
+        first = int(same.kept[same.targets[again]])
+        raise UnfitFileError(
+            "neighbouring triangles must share their vertices, or the sheet falls apart; "
+            f"{repeated} of {len(rest)} vertices are at the position of another one, such as "
+            f"{first + 1} and {again + 1}: merge vertices by distance (in Blender: M, By Distance)"
+        )
 
 
-def _start(data: bytes) -> Arrays:
-    if not data.startswith(b"PK"):
-        return {"positions": read_obj(data)[0]}
-    return _arrays(data, {"positions": ("vertex", 3)})
+class _Body(NamedTuple):
+    arrays: Arrays
+    vertex_count: int
+    """Vertices of the file."""
+    welded_count: int
+    """Vertices that were at the position of another one."""
 
 
-def _path(data: bytes) -> Arrays:
+def _read_body(data: bytes) -> _Body:
     if data.startswith(b"PK"):
-        found = _arrays(data, {"time": ("time",), "move": ("time", 3), "turn": ("time", 3)})
-        _ascending(found["time"])
-        return found
-    lines = _text(data).splitlines()
-    if not lines or lines[0].replace(" ", "") != "time,x,y,z,rx,ry,rz":
+        arrays = _read_frames(data)
+    else:
+        polygons = read_polygons(data)
+        triangles = triangulate(polygons.positions, polygons.corners, polygons.sizes)
+        arrays = {
+            "positions": polygons.positions[None],
+            "triangles": triangles,
+            "times": np.zeros(1),
+        }
+    # Before the weld, which gives a triangle without an area a vertex twice.
+    _check_corners(arrays["triangles"])
+    _check_areas(_first_positions(arrays), arrays["triangles"])
+    body = _weld_body(arrays)
+    positions = _first_positions(body.arrays)
+    _check_edges(body.arrays["triangles"], len(positions))
+    _check_extent(positions)
+    return body
+
+
+def _first_positions(arrays: Arrays) -> Floats:
+    """Return the vertices of a body (N, 3): at rest if it is a skin, or in its first frame."""
+    positions: Floats = arrays["rest"] if "rest" in arrays else arrays["positions"][0]
+    return positions
+
+
+def _weld_body(arrays: Arrays) -> _Body:
+    """Weld the vertices of a body that are at equal positions at all times.
+
+    Programs write a vertex for each face that has a normal or a texture coordinate of its own.
+    """
+    if "rest" in arrays:
+        columns = np.column_stack([arrays["rest"], arrays["weights"]])
+    else:
+        positions = arrays["positions"]
+        columns = positions.transpose(1, 0, 2).reshape(positions.shape[1], -1)
+    same = weld(columns.astype(np.float64))
+    count = len(columns)
+    welded_count = count - len(same.kept)
+    if welded_count:
+        arrays = dict(arrays)
+        for name, axis in (("rest", 0), ("weights", 0), ("positions", 1)):
+            if name in arrays:
+                arrays[name] = np.take(arrays[name], same.kept, axis=axis)
+        arrays["triangles"] = same.targets[arrays["triangles"]]
+    return _Body(arrays, count, welded_count)
+
+
+def _read_frames(data: bytes) -> Arrays:
+    """Return the arrays of a body in an NPZ file: frames, or a skin."""
+    arrays = _read_arrays(data, _SKIN if "rest" in _array_names(data) else _FRAMES)
+    _check_ascending(arrays["times"])
+    count = len(_first_positions(arrays))
+    stated = arrays["triangles"]
+    triangles = stated.astype(np.int64)
+    wrong = stated[(triangles != stated) | (triangles < 0) | (triangles >= count)]
+    if wrong.size:
+        raise UnfitFileError(f"triangles must be vertices, 0 to {count - 1}, and has {wrong[0]}")
+    return {**arrays, "triangles": triangles}
+
+
+def _read_start(data: bytes) -> Arrays:
+    if data.startswith(b"PK"):
+        return _read_arrays(data, {"positions": ("vertex", 3)})
+    if not has_order(data):
         raise UnfitFileError(
-            "must begin with the line time,x,y,z,rx,ry,rz, and begins with "
-            f"{''.join(lines[:1])[:80]!r}"
+            "must be an OBJ, PLY or NPZ file with the vertices of the sheet in their order, and an "
+            "STL file has no such order"
         )
-    rows = []
-    for number, line in enumerate(lines[1:], 2):
-        try:
-            row = [float(word) for word in line.split(",")]
-        except ValueError:
-            row = []
-        if len(row) != 7 or not np.isfinite(row).all() or max(map(abs, row[1:4])) > FARTHEST:
-            raise UnfitFileError(
-                f"line {number} must be seven finite numbers [s, m, rad], and is {line[:80]!r}"
-            )
-        rows.append(row)
-    table = np.array(rows).reshape(-1, 7)
-    _ascending(table[:, 0])
-    return {"time": table[:, 0], "move": table[:, 1:4], "turn": table[:, 4:]}
+    return {"positions": read_polygons(data).positions}
 
 
-def _ascending(times: Floats) -> None:
-    if not len(times) or times[0] < 0 or not (np.diff(times) > 0).all():
-        shown = ", ".join(f"{time:g}" for time in times[:8])
+def _check_extent(positions: Floats) -> None:
+    """Raise UnfitFileError for a mesh whose size is that of another unit."""
+    extent = float((positions.max(axis=0) - positions.min(axis=0)).max())
+    if not SMALLEST <= extent <= LARGEST:
         raise UnfitFileError(
-            f"times must be instants that ascend from 0 s or later, and are {shown or 'none'} [s]"
+            f"must be {SMALLEST:g} to {LARGEST:g} m across, and is {extent:g} m{unit_hint(extent)}"
         )
 
 
-def _names(data: bytes) -> dict[str, int]:
-    """Return the arrays of an NPZ file with their sizes [bytes], before anything is decompressed."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return {
-                info.filename.removesuffix(".npy"): info.file_size for info in archive.infolist()
-            }
-    except (zipfile.BadZipFile, OSError) as error:
-        raise UnfitFileError(f"must be an NPZ file: {error}") from error
-
-
-def _arrays(data: bytes, shapes: _Shapes) -> Arrays:
-    """Return the arrays of an NPZ file: sides of their shapes with the same name must be equal."""
-    sizes = _names(data)
-    if missing := [name for name in shapes if name not in sizes]:
-        raise UnfitFileError(f"must have {', '.join(shapes)}, and {', '.join(missing)} is missing")
-    if sum(sizes.values()) > MAX_FILE_BYTES:
+def _check_corners(triangles: Indices) -> None:
+    names_twice = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    if names_twice.any():
         raise UnfitFileError(
-            f"must have at most {MAX_FILE_BYTES} bytes when unpacked, and has {sum(sizes.values())}"
+            "a triangle must have three vertices, and triangle "
+            f"{int(np.argmax(names_twice))} names one twice"
         )
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            found = {name: file[name] for name in shapes}
-    except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise UnfitFileError(f"must be an NPZ file of plain arrays: {error}") from error
-    sides: dict[Any, int] = {3: 3, 4: 4}
-    for name, values in found.items():
-        shape = shapes[name]
-        expected = ", ".join(str(sides.get(side, side)) for side in shape)
-        if values.ndim != len(shape) or not all(
-            n and n == sides.setdefault(side, n)
-            for side, n in zip(shape, values.shape, strict=True)
-        ):
-            raise UnfitFileError(f"{name} must be ({expected}), and is {values.shape}")
-        if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-            raise UnfitFileError(
-                f"{name} must be finite numbers, and is {values.dtype} with others"
-            )
-        if (
-            values.dtype.kind == "f"
-            and values.size
-            and np.abs(values).max() > FARTHEST
-            and "time" not in name
-        ):
-            raise UnfitFileError(
-                f"{name} must be within {FARTHEST:g} m, and reaches {np.abs(values).max():g} m"
-            )
-    return found
 
 
-def _check_edges(triangles: Triangles, vertices: int) -> None:
-    """Raise UnfitFileError where more than two triangles share an edge, or two that are turned
-    against each other.
+def _check_edges(triangles: Indices, vertices: int) -> None:
+    """Raise UnfitFileError if triangles are not the surface of a manifold, turned alike.
+
+    At most two triangles share an edge, and each runs along it in another direction.
     """
     if vertices > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
         raise UnfitFileError(
             f"must have at most {MAX_VERTICES} vertices and {MAX_TRIANGLES} triangles, and has "
-            f"{vertices} and "
-            f"{len(triangles)}"
+            f"{vertices} and {len(triangles)}"
         )
-    if len(same := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))):
+    _, first, counts = np.unique(
+        np.sort(triangles, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    if (counts > 1).any():
         raise UnfitFileError(
-            f"a triangle must have three vertices, and triangle {same[0]} names one twice"
+            f"each triangle must be there once, and {int((counts - 1).sum())} repeat another one, "
+            f"such as triangle {int(first[int(np.argmax(counts > 1))])}: delete them (in Blender: "
+            "merge vertices by distance)"
         )
     edges = np.concatenate([triangles[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
     _, counts = np.unique(edges, axis=0, return_counts=True)
@@ -336,80 +345,209 @@ def _check_edges(triangles: Triangles, vertices: int) -> None:
         )
 
 
-def _check_areas(vertices: Floats, triangles: Triangles) -> None:
-    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-    height = (
-        np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        / np.maximum(((b - a) ** 2).sum(axis=1), 1e-300) ** 0.5
-    )
-    if len(flat := np.flatnonzero(height <= 1e-12)):
+def _check_areas(vertices: Floats, triangles: Indices) -> None:
+    a = vertices[triangles[:, 0]]
+    b = vertices[triangles[:, 1]]
+    c = vertices[triangles[:, 2]]
+    # The height over the first edge, |ab x ac| / |ab|, has a unit that a limit can have.
+    doubled = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    length = np.linalg.norm(b - a, axis=1)
+    flat = doubled <= FLATTEST * np.maximum(length, np.finfo(float).tiny)
+    if flat.any():
         raise UnfitFileError(
-            f"all triangles must have areas above 0 m^2, and triangle {flat[0]} has none"
+            f"all triangles must have areas above 0 m^2, and triangle {int(np.argmax(flat))} has "
+            "none"
         )
 
 
-def _text(data: bytes) -> str:
+# ---- Folders of frames --------------------------------------------------------------------------
+
+
+def frames_of(files: Sequence[Path], scene: Scene, name: str) -> bytes:
+    """Return a folder of mesh files, one a frame of the body that names it, as one NPZ file.
+
+    Files that are no meshes are left out. Frames are in the order of the numbers in their names.
+
+    Raises:
+        UnfitFileError: A number is missing, or frames do not have the same faces.
+    """
+    files = _ordered_frames([file for file in files if file.suffix.lower() in MESH_SUFFIXES])
+    rates = [
+        body.frame_rate
+        for body in scene.bodies.values()
+        if isinstance(body, MeshBody) and body.file == name
+    ]
+    if not files or not rates or rates[0] is None:
+        raise UnfitFileError(
+            "must hold OBJ, PLY or STL files, one a frame, of a body with a frame_rate [1/s]"
+        )
+    frames = []
+    for file in files:
+        data = file.read_bytes()
+        check_file(data)
+        frames.append(read_polygons(data))
+        _check_same_faces(frames[0], frames[-1], files[0], file)
+    # All frames are cut as the first one: a triangle must not change from frame to frame.
+    triangles = triangulate(frames[0].positions, frames[0].corners, frames[0].sizes)
+    packed = io.BytesIO()
+    np.savez(
+        packed,
+        positions=np.stack([frame.positions for frame in frames]),
+        triangles=triangles,
+        times=np.arange(len(files)) / rates[0],
+    )
+    return packed.getvalue()
+
+
+def _check_same_faces(first: Polygons, frame: Polygons, first_file: Path, file: Path) -> None:
+    if (
+        first.positions.shape != frame.positions.shape
+        or not np.array_equal(first.corners, frame.corners)
+        or not np.array_equal(first.sizes, frame.sizes)
+    ):
+        raise UnfitFileError(
+            f"{file.name} must have the vertices and faces of {first_file.name}, in the same order"
+        )
+
+
+def _ordered_frames(files: list[Path]) -> list[Path]:
+    """Return the files of frames by the last number in their names; raise UnfitFileError.
+
+    As text, `frame_10` comes before `frame_2`.
+    """
+    if len(files) < 2:
+        return files
+    numbered: dict[int, Path] = {}
+    names: set[tuple[str, str]] = set()
+    for file in files:
+        match = re.fullmatch(r"(.*?)(\d+)(\D*)", file.stem)
+        if match is None:
+            raise UnfitFileError(
+                f"frames must have numbers in their names, as frame_1.obj, and {file.name} has none"
+            )
+        names.add((match[1], match[3] + file.suffix.lower()))
+        number = int(match[2])
+        if number in numbered:
+            raise UnfitFileError(
+                f"frames must have different numbers, and {numbered[number].name} and {file.name} "
+                f"have {number}"
+            )
+        numbered[number] = file
+    if len(names) > 1:
+        listed = ", ".join(sorted(before + "N" + after for before, after in names))
+        raise UnfitFileError(f"must hold the frames of one body, and holds {listed}")
+    first = min(numbered)
+    for number in range(first, first + len(numbered)):
+        if number not in numbered:
+            raise UnfitFileError(
+                f"frames must be numbered without gaps, and frame {number} is missing between "
+                f"{first} and {max(numbered)}"
+            )
+    return [numbered[number] for number in sorted(numbered)]
+
+
+# ---- Motions ------------------------------------------------------------------------------------
+
+
+def _read_path(data: bytes) -> Arrays:
+    if data.startswith(b"PK"):
+        arrays = _read_arrays(data, {"time": ("time",), "move": ("time", 3), "turn": ("time", 3)})
+        _check_ascending(arrays["time"])
+        return arrays
+    # utf-8-sig: spreadsheets write a byte order mark.
     try:
-        return data.decode("utf-8")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UnfitFileError(f"must be text in UTF-8, or an NPZ file: {error}") from error
+    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    try:
+        header = next(reader, [])
+        if tuple(cell.strip().lower() for cell in header) != PATH_COLUMNS:
+            raise UnfitFileError(
+                f"must begin with the line {','.join(PATH_COLUMNS)}, and begins with "
+                f"{','.join(header)[:80]!r}"
+            )
+        # Rows of empty cells are what spreadsheets leave below a table.
+        rows = [_path_row(cells, reader.line_num) for cells in reader if any(map(str.strip, cells))]
+    except csv.Error as error:
+        raise UnfitFileError(f"line {reader.line_num} must be CSV: {error}") from error
+    table = np.array(rows).reshape(-1, len(PATH_COLUMNS))
+    _check_ascending(table[:, 0])
+    return {"time": table[:, 0], "move": table[:, 1:4], "turn": table[:, 4:]}
 
 
-def read_obj(data: bytes) -> tuple[Floats, Triangles, Floats | None]:
-    """Return the vertices (N, 3), triangles (T, 3) and, if each vertex has one, texture coordinates
-    (N, 2).
-
-    Raises UnfitFileError for a line that is no vertex or face.
-    """
-    vertices: list[list[float]] = []
-    texture: list[list[float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    flat: dict[int, int] = {}
-    for number, line in enumerate(_text(data).splitlines(), 1):
-        word, *rest = line.split() or [""]
-        try:
-            if word in ("v", "vt"):
-                wanted = 3 if word == "v" else 2
-                numbers = [float(text) for text in rest[:wanted]]
-                if len(numbers) != wanted or not all(abs(value) <= FARTHEST for value in numbers):
-                    raise ValueError
-                (vertices if word == "v" else texture).append(numbers)
-            elif word == "f":
-                corners = [_corner(text, len(vertices), len(texture)) for text in rest]
-                if len(corners) < 3:
-                    raise ValueError
-                for vertex, of_texture in corners:
-                    if of_texture is not None and flat.setdefault(vertex, of_texture) != of_texture:
-                        raise UnfitFileError(
-                            f"line {number}: a vertex must have one texture coordinate, and "
-                            f"{vertex + 1} has two"
-                        )
-                names = [vertex for vertex, _ in corners]
-                triangles += [(names[0], b, c) for b, c in pairwise(names[1:])]
-        except UnfitFileError:
-            raise
-        except (ValueError, IndexError) as error:
-            rule = f"must be a vertex within {FARTHEST:g} m or a face of its vertices"
-            raise UnfitFileError(f"line {number} {rule}, and is {line.strip()[:80]!r}") from error
-    if not triangles:
-        raise UnfitFileError("must have faces, and has none")
-    every = (
-        [texture[flat[vertex]] for vertex in range(len(vertices))]
-        if len(flat) == len(vertices)
-        else None
-    )
-    return np.array(vertices), np.array(triangles), None if every is None else np.array(every)
+def _path_row(cells: list[str], line: int) -> list[float]:
+    try:
+        row = [float(cell) for cell in cells]
+    except ValueError:
+        row = []
+    if len(row) != len(PATH_COLUMNS) or not np.isfinite(row).all():
+        raise UnfitFileError(
+            f"line {line} must be seven finite numbers [s, m, rad], and is {','.join(cells)[:80]!r}"
+        )
+    farthest = max(map(abs, row[1:4]))
+    if farthest > FARTHEST:
+        raise UnfitFileError(
+            f"line {line} must move by at most {FARTHEST:g} m along each axis, and moves by "
+            f"{farthest:g} m"
+        )
+    return row
 
 
-def _corner(text: str, vertices: int, texture: int) -> tuple[int, int | None]:
-    """Return a corner of a face from 0: an OBJ file counts from 1, or from -1 back from the last
-    one.
-    """
-    found: list[int | None] = []
-    for word, count in zip(text.split("/"), (vertices, texture), strict=False):
-        number = int(word) if word else 0
-        if abs(number) > count or (not number and (word or not found)):
-            raise ValueError
-        found.append(None if not number else number - 1 if number > 0 else count + number)
-    assert found[0] is not None
-    return found[0], found[1] if len(found) > 1 else None
+def _check_ascending(times: Floats) -> None:
+    if not len(times) or times[0] < 0 or not (np.diff(times) > 0).all():
+        listed = ", ".join(f"{time:g}" for time in times[:8])
+        raise UnfitFileError(
+            f"times must be instants that ascend from 0 s or later, and are {listed or 'none'} [s]"
+        )
+
+
+# ---- NPZ ----------------------------------------------------------------------------------------
+
+
+def _array_names(data: bytes) -> set[str]:
+    """Return the names of the arrays of an NPZ file that has passed the gate."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
+def _read_arrays(data: bytes, shapes: _Shapes) -> Arrays:
+    """Return arrays of an NPZ file; sides of their shapes with the same name must be equal."""
+    missing = shapes.keys() - _array_names(data)
+    if missing:
+        listed = ", ".join(name for name in shapes if name in missing)
+        raise UnfitFileError(f"must have {', '.join(shapes)}, and {listed} is missing")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in shapes}
+    except (ValueError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise UnfitFileError(f"must be an NPZ file of plain arrays: {error}") from error
+    # A number in a shape stands for itself; a name stands for the first side that has it.
+    sides: dict[str | int, int] = {3: 3, 4: 4}
+    for name, values in arrays.items():
+        _check_shape(name, values.shape, shapes[name], sides)
+        _check_values(name, values)
+    return arrays
+
+
+def _check_shape(
+    name: str, shape: tuple[int, ...], expected: tuple[str | int, ...], sides: dict[str | int, int]
+) -> None:
+    """Raise UnfitFileError for a shape that does not fit; add its sides to the known `sides`."""
+    words = ", ".join(str(sides.get(side, side)) for side in expected)
+    refusal = UnfitFileError(f"{name} must be ({words}), and is {shape}")
+    if len(shape) != len(expected):
+        raise refusal
+    for side, extent in zip(expected, shape, strict=True):
+        if extent == 0 or extent != sides.setdefault(side, extent):
+            raise refusal
+
+
+def _check_values(name: str, values: npt.NDArray[Any]) -> None:
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise UnfitFileError(f"{name} must be finite numbers, and is {values.dtype} with others")
+    # All but times are lengths, or rotations and weights of order 1.
+    is_length = values.dtype.kind == "f" and "time" not in name
+    largest = float(np.abs(values).max()) if is_length else 0.0
+    if largest > FARTHEST:
+        raise UnfitFileError(f"{name} must be within {FARTHEST:g} m, and reaches {largest:g} m")

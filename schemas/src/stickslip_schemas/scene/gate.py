@@ -15,6 +15,15 @@ from math import prod
 
 from stickslip_schemas.scene.document import MAX_VERTICES
 from stickslip_schemas.scene.errors import UnfitFileError
+from stickslip_schemas.scene.mesh_files import (
+    STL_HEADER_BYTES,
+    is_binary_stl,
+    is_ply,
+    is_text_stl,
+    obj_text,
+    read_ply_header,
+)
+from stickslip_schemas.scene.polygons import MAX_CORNERS
 
 MAX_FILE_BYTES = 16 * 2**20
 """Largest file of a scene, and largest sum of the arrays of an NPZ file [bytes]."""
@@ -27,6 +36,9 @@ MAX_LINES = 1_000_000
 
 MAX_PATH_ROWS = 100_000
 """Rows of a path: 100 s at 1 kHz."""
+
+MAX_SOUP_VERTICES = 3 * MAX_TRIANGLES
+"""Vertices of a mesh before equal ones are welded: an STL file has three for each triangle."""
 
 MAX_FACE_BYTES = 64 * 2**10
 """Longest face of an OBJ file [bytes]: 2,000 corners with texture coordinates and normals."""
@@ -69,7 +81,9 @@ _NEWLINES = (
 """Everything at which `str.splitlines` begins a new line, in UTF-8."""
 
 _VERTEX = re.compile(rb"^[ \t]*v[ \t]", re.MULTILINE)
-_FACE = re.compile(rb"^[ \t]*f[ \t]([^\r\n]*)", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t]*f[ \t\x0b]([^\n]*)", re.MULTILINE)
+_FACET = re.compile(rb"\bendfacet\b", re.IGNORECASE)
+_PATH_TABLE = re.compile(rb"(?:\xef\xbb\xbf)?[ \t]*\"?time\b", re.IGNORECASE)
 
 
 def check_file(data: bytes) -> None:
@@ -82,22 +96,57 @@ def check_file(data: bytes) -> None:
     if data.startswith(_ZIP):
         _check_npz(data)
         return
+    if is_binary_stl(data):
+        count = int.from_bytes(data[STL_HEADER_BYTES - 4 : STL_HEADER_BYTES], "little")
+        _check_triangles(count)
+        return
+    if is_ply(data):
+        _check_ply(data)
+        return
     lines = sum(data.count(newline) for newline in _NEWLINES)
     if lines > MAX_LINES:
         raise UnfitFileError(f"must have at most {MAX_LINES} lines, and has {lines}")
-    if data.lstrip(b"\xef\xbb\xbf \t").startswith(b"time"):
+    if is_path_table(data):
         if lines > MAX_PATH_ROWS + 1:
             raise UnfitFileError(f"must have at most {MAX_PATH_ROWS} rows, and has {lines - 1}")
+    elif is_text_stl(data):
+        _check_triangles(sum(1 for _ in _FACET.finditer(data)))
     else:
-        _check_mesh(data)
+        _check_obj(data)
 
 
-def _check_mesh(data: bytes) -> None:
+def is_path_table(data: bytes) -> bool:
+    """Return whether a file begins like the CSV file of a motion."""
+    return _PATH_TABLE.match(data) is not None
+
+
+def _check_triangles(count: int) -> None:
+    if count > MAX_TRIANGLES:
+        raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has {count}")
+
+
+def _check_ply(data: bytes) -> None:
+    """Check the counts that the header of a PLY file states."""
+    header = read_ply_header(data)
+    _check_triangles(header.count("face"))
+    vertices = header.count("vertex")
+    if vertices > MAX_SOUP_VERTICES:
+        raise UnfitFileError(f"must have at most {MAX_SOUP_VERTICES} vertices, and has {vertices}")
+    # Each value takes a byte or more, so other elements cannot ask for more than the file has.
+    for element in header.elements:
+        if element.count > len(data):
+            raise UnfitFileError(
+                f"must have at most {len(data)} elements {element.name}, the bytes of the file, "
+                f"and its header states {element.count}"
+            )
+
+
+def _check_obj(data: bytes) -> None:
     """Count vertices and triangles of an OBJ file, up to their limits.
 
-    A face of n corners has n - 2 triangles. A backslash continues a line.
+    A face of n corners has n - 2 triangles.
     """
-    text = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    text = obj_text(data)
     vertices = sum(1 for _ in _VERTEX.finditer(text))
     if vertices > MAX_VERTICES:
         raise UnfitFileError(f"must have at most {MAX_VERTICES} vertices, and has {vertices}")
@@ -109,7 +158,12 @@ def _check_mesh(data: bytes) -> None:
                 f"a face must have at most {MAX_FACE_BYTES} bytes in its line, and one has "
                 f"{len(corners)}"
             )
-        triangles += max(1, len(corners.split()) - 2)
+        count = len(corners.split())
+        if count > MAX_CORNERS:
+            raise UnfitFileError(
+                f"a face must have at most {MAX_CORNERS} corners, and one has {count}"
+            )
+        triangles += max(1, count - 2)
         if triangles > MAX_TRIANGLES:
             raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has more")
 
@@ -190,7 +244,8 @@ def _check_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
         (length,) = struct.unpack(length_format, length_bytes)
         if length > MAX_HEADER_BYTES:
             raise UnfitFileError(
-                f"{name} must have a header of at most {MAX_HEADER_BYTES} bytes, and it has {length}"
+                f"{name} must have a header of at most {MAX_HEADER_BYTES} bytes, and it has "
+                f"{length}"
             )
         header = file.read(length)
     item_bytes, shape = _read_header(name, header)

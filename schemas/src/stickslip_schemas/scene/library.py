@@ -1,52 +1,19 @@
 """Built-in scenes: YAML files of this package, and the files that they name."""
 
-import re
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.names import did_you_mean
+from stickslip_schemas.spec.yaml_documents import parse_yaml
 
 SCENES = Path(__file__).parents[1] / "scenes"
 """Folder of the built-in scenes."""
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML in which `1e-3` is a number and a repeated key is an error."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is no word", key_node.start_mark
-                )
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is there twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
-    list("-+0123456789"),
-)
-
-
-def parse_yaml(text: str) -> Any:
-    """Return what a YAML file of ours holds; raise yaml.YAMLError."""
-    return yaml.load(text, _Loader)
-
-
 @cache
 def scene_names() -> tuple[str, ...]:
+    """Return the names of the built-in scenes, in order."""
     return tuple(sorted(file.stem for file in SCENES.glob("*.yaml")))
 
 
@@ -65,7 +32,7 @@ def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
 def load_scene(name: str) -> Scene:
     """Return a built-in scene, whose files are references to artifacts.
 
-    Raise ValueError for an unknown name.
+    Raises ValueError for an unknown name.
     """
     if name not in scene_names():
         raise ValueError(

@@ -1,12 +1,19 @@
 """Parameters of a scene, and the paths into the document that they set."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Never
 
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base import Document, Float, replace_at, unit_in, unit_of
+from stickslip_schemas.base import (
+    Document,
+    Float,
+    location_as_written,
+    replace_at,
+    unit_in,
+    unit_of,
+)
 from stickslip_schemas.spec.names import CustomName, did_you_mean
 
 Location = tuple[str | int, ...]
@@ -44,86 +51,77 @@ class Parameter(Document):
     description: str = Field(default="", max_length=300, description="for people")
 
     def check(
-        self, scene: Any, name: str, document: Mapping[str, Any], taken: dict[Location, str]
+        self, scene: Any, name: str, document: Mapping[str, Any], owners: dict[Location, str]
     ) -> None:
         """Check a parameter of a scene, whose `document` is JSON.
 
-        `taken` has the locations of parameters before it.
+        `owners` has the locations of parameters before it, and gets those of this one.
         """
-        here: Location = ("parameters", name)
+        parent: Location = ("parameters", name)
         if name in LOOKS_AXES:
-            refuse(
-                scene,
-                here,
-                f"must not have the name of an axis of all scenes: {', '.join(LOOKS_AXES)}",
-                name,
-            )
+            rule = f"must not have the name of an axis of all scenes: {', '.join(LOOKS_AXES)}"
+            refuse(scene, parent, rule, name)
         defaults = []
         for number, path in enumerate(self.sets):
-            path_location = (*here, "sets", number)
+            path_location = (*parent, "sets", number)
             try:
                 location = resolve_path(document, path)
             except LookupError as error:
                 refuse(scene, path_location, str(error.args[0]), path)
-            value = value_at(document, location)
-            is_number = isinstance(value, float) and not set(location) & {*_FIXED}
-            sized = (
-                location[0] == "sheets"
-                and location[2] == "mesh"
-                and document["sheets"][location[1]]["mesh"]["type"] != "grid"
-            )
-            if not ((is_number and not sized) or location[-1] == "material"):
-                rule = (
-                    "must lead to a number or a material, and not to what decides on shapes of "
-                    "arrays or on files"
-                )
+            self._check_target(scene, parent, path, location, document)
+            # Two parameters at one location would contradict each other.
+            if location in owners:
+                rule = f"must not lead where {owners[location]!r} does"
                 refuse(scene, path_location, rule, path)
-            if is_number and self.unit != (unit := unit_in(scene, location)):
-                refuse(scene, (*here, "unit"), f"must be {unit}, as of {path}", self.unit)
-            if location in taken:
-                refuse(scene, path_location, f"must not lead where {taken[location]!r} does", path)
-            taken[location] = name
-            defaults.append(value)
+            owners[location] = name
+            defaults.append(value_at(document, location))
         if len(set(defaults)) > 1:
-            rule = "must find one value, the default, at all locations"
-            refuse(
-                scene,
-                (*here, "sets"),
-                f"{rule}; they have {', '.join(map(str, defaults))}",
-                list(self.sets),
-            )
-        self._check_range(scene, here, defaults[0])
+            rule = "must find one value, the default, at all paths; they have "
+            rule += ", ".join(map(str, defaults))
+            refuse(scene, (*parent, "sets"), rule, list(self.sets))
+        self._check_range(scene, parent, defaults[0])
 
-    def _check_range(self, scene: Any, here: Location, default: Value) -> None:
+    def _check_target(
+        self, scene: Any, parent: Location, path: str, location: Location, document: Any
+    ) -> None:
+        """Check that a parameter may set the value at a location, and has its unit."""
+        value = value_at(document, location)
+        is_number = isinstance(value, float) and not set(location) & {*_FIXED}
+        # Sizes of a grid leave its vertices alone; those of other meshes change their number.
+        decides_on_shapes = (
+            location[0] == "sheets"
+            and location[2] == "mesh"
+            and document["sheets"][location[1]]["mesh"]["type"] != "grid"
+        )
+        number = self.sets.index(path)
+        if not ((is_number and not decides_on_shapes) or location[-1] == "material"):
+            rule = (
+                "must lead to a number or a material, and not to a value that decides on shapes of "
+                "arrays or on files"
+            )
+            refuse(scene, (*parent, "sets", number), rule, path)
+        unit = unit_in(scene, location) if is_number else self.unit
+        if self.unit != unit:
+            refuse(scene, (*parent, "unit"), f"must be {unit}, as of {path}", self.unit)
+
+    def _check_range(self, scene: Any, parent: Location, default: Value) -> None:
         if isinstance(default, str) or self.values is not None:
-            for end in ("low", "high"):
-                if getattr(self, end) is not None:
-                    refuse(
-                        scene,
-                        (*here, end),
-                        "is for numbers without a list of values",
-                        getattr(self, end),
-                    )
+            for end, bound in (("low", self.low), ("high", self.high)):
+                if bound is not None:
+                    rule = "is for numbers without a list of values"
+                    refuse(scene, (*parent, end), rule, bound)
             for number, value in enumerate(self.values or ()):
                 if type(value) is not type(default):
                     kind = "name" if isinstance(default, str) else "number"
-                    refuse(
-                        scene,
-                        (*here, "values", number),
-                        f"must be a {kind}, as in the document",
-                        value,
-                    )
+                    rule = f"must be a {kind}, as in the document"
+                    refuse(scene, (*parent, "values", number), rule, value)
         elif self.low is None or self.high is None or not self.low < self.high:
-            refuse(
-                scene,
-                (*here, "low"),
-                f"low and high [{self.unit}] must be given, low below high",
-                self.low,
-            )
+            rule = f"low and high [{self.unit}] must be given, low below high"
+            refuse(scene, (*parent, "low"), rule, self.low)
+        # The document itself must be a point of the grid.
         if not self.allows(default):
-            refuse(
-                scene, (*here, "sets", 0), f"must lead to a default within {self.range}", default
-            )
+            rule = f"must lead to a default within {self.range}"
+            refuse(scene, (*parent, "sets", 0), rule, default)
 
     @property
     def extremes(self) -> list[tuple[Location, Value]]:
@@ -167,31 +165,36 @@ def resolve_path(document: Mapping[str, Any], path: str) -> Location:
         raise LookupError(
             f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}"
         )
-    here: Any = document
+    value: Any = document
     location: list[str | int] = []
     for word in words:
-        step: str | int = int(word) if isinstance(here, list) and word.isdecimal() else word
-        known = (
-            range(len(here))
-            if isinstance(here, list)
-            else list(here)
-            if isinstance(here, dict)
-            else []
-        )
+        # A word is a name in a mapping and a position in a list. Nothing else has parts.
+        step: str | int = word
+        known: Sequence[str | int] = ()
+        if isinstance(value, dict):
+            known = list(value)
+        elif isinstance(value, list):
+            known = range(len(value))
+            step = int(word) if word.isdecimal() else word
         if step not in known:
-            names = [str(name) for name in known]
-            where = ".".join(map(str, location)) or "the document"
-            raise LookupError(
-                f"must be a path into the document: {where} has no "
-                f"{word!r}{did_you_mean(word, names)}"
-                + (f"; it has {', '.join(names[:32])}" if names else "")
-            )
-        here = here[step]
+            raise LookupError(_dead_end(location, word, [str(name) for name in known]))
+        value = value[step]
         location.append(step)
     return tuple(location)
 
 
+def _dead_end(location: Sequence[str | int], word: str, names: list[str]) -> str:
+    """Return the message for a path that leads nowhere from a location on."""
+    parent = ".".join(map(str, location)) or "the document"
+    hint = did_you_mean(word, names)
+    message = f"must be a path into the document: {parent} has no {word!r}{hint}"
+    if names:
+        message += f"; it has {', '.join(names[:32])}"
+    return message
+
+
 def value_at(document: Any, location: Location) -> Any:
+    """Return the value at a location of a document."""
     for step in location:
         document = document[step]
     return document
@@ -215,24 +218,12 @@ def refuse(model: BaseModel, location: Location, rule: str, value: Any) -> Never
     )
 
 
-def refuse_as(error: ValidationError, scene: BaseModel, location: Location, value: Any) -> Never:
-    """Raise a ValidationError for a value that another part of a document, a scene, makes wrong."""
+def refuse_as(error: ValidationError, scene: Any, location: Location, value: Any) -> Never:
+    """Raise a ValidationError for a value that breaks a rule of the scene that it is put into.
+
+    The value stands at `location` of the spec; the message names the path in the scene.
+    """
     first = error.errors(include_url=False)[0]
     rule = first["msg"].removeprefix("Value error, ") + unit_of(first, type(scene))
-    path = ".".join(_path_in(scene.model_dump(mode="json"), first["loc"]))
-    refuse(scene, location, f"sets {path}: {rule}", value)
-
-
-def _path_in(document: Any, location: Location) -> list[str]:
-    """Return the steps of a location that lead into a document.
-
-    pydantic adds the tags of unions, which nobody has written.
-    """
-    steps = []
-    for step in location:
-        try:
-            document = document[step]
-        except (KeyError, IndexError, TypeError):
-            continue  # a tag is no key of an object and no position in a list
-        steps.append(str(step))
-    return steps
+    written = location_as_written(first["loc"], scene.physics(), keep_last=True)
+    refuse(scene, location, f"sets {'.'.join(map(str, written))}: {rule}", value)

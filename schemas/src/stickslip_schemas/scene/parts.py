@@ -23,6 +23,21 @@ from stickslip_schemas.spec.names import (
     did_you_mean,
 )
 
+SMALLEST = 1e-3
+"""Least extent of a sheet or of a mesh [m]: anything smaller is taken for another unit."""
+LARGEST = 10.0
+"""Largest extent of a sheet or of a mesh [m]."""
+
+
+def unit_hint(extent: float) -> str:
+    """Return a question for the unit of a length [m] that is out of range."""
+    # Programs of engineers write millimetres. A length that is too small may have been converted
+    # twice, or be in kilometres.
+    if extent > LARGEST:
+        return f"; did you mean mm? Lengths are in metres, and {extent:g} mm are {extent / 1000:g}"
+    return f"; did you mean {extent * 1000:g} m? Lengths are in metres, not in mm or km"
+
+
 Length = Annotated[Float, Field(gt=0, le=100)]
 Place = Annotated[Float, Field(ge=-100, le=100)]
 Vector = tuple[Place, Place, Place]

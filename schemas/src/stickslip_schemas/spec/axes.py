@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Self, TypeVa
 
 from pydantic import BeforeValidator, FailFast, Field, GetJsonSchemaHandler, Strict, model_validator
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from stickslip_schemas.base import WHOLE, Document
 
@@ -105,7 +105,13 @@ class SobolAxis(_RangeAxis[T], Generic[T]):
 def _long_form(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return {"type": "list", "values": value}
-    if isinstance(value, int | float | str) and not isinstance(value, bool):
+    # In Python, True is an int.
+    if value is None or isinstance(value, bool):
+        raise PydanticCustomError(
+            "axis_form",
+            "must be a value, a list of values, or an object with the field type",
+        )
+    if isinstance(value, int | float | str):
         return {"type": "list", "values": [value]}
     return value
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
+from itertools import chain, product
 from math import ceil, floor
 from operator import mul
 from pathlib import Path
@@ -42,10 +43,10 @@ Lens = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 NO_LENS: Lens = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_TOLERANCE = 1e-6  # of R R^T - 1: calibration files print six digits or more
 
-_INVERSIONS = (
-    60  # steps to the place that a lens moved: each leaves two thirds of the error, or less
-)
-_BORDER = 16  # places along each side of a picture at which it is found out how far a lens sees
+_INVERSIONS = 60
+"""Fixed-point steps that invert a lens: each leaves two thirds of the error, or less."""
+_BORDER = 16
+"""Points along each side of a picture at which the reach of a lens is measured."""
 
 
 def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
@@ -53,25 +54,26 @@ def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
     k1, k2, p1, p2, k3 = lens
     s = x * x + y * y
     g = 1.0 + s * (k1 + s * (k2 + s * k3))
-    return x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x), y * g + p1 * (
-        s + 2.0 * y * y
-    ) + 2.0 * p2 * x * y
+    u = x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)
+    v = y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y
+    return u, v
 
 
 def undistorted(u: Any, v: Any, lens: Lens) -> tuple[Any, Any]:
     """Return the places that a lens shows at (u, v), by fixed-point steps; numbers or arrays."""
     if not any(lens):
         return u, v
-    x, y = u, v
+    x = u
+    y = v
     k1, k2, p1, p2, k3 = lens
+    # Solve the formula above for x and y where they stand alone, with the last s, g and x y.
     for _ in range(_INVERSIONS):
         s = x * x + y * y
         g = 1.0 + s * (k1 + s * (k2 + s * k3))
         xy = 2.0 * x * y
-        x, y = (
-            (u - p1 * xy - p2 * (s + 2.0 * x * x)) / g,
-            (v - p1 * (s + 2.0 * y * y) - p2 * xy) / g,
-        )
+        next_x = (u - p1 * xy - p2 * (s + 2.0 * x * x)) / g
+        y = (v - p1 * (s + 2.0 * y * y) - p2 * xy) / g
+        x = next_x
     return x, y
 
 
@@ -102,10 +104,11 @@ class Camera(Document):
     @field_validator("rotation")
     @classmethod
     def _is_rotation(cls, rotation: Matrix3) -> Matrix3:
-        products = (
-            (i, j, sum(map(mul, rotation[i], rotation[j]))) for i in range(3) for j in range(3)
-        )
-        error = max(abs(product - (i == j)) for i, j, product in products)
+        # R R^T must be the identity: rows of length 1 at right angles.
+        error = 0.0
+        for (i, row), (j, other) in product(enumerate(rotation), repeat=2):
+            error = max(error, abs(sum(map(mul, row, other)) - (i == j)))
+        # A mirror image has the determinant -1.
         (a, b, c), (d, e, f), (g, h, k) = rotation
         det = a * (e * k - f * h) - b * (d * k - f * g) + c * (d * h - e * g)
         if error > ROTATION_TOLERANCE or det < 0:
@@ -165,11 +168,9 @@ class Camera(Document):
 
     def border(self) -> list[tuple[float, float]]:
         """Return the points of the plane at depth 1 that the lens shows along the border."""
-        along = [k / _BORDER for k in range(_BORDER + 1)]
-        places = [(a, b) for a in along for b in (0.0, 1.0)] + [
-            (a, b) for a in (0.0, 1.0) for b in along
-        ]
-        pixels = ((a * self.width - 0.5, b * self.height - 0.5) for a, b in places)
+        fractions = [k / _BORDER for k in range(_BORDER + 1)]
+        points = [*product(fractions, (0.0, 1.0)), *product((0.0, 1.0), fractions)]
+        pixels = ((a * self.width - 0.5, b * self.height - 0.5) for a, b in points)
         return [
             undistorted((u - self.cx) / self.fx, (v - self.cy) / self.fy, self.distortion)
             for u, v in pixels
@@ -180,8 +181,11 @@ class Camera(Document):
         if not any(self.distortion):
             return self
         x, y = zip(*self.border(), strict=True)
-        left, top = floor(self.fx * min(x) + self.cx), floor(self.fy * min(y) + self.cy)
-        right, bottom = ceil(self.fx * max(x) + self.cx), ceil(self.fy * max(y) + self.cy)
+        # Whole pixels outwards, so that the frame holds all of the border.
+        left = floor(self.fx * min(x) + self.cx)
+        top = floor(self.fy * min(y) + self.cy)
+        right = ceil(self.fx * max(x) + self.cx)
+        bottom = ceil(self.fy * max(y) + self.cy)
         size = {
             "width": right - left + 1,
             "height": bottom - top + 1,
@@ -198,7 +202,7 @@ class Camera(Document):
             self.fy,
             self.cx,
             self.cy,
-            *(v for row in self.rotation for v in row),
+            *chain.from_iterable(self.rotation),
             *self.translation,
         ]
 
@@ -214,16 +218,17 @@ class Camera(Document):
         """
         import numpy as np
 
-        if (
-            any(self.distortion)
-            and (outside := self.pinhole().overflow(points, radius, margin)) > 0.0
-        ):
-            return outside
+        # A lens may fold points far outside into its picture. The pinhole camera does not.
+        if any(self.distortion):
+            outside = self.pinhole().overflow(points, radius, margin)
+            if outside > 0.0:
+                return outside
         pixels, depth = self.project(points)
         if not bool(np.all(depth > radius)):
             return float("inf")
         disc = radius / depth[..., None] * np.array([self.fx, self.fy])
-        low, high = -0.5 + margin, np.array([self.width, self.height]) - 0.5 - margin
+        low = -0.5 + margin
+        high = np.array([self.width, self.height]) - 0.5 - margin
         return float(max((low - (pixels - disc)).max(), (pixels + disc - high).max()))
 
 
@@ -232,9 +237,17 @@ def square(name: str, size: int, focal: float, rotation: Any, translation: Vecto
 
     `size` and `focal` are in pixels.
     """
-    middle, at = (size - 1) / 2, {"rotation": rotation, "translation": translation}
+    middle = (size - 1) / 2
     return Camera(
-        name=name, width=size, height=size, fx=focal, fy=focal, cx=middle, cy=middle, **at
+        name=name,
+        width=size,
+        height=size,
+        fx=focal,
+        fy=focal,
+        cx=middle,
+        cy=middle,
+        rotation=rotation,
+        translation=translation,
     )
 
 
@@ -250,8 +263,9 @@ _FRAMED_MARGIN = 10.0  # [px] at 224 pixels
 def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) -> Camera:
     """Return the nearest upright camera that has all points (n, 3) in its square frame.
 
-    A point (X, Y, Z) in the camera's directions is in the frame where |X + t_x| <= k (Z + t_z), and the same of Y, so
-    t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of Y, and t_x centres the points.
+    A point (X, Y, Z) in the camera's directions is in the frame if |X + t_x| <= k (Z + t_z), and
+    the same of Y. So t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of
+    Y, and t_x centres the points.
 
     Args:
         name: One of `FRAMING`.
@@ -261,10 +275,12 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
     """
     import numpy as np
 
+    # The axes of the camera: it looks at the points from azimuth a and elevation e.
     a, e = np.radians(FRAMING[name]) + np.array([np.radians(turn), 0.0])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
     R = np.stack([right, np.cross(forward, right), forward])
+    # The points along these axes, and the narrowest frame around them.
     x, y, z = R @ np.asarray(points, dtype=np.float64).reshape(-1, 3).T
     scale = size / 224.0
     focal = _FRAMED_FOCAL * scale
@@ -299,6 +315,7 @@ def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
 
 @cache
 def rig_names() -> tuple[str, ...]:
+    """Return the names of the shipped rigs, in order."""
     return tuple(sorted(file.stem for file in RIGS.glob("*.toml")))
 
 

@@ -227,7 +227,7 @@ class JobSpec(Document):
 
     @property
     def needs_certificate(self) -> bool:
-        """True where no sample may be made without a passing certificate."""
+        """True if no sample may be made without a passing certificate."""
         raise NotImplementedError
 
     @property
@@ -348,6 +348,7 @@ class JobSpec(Document):
 
     @property
     def sample_count(self) -> int:
+        """Number of points of the grid."""
         sizes = [axis.num for axis in self.named_axes.values()]
         return sizes[0] if self.combine == "zip" else prod(sizes)
 
@@ -374,11 +375,12 @@ class JobSpec(Document):
 
     def columns(self) -> list[list[Any]]:
         """Return the values of each axis, in order."""
-        axes = enumerate(self.named_axes.values())
-        return [
-            axis_values(axis, dimension=place if self.combine == "zip" else 0)
-            for place, axis in axes
-        ]
+        # Zipped axes are sampled together, so each takes another dimension of the sequence.
+        columns: list[list[Any]] = []
+        for position, axis in enumerate(self.named_axes.values()):
+            dimension = position if self.combine == "zip" else 0
+            columns.append(axis_values(axis, dimension=dimension))
+        return columns
 
     def combined(self, columns: Sequence[Iterable[Any]]) -> Iterator[tuple[Any, ...]]:
         """Combine one column of cells for each axis: all with all, or row by row."""
@@ -391,6 +393,7 @@ class JobSpec(Document):
 
     def samples_per_file(self, array: ArrayLayout) -> int:
         """Return the number of consecutive samples in every file of an array except the last."""
+        # A label is small: its files hold samples of many shards.
         if array.is_label:
             most = max(arrays.LEAST_LABEL_SAMPLES, arrays.LABEL_CHUNK_BYTES // array.sample_bytes)
             return min(most, arrays.LABEL_SAMPLES, self.sample_count)
@@ -419,17 +422,16 @@ class JobSpec(Document):
         seeds: tuple[SeedRule, ...],
     ) -> D:
         fields: dict[str, Any] = {}
-        for axis, given in point.items():
-            for path, value in self.document_fields(axis, given).items():
+        for axis, axis_value in point.items():
+            for path, value in self.document_fields(axis, axis_value).items():
                 name, *inner = path.split("/")
                 if name in model.model_fields:
                     fields[name] = replace_at(fields.get(name, settings.get(name)), inner, value)
-        drawn = {
-            rule.field: derived_seed(
-                self.seed, rule.purpose, {axis: point[axis] for axis in self.seed_axes(rule)}
-            )
-            for rule in seeds
-        }
+        drawn: dict[str, int] = {}
+        for rule in seeds:
+            # A seed depends on values of axes, and not on the slot: a larger grid keeps it.
+            values = {axis: point[axis] for axis in self.seed_axes(rule)}
+            drawn[rule.field] = derived_seed(self.seed, rule.purpose, values)
         return model(**{**settings, **fields, **drawn})
 
     def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:

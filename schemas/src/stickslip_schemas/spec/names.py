@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from enum import StrEnum
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field, Strict, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, Strict, WithJsonSchema, model_validator
 
 from stickslip_schemas.base import WHOLE, Document, Float
 from stickslip_schemas.spec.arrays import CLIP_SIZE
@@ -191,7 +191,7 @@ FIELD_OF_VIEW = (3.0, 150.0)
 
 _TOLERANCE = 1e-9
 _RADII = 64  # at which a lens is checked
-_FOUND = 1e-3  # to which the border of a clip must be found through its lens [px]
+_BORDER_TOLERANCE = 1e-3  # of the border of a clip that is traced through its lens and back [px]
 
 Azimuth = Annotated[Float, Field(ge=-180, le=180)]
 Elevation = Annotated[Float, Field(ge=5, le=90)]
@@ -304,6 +304,27 @@ class FloorNumbers(_Ranges):
     )
 
 
+def _flatten_vector(value: Any) -> Any:
+    """Return a column or a row of numbers as a plain list, as OpenCV's arrays are written.
+
+    `solvePnP` returns rvec and tvec as [[a], [b], [c]], and `calibrateCamera` the distortion as
+    [[k1, k2, p1, p2, k3]].
+    """
+    if not isinstance(value, list | tuple) or not value:
+        return value
+    # A plain list has numbers in it, and no lists.
+    rows = [row for row in value if isinstance(row, list | tuple)]
+    if len(rows) != len(value):
+        return value
+    is_row = len(rows) == 1
+    is_column = all(len(row) == 1 for row in rows)
+    return [number for row in rows for number in row] if is_row or is_column else value
+
+
+FLATTENED = BeforeValidator(_flatten_vector)
+"""Takes the vectors of OpenCV as they are."""
+
+
 class Calibration(Document):
     """A custom camera, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
 
@@ -318,15 +339,19 @@ class Calibration(Document):
     camera_matrix: tuple[Row, Row, Row] = Field(
         description="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px]"
     )
-    distortion: tuple[Float, ...] = Field(
+    distortion: Annotated[tuple[Float, ...], FLATTENED] = Field(
         default=(),
         max_length=14,
-        description="distortion coefficients k1, k2, p1, p2, k3 of the lens; further ones must be 0",
+        description=(
+            "distortion coefficients k1, k2, p1, p2, k3 of the lens; further ones must be 0"
+        ),
     )
-    rvec: Row = Field(
+    rvec: Annotated[Row, FLATTENED] = Field(
         description="rotation from the world to the camera, as a Rodrigues vector [rad]"
     )
-    tvec: Row = Field(description="the world's origin in the camera's axes [m]")
+    tvec: Annotated[Row, FLATTENED] = Field(
+        description="the world's origin in the camera's axes [m]"
+    )
 
     @model_validator(mode="after")
     def _can_be_rendered(self) -> Self:
@@ -344,13 +369,12 @@ class Calibration(Document):
                 f"no skew; it is {[list(row) for row in self.camera_matrix]}"
             )
         for axis, f, c, side in zip("xy", (fx, fy), (cx, cy), self.image_size, strict=True):
+            # A field of view of 2 a sees half of the side at the focal length side / (2 tan a).
             least, most = (
                 0.5 * side / math.tan(math.radians(0.5 * view)) for view in reversed(FIELD_OF_VIEW)
             )
-            for name, value, low, high in (
-                ("f", f, least, most),
-                ("c", c, -0.5 * side, 1.5 * side),
-            ):
+            ranges = (("f", f, least, most), ("c", c, -0.5 * side, 1.5 * side))
+            for name, value, low, high in ranges:
                 if not low <= value <= high:
                     raise ValueError(
                         f"camera_matrix must have {name}{axis} from {low:.4g} to {high:.4g} px, "
@@ -375,24 +399,21 @@ class Calibration(Document):
         """
         camera = self.camera("own")
         border = camera.border()
-        farthest = sum(max(abs(place[axis]) for place in border) ** 2 for axis in range(2))
+        # s = x^2 + y^2 of the corner of the box around all that the square shows.
+        farthest = max(abs(x) for x, _ in border) ** 2 + max(abs(y) for _, y in border) ** 2
+        # Points must move outwards in their order: d(r g) / dr > 0 at all radii.
         k1, k2, _, _, k3 = camera.distortion
-        radii = (k / _RADII * farthest for k in range(_RADII + 1))
-        rising = all(
-            1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3)) > 0.0 for s in radii
-        )  # d(r g) / dr
-        shown = [distorted(x, y, camera.distortion) for x, y in border]
-        pixels = [(camera.fx * u + camera.cx, camera.fy * v + camera.cy) for u, v in shown]
-        sides = [
-            min(abs(p - side) for p in pixel for side in (-0.5, CLIP_SIZE - 0.5))
-            for pixel in pixels
-        ]
-        found = all(side < _FOUND for side in sides)
-        if not (
-            rising
-            and found
-            and farthest <= 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2
-        ):
+        squares = [k / _RADII * farthest for k in range(_RADII + 1)]
+        is_rising = all(1.0 + s * (3.0 * k1 + s * (5.0 * k2 + s * 7.0 * k3)) > 0.0 for s in squares)
+        # The lens was inverted along the border: its image must be the border again.
+        is_inverted = True
+        for x, y in border:
+            u, v = distorted(x, y, camera.distortion)
+            pixel = (camera.fx * u + camera.cx, camera.fy * v + camera.cy)
+            gaps = [min(abs(p + 0.5), abs(p - CLIP_SIZE + 0.5)) for p in pixel]
+            is_inverted = is_inverted and min(gaps) < _BORDER_TOLERANCE
+        widest = 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2
+        if not (is_rising and is_inverted and farthest <= widest):
             raise ValueError(
                 "distortion must move places outwards in their order over the whole square of the "
                 "clip, for a field of "
@@ -410,7 +431,8 @@ class Calibration(Document):
         (fx, _, cx), (_, fy, cy), _ = self.camera_matrix
         # Pixel centres are whole numbers: the left edge of the square is at (width - side) / 2 -
         # 1/2.
-        left, top = (width - side) / 2, (height - side) / 2
+        left = (width - side) / 2
+        top = (height - side) / 2
         return Camera(
             name=name,
             width=CLIP_SIZE,
@@ -432,7 +454,8 @@ def _rotation(rvec: Row) -> tuple[Row, Row, Row]:
     """
     angle = math.hypot(*rvec)
     x, y, z = (value / angle if angle > _TOLERANCE else value for value in rvec)
-    s, c = math.sin(angle), 1.0 - math.cos(angle)
+    s = math.sin(angle)
+    c = 1.0 - math.cos(angle)
     return (
         (1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y),
         (c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x),

@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
-from stickslip_schemas.scene.library import load_scene, parse_yaml
+from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_schemas.spec.names import MATERIAL_NAME
+from stickslip_schemas.spec.yaml_documents import parse_yaml
 
 from stickslip_services.cli.common import field_line
 from stickslip_services.client.errors import ClientError
@@ -241,19 +242,13 @@ def _inline_files(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str
         if not file.is_relative_to(folder):
             raise UnfitFileError("must be in the folder of the scene, and a link leads out of it")
         if file.is_dir():
-            return frames_of(sorted(file.glob("*.obj"), key=_frame_order), scene, name)
+            return frames_of(sorted(file.iterdir()), scene, name)
         return file.read_bytes()
 
     try:
         return inlined(scene, read)
     except UnfitFileError as error:
         raise CommandError(f"{path} is not valid\n  {error}") from error
-
-
-def _frame_order(file: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts `frame_2` before `frame_10`: numbers in a name count as numbers."""
-    pieces = re.split(r"(\d+)", file.name)
-    return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in pieces]
 
 
 def check_spec(document: Mapping[str, Any], path: Path) -> JobSpec:

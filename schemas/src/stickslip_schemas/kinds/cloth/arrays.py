@@ -35,19 +35,20 @@ def over_time(
     **more: Any,
 ) -> ArrayLayout:
     """Return a recorded array: a number, or an array of dimensions `of`, at each instant."""
-    said = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
+    attributes = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
     return array(
         name,
         text,
         dtype,
         {"instant": spec.instants, **(of or {})},
         is_recorded=True,
-        attributes=said,
+        attributes=attributes,
         **more,
     )
 
 
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
+    """Return the arrays of clips and the labels of looks, which all kinds of cloth have."""
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
     light = "azimuth and elevation of the lamp [degree], its power over the nominal"
@@ -77,8 +78,8 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
         array("frame_share", "share of the frame that is cloth, mean of the clip", "float32"),
         array("visible_share", "share of the cloth in sight, mean of the clip", "float32"),
         *(
-            array(f"psnr_{name}", f"PSNR over {of} [dB], NaN: not measured", "float32")
-            for name, of in REGIONS.items()
+            array(f"psnr_{name}", f"PSNR over {region} [dB], NaN: not measured", "float32")
+            for name, region in REGIONS.items()
         ),
         array(
             "psnr_deviation",
@@ -178,6 +179,7 @@ def _check(name: str, text: str, limit: float | None) -> ArrayLayout:
 
 
 def solver_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
+    """Return the labels of the solver and of its checks, which all kinds of cloth have."""
     return (
         codes("kernel", KERNELS),
         array("steps", "time steps of the solver", "int32"),
@@ -201,6 +203,10 @@ def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
         "bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2}
     )
     rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
+    meshes: list[ArrayLayout] = []
+    if spec.store_positions:
+        for name in scene.sheets:
+            meshes += _mesh(spec, scene, name)
     labels: list[ArrayLayout] = []
     for name, sheet in scene.sheets.items():
         labels += fabric_arrays(f"{name}.")
@@ -226,78 +232,96 @@ def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
         *labels,
         *solver_arrays(spec),
         *_tracks(spec, scene),
-        *(
-            each
-            for name in scene.sheets
-            for each in _mesh(spec, scene, name)
-            if spec.store_positions
-        ),
+        *meshes,
     )
 
 
 def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
     """Return the label of a parameter: a number with its unit, or the code of a fabric."""
-    given = scene.parameters[parameter]
+    document = scene.parameters[parameter]
     if isinstance(scene.default(parameter), float):
-        return array(parameter, f"{given.description or 'parameter of the scene'} [{given.unit}]")
+        description = document.description or "parameter of the scene"
+        return array(parameter, f"{description} [{document.unit}]")
     return codes(parameter, (*Material, *scene.materials))
 
 
 def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
     """Yield forces and poses, in the order of names that their attributes give."""
-    sheets, bodies, holders = (
-        list(scene.sheets),
-        list(scene.bodies),
-        [f"{a}.{b}" for a, b in scene.holders],
-    )
-    on, pose = {"sheets": sheets, "others": [*bodies, *sheets]}, {"row": 3, "column": 4}
-    by = {"sheet": len(sheets), "other": len(on["others"]), "xyz": 3}
+    sheets = list(scene.sheets)
+    bodies = list(scene.bodies)
+    holders = [f"{sheet}.{holder}" for sheet, holder in scene.holders]
+    pose = {"row": 3, "column": 4}
+
+    # Forces are on sheets, from bodies first and then from sheets.
+    others = [*bodies, *sheets]
     yield over_time(
         spec,
         "contact_force",
         "force of bodies, then sheets, on each sheet [N]",
-        of=by,
-        attributes=on,
+        of={"sheet": len(sheets), "other": len(others), "xyz": 3},
+        attributes={"sheets": sheets, "others": others},
     )
     if bodies:
-        of, names = {"body": len(bodies), **pose}, {"names": bodies}
         yield over_time(
-            spec, "body_pose", "x -> A x + b from a body's axes [m]", of=of, attributes=names
+            spec,
+            "body_pose",
+            "x -> A x + b from a body's axes [m]",
+            of={"body": len(bodies), **pose},
+            attributes={"names": bodies},
         )
     if holders:
-        held, said = {"holder": len(holders)}, {"attributes": {"names": holders}}
-        force, placed = (
+        by_holder = {"holder": len(holders)}
+        names = {"names": holders}
+        yield over_time(
+            spec,
+            "holder_force",
             "force of each holder on its sheet [N]",
-            "x -> A x + b from a holder's axes [m]",
+            of={**by_holder, "xyz": 3},
+            attributes=names,
         )
-        yield over_time(spec, "holder_force", force, "float32", {**held, "xyz": 3}, **said)
-        yield over_time(spec, "holder_pose", placed, "float32", {**held, **pose}, **said)
-        yield over_time(spec, "grasped", "1 while a holder holds", "uint8", held, **said)
+        yield over_time(
+            spec,
+            "holder_pose",
+            "x -> A x + b from a holder's axes [m]",
+            of={**by_holder, **pose},
+            attributes=names,
+        )
+        yield over_time(
+            spec, "grasped", "1 while a holder holds", "uint8", by_holder, attributes=names
+        )
 
 
 def _mesh(spec: ClipSpec, scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
+    """Return the mesh of a sheet, its motion and its contact."""
     vertices, triangles = scene.sheets[sheet].mesh.shape
-    vertex, corners = {f"{sheet}.vertex": vertices}, {f"{sheet}.triangle": triangles, "corner": 3}
-    states, positions = {"categories": STATES}, dict[str, Any](per_sample=True, is_trajectory=True)
+    # Dimensions have the name of the sheet: sheets have different numbers of vertices.
+    by_vertex = {f"{sheet}.vertex": vertices}
+    by_corner = {f"{sheet}.triangle": triangles, "corner": 3}
     return (
         over_time(
             spec,
             f"{sheet}.positions",
             "positions of the vertices [m]",
-            of={**vertex, "xyz": 3},
-            **positions,
+            of={**by_vertex, "xyz": 3},
+            per_sample=True,
+            is_trajectory=True,
         ),
         over_time(
-            spec, f"{sheet}.contact", "contact of each vertex", "uint8", vertex, attributes=states
+            spec,
+            f"{sheet}.contact",
+            "contact of each vertex",
+            "uint8",
+            by_vertex,
+            attributes={"categories": STATES},
         ),
         array(
             f"{sheet}.rest",
             "the flat sheet (warp, weft) [m]",
             "float32",
-            {**vertex, "uv": 2},
+            {**by_vertex, "uv": 2},
             is_recorded=True,
         ),
         array(
-            f"{sheet}.triangles", "vertices of the triangles", "int32", corners, is_recorded=True
+            f"{sheet}.triangles", "vertices of the triangles", "int32", by_corner, is_recorded=True
         ),
     )
