@@ -12,8 +12,10 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
-from stickslip_services.pages.browsing import coloured, mp4, sample_view, sliders, thumbs
-from stickslip_services.pages.samples import deformed, motion
+from stickslip_services.pages.browsing import sliders, thumbs
+from stickslip_services.pages.motion import deformed, motion
+from stickslip_services.pages.pictures import coloured, mp4
+from stickslip_services.pages.sample_page import sample_view
 
 
 def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:

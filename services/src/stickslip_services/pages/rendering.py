@@ -27,34 +27,36 @@ STATIC = Path(__file__).parent / "static"
 
 _POLICY = {
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-        "base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+        "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     ),
     "Referrer-Policy": "same-origin",
     "Cache-Control": "no-store",
+    "Vary": "Authorization",
 }
+"""Headers of all pages: they load and send nothing elsewhere, and nobody keeps them."""
 
 
-def html_page(template: str, status: int = 200, **values: Any) -> Response:
-    """Return a rendered template, all of whose values are escaped, as a response with its security
-    headers.
-    """
+def html_page(template: str, status: int = 200, **values: object) -> Response:
+    """Return a rendered template with its security headers. All of its values are escaped."""
     content = _environment().get_template(template).render(**values)
     return Response(content, status, media_type="text/html", headers=_POLICY)
 
 
 @cache
 def _environment() -> Environment:
-    made = Environment(
+    environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.policies["json.dumps_kwargs"] = {}  # curves keep their order
-    made.filters |= {each.__name__: each for each in (duration, size, number, moment, ago, words)}
-    return made
+    # Curves keep their order, and a script of the page could not read NaN.
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
+    filters = (duration, size, number, moment, ago, words)
+    environment.filters |= {function.__name__: function for function in filters}
+    return environment
 
 
 def spec_text(spec: JobSpec) -> str:
@@ -62,9 +64,8 @@ def spec_text(spec: JobSpec) -> str:
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
     for name, axis in document["axes"].items():
         if axis["type"] == "list":
-            document["axes"][name] = (
-                axis["values"][0] if len(axis["values"]) == 1 else axis["values"]
-            )
+            values = axis["values"]
+            document["axes"][name] = values[0] if len(values) == 1 else values
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 
@@ -74,15 +75,20 @@ def number(value: object) -> str:
         return "yes" if value else "no"
     if isinstance(value, int):
         return f"{value:,}"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return str(value)
 
 
 def moment(value: datetime | None) -> str:
+    """Return a time as text, to the minute; an empty text for None."""
     return "" if value is None else f"{value:%Y-%m-%d %H:%M} UTC"
 
 
 def ago(value: datetime) -> str:
-    return f"{duration(max(0.0, time.time() - value.astimezone(UTC).timestamp()))} ago"
+    """Return the time since a moment as text, for example `4 min ago`."""
+    seconds = time.time() - value.astimezone(UTC).timestamp()
+    return f"{duration(max(0.0, seconds))} ago"
 
 
 def words(value: object) -> str:
@@ -112,81 +118,89 @@ def plot(
     return {"tables": tables, "x": x_name, "y": y_name, "log": is_log, "timed": is_timed}
 
 
-CELLS = 12
+MAX_CELLS = 12
 """Most cells of a map along an axis. An axis with no more values than that has a cell for each."""
 
 Flags = npt.NDArray[np.bool_]
 
 
 class Axis(NamedTuple):
-    """An axis of the grid: the values of each cell and of all, as text, and the cell of each
-    sample, by slot.
-    """
+    """An axis of the grid, divided into cells."""
 
     name: str
     texts: list[str]
+    """The values of each cell."""
     range: str
+    """All values."""
     cell: npt.NDArray[np.int64]
+    """The cell of each sample, by slot."""
 
 
 def grid_maps(
     spec: JobSpec, done: Flags, lost: Flags, *, most: int | None = None
 ) -> list[dict[str, Any]]:
-    """Return maps of all samples, done and lost by slot, for each pair of axes or for the `most`
-    first pairs.
+    """Return maps of all samples for each pair of axes, or for the `most` first pairs.
 
-    A map has the axes `across` and `up`, and `cells` that hold samples, counted from the lower
-    left. A grid with one axis of several values has one map with one row.
+    `done` and `lost` are by slot. A map has the axes `across` and `up`, and `cells` that hold
+    samples, counted from the lower left. A grid with one axis of several values has one map with
+    one row.
     """
     columns = [np.asarray(column) for column in spec.columns()]
     slots = np.arange(spec.sample_count)
-    places = (
-        [slots] * len(columns)
-        if spec.combine == "zip"
-        else np.unravel_index(slots, [len(own) for own in columns])
-    )
-    axes = [
-        _axis(name, own[at]) for name, own, at in zip(spec.named_axes, columns, places, strict=True)
-    ]
-    axes = [axis for axis in axes if len(axis.texts) > 1]
+    if spec.combine == "zip":
+        positions = [slots] * len(columns)
+    else:
+        # The last axis varies fastest.
+        positions = list(np.unravel_index(slots, [len(column) for column in columns]))
+    axes = []
+    for name, column, position in zip(spec.named_axes, columns, positions, strict=True):
+        axis = _axis(name, column[position])
+        if len(axis.texts) > 1:
+            axes.append(axis)
     if len(axes) == 1:
         axes.append(Axis("", [""], "", np.zeros_like(slots)))
     return [_map(across, up, done, lost) for across, up in islice(combinations(axes, 2), most)]
 
 
 def _axis(name: str, values: npt.NDArray[Any]) -> Axis:
-    known, cell = np.unique(values, return_inverse=True)
-    texts = [_text(value) for value in known]
-    span = texts[0] if len(texts) == 1 else f"{texts[0]} to {texts[-1]}"
-    if (
-        len(known) > CELLS and known.dtype.kind == "U"
-    ):  # names have no distances: each cell gets as many
-        first = -(-np.arange(CELLS + 1) * len(known) // CELLS)
-        texts = [f"{known[a]} to {known[b - 1]}" for a, b in pairwise(first)]
-        cell = np.searchsorted(first, cell, side="right") - 1
-    elif len(known) > CELLS:
-        bounds = np.linspace(known[0], known[-1], CELLS + 1)
-        texts = [f"{_text(a)} to {_text(b)}" for a, b in pairwise(bounds)]
-        cell = np.minimum(np.searchsorted(bounds, values, side="right") - 1, CELLS - 1)
-    return Axis(name, texts, span, cell)
+    """Return an axis from the value of each sample."""
+    distinct, cell = np.unique(values, return_inverse=True)
+    texts = [_text(value) for value in distinct]
+    whole_range = texts[0] if len(texts) == 1 else f"{texts[0]} to {texts[-1]}"
+    is_name = distinct.dtype.kind == "U"
+    if len(distinct) > MAX_CELLS and is_name:
+        # Names have no distances: each cell gets as many.
+        bounds = -(-np.arange(MAX_CELLS + 1) * len(distinct) // MAX_CELLS)
+        texts = [f"{distinct[first]} to {distinct[end - 1]}" for first, end in pairwise(bounds)]
+        cell = np.searchsorted(bounds, cell, side="right") - 1
+    elif len(distinct) > MAX_CELLS:
+        bounds = np.linspace(distinct[0], distinct[-1], MAX_CELLS + 1)
+        texts = [f"{_text(low)} to {_text(high)}" for low, high in pairwise(bounds)]
+        # The largest value belongs to the last cell.
+        cell = np.minimum(np.searchsorted(bounds, values, side="right") - 1, MAX_CELLS - 1)
+    return Axis(name, texts, whole_range, cell)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return str(value) if isinstance(value, str) else f"{value:.4g}"
 
 
 def _map(across: Axis, up: Axis, done: Flags, lost: Flags) -> dict[str, Any]:
-    columns, rows = len(across.texts), len(up.texts)
-    place = across.cell * rows + up.cell
-    numbers = np.stack(
-        [np.bincount(place[of], minlength=columns * rows) for of in (slice(None), done, lost)]
-    )
+    """Return a map: the numbers of samples, of those done and of those lost, of each cell."""
+    row_count = len(up.texts)
+    cell_count = len(across.texts) * row_count
+    cell_of_slot = across.cell * row_count + up.cell
+    counts = {
+        "samples": np.bincount(cell_of_slot, minlength=cell_count),
+        "done": np.bincount(cell_of_slot[done], minlength=cell_count),
+        "lost": np.bincount(cell_of_slot[lost], minlength=cell_count),
+    }
     cells = []
-    for at in np.flatnonzero(numbers[0]).tolist():
-        i, j = divmod(at, rows)
-        region = f"{across.name} {across.texts[i]}" + (
-            f", {up.name} {up.texts[j]}" if up.name else ""
-        )
-        counts = dict(zip(("samples", "done", "lost"), numbers[:, at].tolist(), strict=True))
-        cells.append({"i": i, "j": j, "region": region, **counts})
+    for cell in np.flatnonzero(counts["samples"]).tolist():
+        i, j = divmod(cell, row_count)
+        region = f"{across.name} {across.texts[i]}"
+        if up.name:
+            region += f", {up.name} {up.texts[j]}"
+        numbers = {name: int(column[cell]) for name, column in counts.items()}
+        cells.append({"i": i, "j": j, "region": region, **numbers})
     return {"across": across, "up": up, "cells": cells}

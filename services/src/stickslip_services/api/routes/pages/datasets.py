@@ -28,17 +28,12 @@ from stickslip_services.catalog.versions import (
 )
 from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import (
-    coloured,
-    histograms,
-    losses,
-    mp4,
-    sample_view,
-    sliders,
-    thumbs,
-)
+from stickslip_services.pages.browsing import histograms, losses, sliders, thumbs
+from stickslip_services.pages.motion import motion
+from stickslip_services.pages.pictures import coloured, mp4
 from stickslip_services.pages.rendering import html_page, plot, spec_text, table
-from stickslip_services.pages.samples import SampleData, motion
+from stickslip_services.pages.sample_page import sample_view
+from stickslip_services.pages.samples import SampleData
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers
 
@@ -198,7 +193,7 @@ def get_motion(opened: OpenedDep, slot: Slot) -> Response:
     except KeyError as error:
         name = f"version {opened.version.version} of {opened.dataset.id}"
         raise NotFoundError(f"{name} has no shape of a sample {slot}") from error
-    return Response(json.dumps(document), media_type="application/json")
+    return Response(json.dumps(document, allow_nan=False), media_type="application/json")
 
 
 def _value(data: SampleData, array: str, slot: int) -> Any:
