@@ -18,7 +18,7 @@ from numcodecs.zstd import Zstd
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.codecs import encode_chunk
 from stickslip_schemas.format.manifest import Manifest, seal_text, with_manifest_digest
-from stickslip_schemas.transport.limits import DOCUMENT_BYTES
+from stickslip_schemas.transport.limits import DOCUMENT_BYTES, DOCUMENT_CONTAINERS, DOCUMENT_VALUES
 from stickslip_services.app import make_app
 from stickslip_services.client import Client, pull
 from stickslip_services.settings import Settings
@@ -232,6 +232,51 @@ def test_a_manifest_of_many_files(
     reseal(server, honest[0], manifest)
     status, _, memory = run_pull(server, honest[1].dataset, tmp_path / "d")
     assert status == 1
+    assert memory < MEMORY_LIMIT
+
+
+def long_list(item: str, field: str, document: dict[str, object]) -> bytes:
+    """Return a manifest with a list of as many items in a field as the largest document takes."""
+    text = json.dumps(document, separators=(",", ":"))
+    count = (DOCUMENT_BYTES - len(text)) // (len(item) + 1) - 1
+    return text.replace(f'"{field}":[]', f'"{field}":[{",".join([item] * count)}]').encode()
+
+
+@pytest.mark.parametrize("item", ["[]", '""', "0.5", "{}"])
+@pytest.mark.parametrize("field", ["files", "sample_keys", "gamma"])
+def test_a_manifest_of_wrong_values(
+    server: Server,
+    honest: tuple[dict[str, bytes], Manifest],
+    tmp_path: Path,
+    item: str,
+    field: str,
+) -> None:
+    """Neither the values nor the errors that they cause fill the memory."""
+    document = json.loads(honest[0]["manifest"])
+    if field == "gamma":
+        document["spec"]["axes"]["gamma"] = []
+    else:
+        document[field] = []
+    manifest = long_list(item, field, document)
+    assert len(manifest) > 0.9 * DOCUMENT_BYTES
+    reseal(server, honest[0], manifest)
+    status, error, memory = run_pull(server, honest[1].dataset, tmp_path / "d")
+    assert (status, "must have at most" in " ".join(error.split())) == (1, True), error
+    assert memory < MEMORY_LIMIT
+
+
+@pytest.mark.parametrize("item", ["{}", '""', "0.5"])
+def test_as_many_wrong_values_as_are_parsed(
+    server: Server, honest: tuple[dict[str, bytes], Manifest], tmp_path: Path, item: str
+) -> None:
+    document = json.loads(honest[0]["manifest"])
+    document["files"] = []
+    count = DOCUMENT_CONTAINERS - 1000 if item == "{}" else DOCUMENT_VALUES - 1000
+    text = json.dumps(document, separators=(",", ":"))
+    manifest = text.replace('"files":[]', f'"files":[{",".join([item] * count)}]').encode()
+    reseal(server, honest[0], manifest)
+    status, error, memory = run_pull(server, honest[1].dataset, tmp_path / "d")
+    assert (status, "sent an unexpected answer: files.0" in " ".join(error.split())) == (1, True)
     assert memory < MEMORY_LIMIT
 
 

@@ -6,8 +6,8 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -206,7 +206,9 @@ ATTACK = "\x1b]0;owned\x07 \x9b31m red‮gnihton"
 
 
 @contextmanager
-def answering(answer: Callable[[str], tuple[int, str, bytes]]) -> Iterator[str]:
+def answering(
+    answer: Callable[[str], tuple[int, str, bytes]], event_headers: Mapping[str, str] | None = None
+) -> Iterator[str]:
     """The URL of a server that answers as `answer` says: status, media type and body of a path."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -215,8 +217,12 @@ def answering(answer: Callable[[str], tuple[int, str, bytes]]) -> Iterator[str]:
             self.send_response(status)
             self.send_header("Content-Type", media_type)
             self.send_header("Content-Length", str(len(body)))
+            if self.path.endswith("/events"):
+                for header, value in (event_headers or {}).items():
+                    self.send_header(header, value)
             self.end_headers()
-            self.wfile.write(body)
+            with suppress(OSError):
+                self.wfile.write(body)
 
         def log_message(self, *_: object) -> None:
             pass
@@ -263,6 +269,25 @@ def test_tables_of_a_hostile_server_are_clean(origin: tuple[str, str, str]) -> N
             assert "owned" in shown.stdout
             assert not {"\x1b", "\x07", "\x9b", "‮"} & set(shown.output)
             assert "\nerror: do" not in shown.output
+
+
+@pytest.mark.parametrize("fault", ["endless", "gzip"])
+def test_an_event_stream_that_is_no_stream(origin: tuple[str, str, str], fault: str) -> None:
+    with Client(origin[0]) as client:
+        job = client.request("GET", f"/v1/jobs/{origin[1]}").json() | {"state": "running"}
+    body = json.dumps(job).encode()
+
+    def answer(path: str) -> tuple[int, str, bytes]:
+        if not path.endswith("/events"):
+            return 200, "application/json", body
+        return 200, "text/event-stream", b"data: " + b"x" * 2**22
+
+    with answering(answer, {"Content-Encoding": "gzip"} if fault == "gzip" else {}) as url:
+        shown = run(url, "watch", job["id"], COLUMNS="300")
+    assert shown.exit_code == 1
+    expected = "compressed body" if fault == "gzip" else "sent an event of over 1048576 bytes"
+    assert expected in shown.stderr
+    assert isinstance(shown.exception, SystemExit)
 
 
 def test_ordinary_text_stays_as_it_is() -> None:

@@ -13,9 +13,9 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import FailFast, Field, model_validator
 
 from stickslip_schemas.base import Document, Int, Reason, Sha256, sha256
 from stickslip_schemas.kinds import AnyJobSpec, registered
@@ -70,6 +70,12 @@ def section_path(number: int) -> str:
 _SHARD = re.compile(r"[^/]+/c/(\d{1,18})(?:/|$)")
 
 
+T = TypeVar("T")
+
+LongTuple = Annotated[tuple[T, ...], FailFast()]
+"""A list that may be long: its first wrong item is the only one that an error names."""
+
+
 class FileEntry(Document):
     """A file of a dataset: its path inside the dataset, its digest and its size in bytes."""
 
@@ -95,9 +101,9 @@ class ManifestSection(Document):
     """
 
     first: Int = Field(ge=0, description="slot of the first sample")
-    sample_keys: tuple[Sha256, ...] = Field(min_length=1, description="by slot")
-    rejections: tuple[Rejection, ...]
-    files: tuple[FileEntry, ...]
+    sample_keys: LongTuple[Sha256] = Field(min_length=1, description="by slot")
+    rejections: LongTuple[Rejection]
+    files: LongTuple[FileEntry]
 
     @property
     def end(self) -> int:
@@ -171,20 +177,20 @@ class Manifest(Document):
     valid_count: int = Field(ge=0)
     split_counts: dict[str, int] = Field(description="valid samples by split")
     rejection_counts: dict[str, int] = Field(description="rejected samples by reason")
-    sections: tuple[FileEntry, ...] = Field(
+    sections: LongTuple[FileEntry] = Field(
         default=(),
         description=(
             "files that list samples and the files of their shards, by slot; none in a "
             "small version"
         ),
     )
-    rejections: tuple[Rejection, ...] = Field(
+    rejections: LongTuple[Rejection] = Field(
         description="empty where there are sections, which have them"
     )
-    sample_keys: tuple[Sha256, ...] = Field(
+    sample_keys: LongTuple[Sha256] = Field(
         description="by slot; empty where there are sections, which have them"
     )
-    files: tuple[FileEntry, ...] = Field(
+    files: LongTuple[FileEntry] = Field(
         description="every file of the version, by path, but the three that vouch for it (this "
         "one, the root's "
         "zarr.json and manifest.sha256), the sections, and what the sections list"

@@ -169,6 +169,8 @@ class HttpClient:
                 response = self._attempt(method, url, limit, options)
             except httpx.InvalidURL as error:
                 raise TransportError(f"is not a URL: {error}") from error
+            except httpx.TooManyRedirects as error:
+                raise TransportError("sends from one URL to another without an end") from error
             except httpx.TransportError as error:
                 is_absent = isinstance(error, httpx.ConnectError | httpx.ProxyError)
                 if is_last or (is_absent and not self._was_answered):

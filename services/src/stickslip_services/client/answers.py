@@ -13,6 +13,7 @@ import httpx
 from pydantic import JsonValue, TypeAdapter, ValidationError
 from stickslip_schemas.documents.problems import MEDIA_TYPE, Problem
 from stickslip_schemas.transport.addresses import without_password
+from stickslip_schemas.transport.limits import check_values
 from stickslip_schemas.transport.proxies import through
 
 from stickslip_services.client.errors import ProblemError, UnexpectedError
@@ -76,6 +77,10 @@ def parse(model: type[T], content: bytes, url: str) -> T:
     Raises:
         UnexpectedError: The content is not such a document.
     """
+    try:
+        check_values(content)
+    except ValueError as error:
+        raise UnexpectedError(f"the document of {without_password(url)} {error}") from error
     try:
         return TypeAdapter(model).validate_json(printable_json(content))
     except ValidationError as error:

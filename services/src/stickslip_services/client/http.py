@@ -28,7 +28,7 @@ from stickslip_schemas.transport.http import (
     TransportError,
     read_bounded,
 )
-from stickslip_schemas.transport.limits import DOCUMENT_BYTES
+from stickslip_schemas.transport.limits import DOCUMENT_BYTES, check_values
 from stickslip_schemas.transport.proxies import object_store_options
 
 from stickslip_services.client.answers import parse, raise_for_problem
@@ -239,9 +239,13 @@ class Client:
         if last_id:
             headers["Last-Event-ID"] = last_id
         path = f"/v1/jobs/{job_id}/events"
-        with self._http.stream("GET", path, silence=SILENCE_SECONDS, headers=headers) as response:
-            self.check_status(response)
-            yield from read_messages(response.iter_raw())
+        stream = self._http.stream("GET", path, silence=SILENCE_SECONDS, headers=headers)
+        try:
+            with stream as response:
+                self.check_status(response)
+                yield from read_messages(response.iter_raw())
+        except AnswerError as error:
+            raise UnexpectedError(str(error)) from error
 
     def datasets(self) -> Iterator[responses.Dataset]:
         """Yield all datasets, newest first."""
@@ -293,7 +297,12 @@ class Client:
                     f"{file.path} must have at most {DOCUMENT_BYTES} bytes, and the manifest says "
                     f"{file.size}"
                 )
-            return self.request("GET", root + file.path, limit=file.size).content
+            content = self.request("GET", root + file.path, limit=file.size).content
+            try:
+                check_values(content)
+            except ValueError as error:
+                raise DamagedError(f"{file.path} {error}") from error
+            return content
 
         return read
 

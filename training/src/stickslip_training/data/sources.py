@@ -24,7 +24,7 @@ from stickslip_schemas.transport.addresses import (
     check_url,
     coordinator_url,
 )
-from stickslip_schemas.transport.limits import DOCUMENT_BYTES
+from stickslip_schemas.transport.limits import DOCUMENT_BYTES, check_values
 from stickslip_schemas.transport.proxies import through
 
 if TYPE_CHECKING:
@@ -91,9 +91,18 @@ class Source(ABC):
     def read_manifest(self) -> bytes:
         """Return the manifest's bytes."""
         try:
-            return self.fetch(MANIFEST_NAME).data
+            manifest = self.fetch(MANIFEST_NAME).data
         except MissingFileError as error:
             raise MissingFileError(f"{error}: this is no committed dataset version") from None
+        self._check_values(MANIFEST_NAME, manifest)
+        return manifest
+
+    def _check_values(self, path: str, document: bytes) -> None:
+        """Raise CorruptDataError for a document whose parsing would fill the memory."""
+        try:
+            check_values(document)
+        except ValueError as error:
+            raise CorruptDataError(f"{self}/{path} {error}") from error
 
     def read(self, file: FileEntry, offset: int = 0, length: int | None = None) -> bytes:
         """Return `length` bytes from `offset`, or the rest of the file.
@@ -130,7 +139,9 @@ class Source(ABC):
                 f"{self}/{file.path} has {file.size} bytes, and a document has at most "
                 f"{DOCUMENT_BYTES}"
             )
-        return self.read(file)
+        document = self.read(file)
+        self._check_values(file.path, document)
+        return document
 
     def computed_digest(self, file: FileEntry) -> str:
         """Return the SHA-256 of the file, which is read in blocks.
