@@ -181,7 +181,7 @@ def test_watchers_share_one_look_at_the_database_and_miss_nothing(
     assert app.state.feeds._feeds == {}  # nobody watches any more
 
 
-@pytest.mark.parametrize("limit", ["MOST_STREAMS", "ALL_STREAMS"])
+@pytest.mark.parametrize("limit", ["MAX_OWN_STREAMS", "MAX_STREAMS"])
 def test_an_address_has_only_so_many_streams_and_so_have_all(
     client: httpx.Client, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
