@@ -113,7 +113,10 @@ def sealer(settings: Settings) -> Fernet:
 
 
 def admit_local_worker(connection: Connection, path: Path, now: float) -> None:
-    """Register the secret of the local workers as a key of the scope `work`; replace a revoked one."""
+    """Register the secret of the local workers as a key of the scope `work`.
+
+    A secret whose key was revoked is replaced.
+    """
     digest = sha256(secret_in(path).encode())
     row = connection.execute(
         select(api_keys.c.revoked_at).where(api_keys.c.digest == digest)

@@ -38,6 +38,8 @@ _STATM = Path("/proc/self/statm")
 
 Answer = dict[str, Any]
 
+logger = logging.getLogger(__name__)
+
 
 def _inspect_texture(data: bytes, _question: Answer) -> object:
     """Return the side of a texture [px]."""
@@ -78,7 +80,7 @@ def _answer(question: Answer, data: bytes) -> Answer:
     # A bug, or a decoder that fails in an unknown way. The coordinator logs it and refuses the
     # file, since nothing is known about it.
     except Exception:
-        logging.exception("an inspection failed")
+        logger.exception("an inspection failed")
         return {"failure": traceback.format_exc()}
 
 

@@ -36,7 +36,7 @@ class Inspector:
         self._program: subprocess.Popen[bytes] | None = None
         self._requests: socket.socket | None = None
 
-    def inspect(self, file: IO[bytes], question: dict[str, Any]) -> Any:
+    def inspect(self, file: IO[bytes], question: dict[str, Any]) -> object:
         """Return the result of an inspection of a file; raise UnfitFileError.
 
         `question` names the inspection and its parameters.
@@ -54,7 +54,7 @@ class Inspector:
             raise UnfitFileError(answer["unfit"])
         return answer["result"]
 
-    def inspect_bytes(self, data: bytes, question: dict[str, Any]) -> Any:
+    def inspect_bytes(self, data: bytes, question: dict[str, Any]) -> object:
         """Return the result of an inspection of data; raise UnfitFileError."""
         with tempfile.TemporaryFile() as file:
             file.write(data)

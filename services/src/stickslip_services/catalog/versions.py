@@ -93,7 +93,7 @@ def sign_version(store: Store, dataset: str, version: int, seal: bytes, key: Pat
 
 
 def mend_signature(store: Store, dataset: str, version: int, seal: bytes, key: Path) -> bool:
-    """Sign a version whose signature is not there or broken; return whether it was.
+    """Sign a version whose signature is missing or broken; return whether it was signed.
 
     Raises ClientError if the key cannot sign, OSError where the store is out of reach.
     """
@@ -108,15 +108,19 @@ def mend_signature(store: Store, dataset: str, version: int, seal: bytes, key: P
 
 def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:
     """Raise CorruptArtifactError where an artifact of a worker's output is not in the store."""
-    named: dict[Sha256, int] = {}
+    # An artifact must be at least as long as its parts that the output names.
+    min_sizes: dict[Sha256, int] = {}
     if isinstance(output, SimulateOutput):
-        named[output.record.digest] = 1
+        min_sizes[output.record.digest] = 1
     elif isinstance(output, RenderOutput):
-        named |= {chunk.digest: chunk.offset + chunk.length for chunk in output.chunks.values()}
-        named |= {} if output.preview is None else {output.preview: 1}
+        for chunk in output.chunks.values():
+            min_sizes[chunk.digest] = chunk.offset + chunk.length
+        if output.preview is not None:
+            min_sizes[output.preview] = 1
     else:
-        named |= {file.sha256: file.size for file in output.files} | {output.labels: 1}
-    for digest, size in named.items():
+        min_sizes |= {file.sha256: file.size for file in output.files}
+        min_sizes[output.labels] = 1
+    for digest, size in min_sizes.items():
         if not store.exists(digest, size=size):
             raise CorruptArtifactError(
                 f"artifact {digest} must be in the store with at least {size} bytes"
@@ -133,7 +137,7 @@ def find_reserved(connection: Connection, publish_task: int) -> tuple[str, int] 
 
 
 def version_number(connection: Connection, dataset: str, publish_task: int) -> int:
-    """Return the version number reserved for a publish task, or the next free one of its dataset."""
+    """Return the version number of a publish task: its own, or the next free one of its dataset."""
     reserved = find_reserved(connection, publish_task)
     if reserved is not None:
         return reserved[1]
@@ -142,6 +146,7 @@ def version_number(connection: Connection, dataset: str, publish_task: int) -> i
 
 
 def reserve_number(connection: Connection, dataset: str, version: int, publish_task: int) -> None:
+    """Reserve a version number for a publish task."""
     connection.execute(
         insert(dataset_versions).values(dataset=dataset, version=version, publish_task=publish_task)
     )
@@ -182,6 +187,7 @@ def commit_version(
 
 
 def find_committed(connection: Connection, publish_task: int) -> Row[Any]:
+    """Return the row of the version that a publish task has made."""
     return connection.execute(
         select(dataset_versions).where(dataset_versions.c.publish_task == publish_task)
     ).one()
@@ -190,31 +196,31 @@ def find_committed(connection: Connection, publish_task: int) -> Row[Any]:
 def damaged_files(
     store: Store, manifest: Sha256, group: Sha256, *, rate: float = inf
 ) -> Mapping[str, Sha256] | None:
-    """Return path and digest of the damaged files of a version, in the store or in the version's
-    directory.
+    """Return path and digest of the damaged files of a version.
 
-    None if the manifest, the root's metadata or the seal is damaged, so that the others are
-    unknown. All files are read, at `rate` [bytes/s]. Raises OSError where the store is out of
-    reach.
+    Both the artifact in the store and the file in the directory of the version are read, at `rate`
+    [bytes/s]. None if the manifest, the root's metadata or the seal is damaged, so that the others
+    are unknown. Raises OSError if the store is out of reach.
     """
-    own = sealed_digests(manifest, group)
+    sealed = sealed_digests(manifest, group)
     try:
         contents = stored_contents(store, manifest)
-        check_seal(*map(store.read, own.values()))
+        check_seal(*map(store.read, sealed.values()))
         listed = list(contents.files())
     except (OSError, ValueError) as error:
         if isinstance(error, OSError) and is_unavailable(error):
             raise
         return None
-    files = own | {file.path: file.sha256 for file in listed}
+    files = sealed | {file.path: file.sha256 for file in listed}
     sizes = {file.path: file.size for file in listed}
+    dataset = contents.manifest.dataset
+    version = contents.manifest.version
 
-    def is_whole(shown: tuple[str, Sha256]) -> bool:
-        path, digest = shown
+    def is_whole(entry: tuple[str, Sha256]) -> bool:
+        path, digest = entry
+        # Reading as fast as the disk can would slow the tasks down.
         time.sleep(sizes.get(path, 0) / rate)
-        return store.shows(
-            digest, contents.manifest.dataset, contents.manifest.version, path
-        ) and store.holds(digest)
+        return store.shows(digest, dataset, version, path) and store.holds(digest)
 
     # Threads of a pool would read to the end before the process may end.
     whole = in_parallel(is_whole, files.items()) if rate == inf else map(is_whole, files.items())

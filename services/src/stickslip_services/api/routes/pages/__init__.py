@@ -1,1 +1,4 @@
-"""Pages for people: the dashboard at `/`. They are not part of the API and may change at any time."""
+"""Pages for people: the dashboard at `/`.
+
+They are not part of the API and may change at any time.
+"""

@@ -33,11 +33,19 @@ from stickslip_services.pages.motion import motion
 from stickslip_services.pages.pictures import coloured, mp4
 from stickslip_services.pages.rendering import html_page, plot, spec_text, table
 from stickslip_services.pages.sample_page import sample_view
-from stickslip_services.pages.samples import SampleData
+from stickslip_services.pages.samples import Array, SampleData
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter(include_in_schema=False)
+
+SHOWN_DATASETS = 100
+SHOWN_CERTIFICATES = 200
+SHOWN_CURVES = 6
+"""Curves of a protocol that its page shows."""
+
+PICTURE_SECONDS = 24 * 3600
+"""Time for which a browser keeps a picture [s]."""
 
 Slot = Annotated[int, Path(ge=0)]
 Step = Annotated[int, Query(ge=1, le=8)]
@@ -45,6 +53,8 @@ Step = Annotated[int, Query(ge=1, le=8)]
 
 @dataclass(frozen=True, slots=True)
 class Opened:
+    """A version that a page shows, and its arrays."""
+
     dataset: Dataset
     version: DatasetVersion
     data: SampleData
@@ -52,11 +62,11 @@ class Opened:
 
 def _opened(dataset: str, version: Version, context: ContextDep) -> Opened:
     with context.database.read() as connection:
-        found, committed = (
-            find_dataset(connection, dataset),
-            find_version(connection, dataset, version),
-        )
-    return Opened(found, committed, _sample_data(context.store, committed.manifest))
+        visible_dataset = find_dataset(connection, dataset)
+        visible_version = find_version(connection, dataset, version)
+    # The manifest never changes, so what it lists is read once for all pages of the version.
+    data = _sample_data(context.store, visible_version.manifest)
+    return Opened(visible_dataset, visible_version, data)
 
 
 @lru_cache(maxsize=8)
@@ -69,8 +79,9 @@ OpenedDep = Annotated[Opened, Depends(_opened)]
 
 @router.get("/datasets")
 def get_datasets(context: ContextDep) -> Response:
+    """Show the newest datasets."""
     with context.database.read() as connection:
-        datasets = list_datasets(connection, PageRequest(100, None)).items
+        datasets = list_datasets(connection, PageRequest(SHOWN_DATASETS, None)).items
     return html_page("datasets.html", here="datasets", datasets=datasets)
 
 
@@ -86,6 +97,7 @@ def get_dataset(dataset: str, context: ContextDep) -> Response:
 
 @router.get("/datasets/{dataset}/v{version}")
 def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Response:
+    """Show a version: its spec, its samples within the filters of the query, and its labels."""
     data = opened.data
     values = thumbs(data, request.query_params, 0) | losses(data)
     return html_page(
@@ -109,9 +121,11 @@ def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Res
 def get_thumbs(
     request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0
 ) -> Response:
-    shown = thumbs(opened.data, request.query_params, start)
-    page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **shown)
-    if not start:
+    """Show the samples within the filters of the query, from one of them on."""
+    values = thumbs(opened.data, request.query_params, start)
+    page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **values)
+    if start == 0:
+        # The address of the page shows the filters, so that it can be sent to somebody.
         page.headers["HX-Replace-Url"] = (
             f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
         )
@@ -123,12 +137,17 @@ def get_sample(
     opened: OpenedDep, slot: int, beside: Annotated[str, Query(max_length=20)] = ""
 ) -> Response:
     """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
-    data, name = opened.data, f"version {opened.version.version} of {opened.dataset.id}"
+    data = opened.data
     last = data.manifest.sample_count - 1
-    slots = [slot, *([int(beside)] if beside.isdecimal() else [])]
-    if not all(0 <= each <= last for each in slots):
+    slots = [slot]
+    if beside.isdecimal():
+        slots.append(int(beside))
+    if not all(0 <= number <= last for number in slots):
+        name = f"version {opened.version.version} of {opened.dataset.id}"
         raise NotFoundError(f"{name} has slots 0 to {last}, not {', '.join(map(str, slots))}")
-    rejections = {each: rejection for each in slots if (rejection := data.rejection(each))}
+    # A rejected sample has labels of its rejection, and no arrays.
+    rejections = {number: data.rejection(number) for number in slots}
+    valid = [number for number in slots if rejections[number] is None]
     return html_page(
         "sample.html",
         here="datasets",
@@ -136,8 +155,8 @@ def get_sample(
         version=opened.version,
         slot=slot,
         last_slot=last,
-        rejections=rejections.values(),
-        shown=[sample_view(data, each) for each in slots if each not in rejections],
+        rejections=[rejection for rejection in rejections.values() if rejection is not None],
+        shown=[sample_view(data, number) for number in valid],
         has_mp4=find_spec("av") is not None,
     )
 
@@ -155,6 +174,7 @@ def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
 
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
 def get_spec(opened: OpenedDep) -> Response:
+    """Return the spec of a version as YAML."""
     return Response(spec_text(opened.data.manifest.spec), media_type="application/yaml")
 
 
@@ -172,8 +192,9 @@ def get_picture(
     `step` takes every `step`-th pixel.
     """
     data = opened.data
+    # Without the name of the array, which is in the address.
     tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}"'
-    headers = {"Cache-Control": "private, max-age=86400", "ETag": tag}
+    headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}", "ETag": tag}
     if matches(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=headers)
     values = _value(data, array, slot)
@@ -196,7 +217,8 @@ def get_motion(opened: OpenedDep, slot: Slot) -> Response:
     return Response(json.dumps(document, allow_nan=False), media_type="application/json")
 
 
-def _value(data: SampleData, array: str, slot: int) -> Any:
+def _value(data: SampleData, array: str, slot: int) -> Array:
+    """Return the value of an array for a sample; raise NotFoundError."""
     if array not in data.arrays or slot >= data.manifest.sample_count:
         raise NotFoundError(f"the dataset has no {array[:50]!r} of sample {slot}")
     try:
@@ -207,6 +229,7 @@ def _value(data: SampleData, array: str, slot: int) -> Any:
 
 @router.get("/scenes")
 def get_scenes(context: ContextDep) -> Response:
+    """Show the scenes that the coordinator knows."""
     with context.database.read() as connection:
         scenes = known_scenes(connection)
     return html_page("scenes.html", here="scenes", scenes=scenes)
@@ -224,14 +247,16 @@ def get_scene(digest: str, context: ContextDep) -> Response:
 
 @router.get("/certificates")
 def get_certificates(context: ContextDep) -> Response:
+    """Show the newest certificates."""
     with context.database.read() as connection:
-        entries = list_certificates(connection, PageRequest(200, None)).items
+        entries = list_certificates(connection, PageRequest(SHOWN_CERTIFICATES, None)).items
         builds = _builds(context, connection)
     return html_page("certificates.html", here="certificates", entries=entries, builds=builds)
 
 
 @router.get("/certificates/{digest}")
 def get_certificate(digest: str, context: ContextDep) -> Response:
+    """Show a certificate: what each protocol has measured, and its curves."""
     with context.database.read() as connection:
         stored = find_certificate(connection, digest)
         builds = _builds(context, connection)
@@ -256,21 +281,28 @@ def _builds(context: Context, connection: Connection) -> set[str]:
 
 
 def _curves(protocol: ProtocolReport) -> Iterator[dict[str, Any]]:
-    for curve in protocol.curves[:6]:
-        dense = curve.dense_x, curve.dense_master
-        line = (
-            dense if curve.dense_x else (curve.x, curve.master)
-        )  # of a certificate without dense curves
-        name = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
+    """Yield the plots of a protocol: measured points, and the curve that they should be on."""
+    for curve in protocol.curves[:SHOWN_CURVES]:
+        # A certificate of an earlier build has the curve at the measured points only.
+        master = (curve.x, curve.master)
+        if curve.dense_x:
+            master = (curve.dense_x, curve.dense_master)
+        parameters = ", ".join(f"{key} = {value:g}" for key, value in curve.parameters.items())
         yield plot(
-            _known("master curve", *line),
-            _known("measured", curve.x, curve.measured, is_dots=True),
+            _known_points("master curve", *master),
+            _known_points("measured", curve.x, curve.measured, is_dots=True),
             x_name=protocol.x,
-            y_name=f"{protocol.y}{f' ({name})' if name else ''}",
+            y_name=f"{protocol.y} ({parameters})" if parameters else protocol.y,
             is_log=True,
         )
 
 
-def _known(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[str, Any]:
-    known = sorted((a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None)
-    return table([a for a, _ in known], {name: [b for _, b in known]}, is_dots=is_dots)
+def _known_points(name: str, x: Numbers, y: Numbers, *, is_dots: bool = False) -> dict[str, Any]:
+    """Return the points of a curve that have both coordinates, by ascending x."""
+    points = sorted(
+        (x_value, y_value)
+        for x_value, y_value in zip(x, y, strict=True)
+        if x_value is not None and y_value is not None
+    )
+    values = {name: [y_value for _, y_value in points]}
+    return table([x_value for x_value, _ in points], values, is_dots=is_dots)
