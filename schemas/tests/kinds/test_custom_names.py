@@ -4,6 +4,7 @@ import io
 import re
 import struct
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,21 @@ def _spec(**more: Any) -> ClothDragSpec:
     spec = job_spec_adapter.validate_python(_document(**more))
     assert isinstance(spec, ClothDragSpec)
     return spec
+
+
+@pytest.mark.parametrize("as_written", [np.transpose, np.array], ids=["columns", "rows"])
+def test_arrays_of_opencv_are_taken_as_they_come(as_written: Callable[[Any], Any]) -> None:
+    """`solvePnP` returns columns, and `calibrateCamera` a row of distortion coefficients."""
+    plain = LAB | {"distortion": [-0.1, 0.02, 0.001, -0.001, 0.0]}
+    arrays = {name: as_written([plain[name]]).tolist() for name in ("rvec", "tvec", "distortion")}
+    assert np.ndim(arrays["rvec"]) == 2
+    assert Calibration(**plain | arrays) == Calibration(**plain)
+
+
+@pytest.mark.parametrize("rvec", [[[1.0, 0.0], [0.0, 1.0]], [[1.0], 0.0, 0.0], [[1.0, 0.0]], []])
+def test_other_shapes_of_vectors_are_refused(rvec: list[Any]) -> None:
+    with pytest.raises(ValidationError):
+        Calibration(**LAB | {"rvec": rvec})
 
 
 def test_names_of_the_users_own_are_codes_after_the_built_in_ones() -> None:

@@ -121,6 +121,20 @@ WRONG: list[tuple[Any, ...]] = [
     (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
     (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 6.2832 [rad]"),
     (f"{UPPER}.thickness", 0.0, "", "greater than or equal to 0.00001 [m]"),
+    (
+        f"{UPPER}.mesh.size",
+        [80, 60],
+        "",
+        "the longer side must be 0.001 to 10 m, and is 80 m; did you mean mm? Lengths are in "
+        "metres, and 80 mm are 0.08",
+        "[80.0, 60.0]",
+    ),
+    (
+        f"{LOWER}.mesh.size",
+        [8e-5, 4e-5],
+        "",
+        "the longer side must be 0.001 to 10 m, and is 8e-05 m; did you mean 0.08 m?",
+    ),
     (f"{UPPER}.self_contact", False, "", "must be true if there are several sheets"),
     (
         f"{UPPER}.factors",

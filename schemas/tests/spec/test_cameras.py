@@ -42,6 +42,18 @@ def test_a_point_behind_the_camera_has_no_image() -> None:
     assert LEVEL.overflow([[4.0, 0.0, 0.0]]) > 0.0
 
 
+@pytest.mark.parametrize("radius", [0.5, 0.999999, 1.0, 2.0])
+def test_a_ball_that_reaches_the_camera_leaves_the_frame(radius: float) -> None:
+    """The plane of the camera is 1 before the middle of the ball, which alone would be in sight."""
+    ball = [[2.0, 0.0, 0.0]]
+    _, depth = LEVEL.project(ball)
+    assert depth.tolist() == pytest.approx([1.0])
+    assert LEVEL.overflow(ball) < 0.0
+    overflow = LEVEL.overflow(ball, radius=radius)
+    # In front of the camera it has an image, however large; otherwise it has none.
+    assert (overflow == np.inf) == (radius >= 1.0)
+
+
 def test_position_is_where_the_depth_vanishes() -> None:
     np.testing.assert_allclose(LEVEL.position, [3.0, 0.0, 0.0])
     assert LEVEL.project(LEVEL.position)[1] == 0.0

@@ -192,6 +192,8 @@ class Physics(Document):
                 f"{self.frames}"
             )
             refuse(self, ("frame_rate",), rule, self.frame_rate)
+        for name, sheet in self.sheets.items():
+            self._check_extent(name, sheet)
         vertices = sum(sheet.mesh.shape[0] for sheet in self.sheets.values())
         if vertices > MAX_VERTICES:
             rule = f"must have at most {MAX_VERTICES} vertices together"
@@ -200,19 +202,21 @@ class Physics(Document):
             self._check_sheet(name, sheet)
         return self
 
+    def _check_extent(self, name: str, sheet: Sheet) -> None:
+        # A mesh in a file is measured when the file is read.
+        if isinstance(sheet.mesh, FileMesh):
+            return
+        extent = max(sheet.mesh.size)
+        if not SMALLEST <= extent <= LARGEST:
+            rule = f"the longer side must be {SMALLEST:g} to {LARGEST:g} m, and is {extent:g} m"
+            location = ("sheets", name, "mesh", "size")
+            refuse(self, location, rule + unit_hint(extent), list(sheet.mesh.size))
+
     def _check_sheet(self, name: str, sheet: Sheet) -> None:
         location = ("sheets", name)
         if not sheet.self_contact and len(self.sheets) > 1:
             rule = "must be true if there are several sheets"
             refuse(self, (*location, "self_contact"), rule, False)
-        # The length along the warp or the weft, whichever is larger. A mesh in a file is
-        # measured when the file is read.
-        if not isinstance(sheet.mesh, FileMesh):
-            extent = max(sheet.mesh.size)
-            if not SMALLEST <= extent <= LARGEST:
-                rule = f"the longer side must be {SMALLEST:g} to {LARGEST:g} m"
-                rule += unit_hint(extent)
-                refuse(self, (*location, "mesh", "size"), rule, list(sheet.mesh.size))
         count = sheet.mesh.shape[0]
         if count * self.frames > MAX_TRACK:
             rule = (

@@ -9,7 +9,7 @@ import io
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,14 +90,15 @@ def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any
     return with_files
 
 
-def weld_notes(physics: Physics, read: Callable[[str], bytes]) -> Iterator[str]:
+def weld_notes(physics: Physics, files: Mapping[str, bytes]) -> Iterator[str]:
     """Yield a sentence for each body of which vertices at equal positions were welded.
 
-    `read` returns the bytes of an artifact by its digest.
+    `files` are by digest. Bodies of other files are left out.
     """
     for location, name in Physics.files(physics):
-        if location[0] == "bodies" and location[-1] == "file":
-            body = _read_body(read(name.removeprefix(ARTIFACT)))
+        data = files.get(name.removeprefix(ARTIFACT))
+        if data is not None and location[0] == "bodies" and location[-1] == "file":
+            body = _read_body(data)
             if body.welded_count:
                 yield (
                     f"{_dotted(location)}: {body.welded_count} of {body.vertex_count} vertices "

@@ -123,6 +123,12 @@ def check(scene: str, as_json: bool) -> None:
         f"{size(cost['bytes_a_sample'])} before compression, and its simulation most likely takes "
         f"{least:.2g} to {most:.2g} CPU s. Digest {document.digest}"
     )
+    if files:
+        # This module needs the extra `arrays`, which a scene without files does not.
+        from stickslip_schemas.scene.files import weld_notes
+
+        for note in weld_notes(document, files):
+            say(note)
 
 
 def _axes(document: Scene) -> dict[str, JsonValue]:
