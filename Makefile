@@ -120,11 +120,6 @@ check: setup-dev
 	$(PY) -m mypy $(SOURCES)
 	MYPYPATH=.:tests $(PY) -m mypy --explicit-package-bases $(TESTS)
 
-# The official library of LeRobot, which opens exports in a test; 8 GB.
-.venv-lerobot:
-	$(PYTHON) -m venv $@
-	$@/bin/pip install --quiet 'lerobot==0.4.4'
-
 # The lines of source, and files that are longer than they should be.
 size:
 	@$(PY) tools/size.py
@@ -166,4 +161,4 @@ constraints:
 	tools/update_constraints.sh $(PYTHON)
 
 clean:
-	rm -rf .venv .venv-blender .venv-core .venv-lerobot demo-out
+	rm -rf .venv .venv-blender .venv-core demo-out

@@ -1,3 +1,1 @@
-"""Datasets in formats that other libraries read: HDF5, WebDataset, Parquet, LeRobot, and OBJ
-meshes.
-"""
+"""Exports to HDF5, WebDataset, Parquet, LeRobot, and OBJ meshes."""

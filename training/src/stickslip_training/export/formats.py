@@ -1,5 +1,6 @@
-"""Exports: the samples of a part of a version, in the order of their slots, one at a time, in
-formats of others.
+"""Exports of a part of a version to formats of other libraries.
+
+Samples are in the order of their slots, and are written one at a time.
 
 Rejected samples are left out in every format, so no fill value is ever taken for a sample. The
 array `slot` says which slot of the version each sample has. An export is there whole or not at all,
@@ -7,7 +8,6 @@ and overwrites nothing.
 """
 
 import io
-import json
 import os
 import shutil
 import tarfile
@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import TypeAdapter
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.selection import Selection
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
@@ -28,6 +27,7 @@ from stickslip_schemas.store import sync
 from stickslip_training.arrays import Array
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.sources import CorruptDataError
+from stickslip_training.export.strict_json import strict_json
 
 OnBytes = Callable[[int], None]
 """Hears how many decoded bytes have been written."""
@@ -40,6 +40,9 @@ FILE_BYTES = 256 * 2**20
 
 CHUNK_BYTES = 2**20
 """Decoded samples of a chunk of HDF5 [bytes]."""
+
+MESH_PARTS = ("positions", "rest", "triangles")
+"""Arrays of a sheet that make a mesh."""
 
 GROUP_BYTES = 32 * 2**20
 """Decoded samples that are written to Parquet and read from it together [bytes]."""
@@ -93,8 +96,9 @@ class Content:
         return self.reader.read(name, slots)
 
     def parts(self) -> Iterator[tuple[str, int, int, npt.NDArray[np.int64]]]:
-        """Yield split, number, count of the files of that split, and slots of each file, split by
-        split.
+        """Yield split, number, count of the files of that split, and slots of each file.
+
+        Files are in the order of the splits.
         """
         size = max(1, FILE_BYTES // self.sample_bytes)
         splits = self.reader.label("split")[self.slots]
@@ -137,12 +141,7 @@ class Content:
             }
             for array in self.arrays
         }
-        return strict_json(self.identity() | {"arrays": arrays}, indent=2) + b"\n"
-
-
-def strict_json(document: dict[str, Any], *, indent: int | None = None) -> bytes:
-    """Return a JSON document [RFC 8259], in which null stands for numbers that are not finite."""
-    return TypeAdapter(dict[str, Any]).dump_json(document, indent=indent)
+        return (strict_json(self.identity() | {"arrays": arrays}, indent=2) + "\n").encode()
 
 
 def to_directory(
@@ -161,8 +160,9 @@ def to_directory(
 
 @contextmanager
 def made_whole(target: Path) -> Iterator[Path]:
-    """Give a path beside `target` to write to, which becomes `target` at the end, or vanishes after
-    an error.
+    """Yield a path beside `target` to write to, which becomes `target` at the end.
+
+    After an error nothing is left.
 
     Raises FileExistsError, and overwrites nothing, where `target` exists.
     """
@@ -205,7 +205,7 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
     count = len(content.slots)
     with h5py.File(path, "x") as file:
         for name, value in content.identity().items():
-            file.attrs[name] = json.dumps(value) if isinstance(value, dict) else value or ""
+            file.attrs[name] = strict_json(value) if isinstance(value, dict) else value or ""
         manifest = np.frombuffer(content.manifest(), dtype=np.uint8)
         file.create_dataset(
             "manifest.json",
@@ -216,14 +216,15 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
         )
         for array in content.arrays:
             rows = max(1, min(count, CHUNK_BYTES // array.sample_bytes))
-            shape, chunks = (count, *array.shape), (rows, *array.shape)
+            shape = (count, *array.shape)
+            chunks = (rows, *array.shape)
             out = file.create_dataset(
                 array.name, shape=shape, dtype=array.dtype, chunks=chunks, fletcher32=True
             )
             for dimension, name in zip(out.dims, ("sample", *array.dimensions), strict=True):
                 dimension.label = name
             for key, value in describe(array).items():
-                out.attrs[key] = json.dumps(value) if isinstance(value, dict) else value
+                out.attrs[key] = strict_json(value) if isinstance(value, dict) else value
             for first in range(0, count, rows):
                 slots = content.slots[first : first + rows]
                 out[first : first + len(slots)] = content.read(array.name, slots)
@@ -231,30 +232,32 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
 
 
 def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write `train-000000.tar` and so on: for each sample `SLOT.json` with its labels, and a
-    `SLOT.ARRAY.npy` for each other array.
+    """Write `train-000000.tar` and so on.
 
-    Categories are codes, as in the version; `dataset.json` names them. Numbers that are not finite
-    are null.
+    A sample is `SLOT.json` with its labels, and `SLOT.ARRAY.npy` for each other array.
+
+    Categories are codes, as in the version, and `dataset.json` names them. A label that is infinite
+    or NaN is null.
     """
+    big = [array.name for array in content.arrays if not array.is_label]
     for split, number, _, slots in content.parts():
-        with tarfile.open(
-            directory / f"{split}-{number:06d}.tar", "x", format=tarfile.USTAR_FORMAT
-        ) as tar:
-            labels = {
-                array.name: content.read(array.name, slots).tolist() for array in content.labels
-            }
-            for place, slot in enumerate(slots):
-                sample = {name: values[place] for name, values in labels.items()}
-                _add(tar, f"{slot:08d}.json", strict_json(sample))
-                for array in content.arrays:
-                    if not array.is_label:
-                        buffer = io.BytesIO()
-                        np.save(
-                            buffer, content.read(array.name, slots[[place]])[0], allow_pickle=False
-                        )
-                        _add(tar, f"{slot:08d}.{array.name}.npy", buffer.getvalue())
+        path = directory / f"{split}-{number:06d}.tar"
+        with tarfile.open(path, "x", format=tarfile.USTAR_FORMAT) as tar:
+            for slot in slots.tolist():
+                _add(tar, f"{slot:08d}.json", strict_json(_sample_labels(content, slot)).encode())
+                # WebDataset groups the files of a sample by the name before the first dot.
+                for name in big:
+                    buffer = io.BytesIO()
+                    values = content.read(name, np.array([slot]))[0]
+                    np.save(buffer, values, allow_pickle=False)
+                    _add(tar, f"{slot:08d}.{name}.npy", buffer.getvalue())
                 on_bytes(content.sample_bytes)
+
+
+def _sample_labels(content: Content, slot: int) -> dict[str, Any]:
+    """Return the labels of a sample as plain values."""
+    alone = np.array([slot])
+    return {array.name: content.read(array.name, alone)[0].tolist() for array in content.labels}
 
 
 def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
@@ -266,56 +269,67 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
-    """Write `SLOT/0000.obj` and so on, one for each instant with all sheets, and
-    `SLOT/labels.json`.
+    """Write `SLOT/0000.obj` and so on, and `SLOT/labels.json`.
+
+    A file has all sheets at an instant.
 
     Meshes are in metres, z up, with the flat cloth as texture coordinates from 0 to 1 along its
     longer side. OBJ is text, and its numbers, read as 32-bit floats, are those of the dataset, bit
     by bit.
     """
+    sheets = _sheets(content)
+    for slot in content.slots.tolist():
+        folder = directory / f"{slot:08d}"
+        folder.mkdir()
+        labels = strict_json(_sample_labels(content, slot), indent=2)
+        (folder / "labels.json").write_text(labels + "\n")
+        for instant, text in enumerate(_obj_files(content, sheets, slot)):
+            (folder / f"{instant:04d}.obj").write_text(text)
+        on_bytes(content.sample_bytes)
+
+
+def _sheets(content: Content) -> list[str]:
+    """Return the prefixes of the arrays of all sheets: "" for the one sheet of a drag.
+
+    Raises ValueError if an array of a sheet is missing.
+    """
     names = {array.name for array in content.arrays}
-    sheets = [
-        name.removesuffix("positions")
-        for name in sorted(names)
-        if name.split(".")[-1] == "positions"
-    ]
-    missing = [
-        f"{sheet}{part}" for sheet in sheets or [""] for part in ("positions", "rest", "triangles")
-    ]
-    if missing := [name for name in missing if name not in names]:
+    positions = [name for name in sorted(names) if name.split(".")[-1] == "positions"]
+    sheets = [name.removesuffix("positions") for name in positions]
+    needed = [f"{sheet}{part}" for sheet in sheets or [""] for part in MESH_PARTS]
+    missing = [name for name in needed if name not in names]
+    if missing:
         raise ValueError(
             f"a mesh needs {', '.join(missing)}, which this part of {content.name} does not have"
         )
-    for slot in content.slots:
-        alone = np.array([slot])
-        folder = directory / f"{slot:08d}"
-        folder.mkdir()
-        labels = {
-            array.name: content.read(array.name, alone)[0].tolist() for array in content.labels
-        }
-        (folder / "labels.json").write_bytes(strict_json(labels, indent=2) + b"\n")
-        written: list[str] = []
-        first = 1
-        for sheet in sheets:
-            positions, rest, triangles = (
-                content.read(f"{sheet}{part}", alone)[0]
-                for part in ("positions", "rest", "triangles")
-            )
-            low = rest.min(axis=0)
-            uv = ((rest - low) / (rest.max(axis=0) - low).max()).astype(np.float32)
-            fixed = "".join(f"vt {u:.9g} {v:.9g}\n" for u, v in uv.tolist())
-            fixed += "".join(
-                "f " + " ".join(f"{i}/{i}" for i in face) + "\n"
-                for face in (triangles + first).tolist()
-            )
-            first += len(rest)
-            written = written or [""] * len(positions)
-            for instant, vertices in enumerate(positions.tolist()):
-                moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
-                written[instant] += f"o {sheet.removesuffix('.') or 'cloth'}\n{moved}{fixed}"
-        for instant, text in enumerate(written):
-            (folder / f"{instant:04d}.obj").write_text(text)
-        on_bytes(content.sample_bytes)
+    return sheets
+
+
+def _obj_files(content: Content, sheets: list[str], slot: int) -> list[str]:
+    """Return the text of the OBJ file of each instant of a sample, with all sheets."""
+    alone = np.array([slot])
+    files: list[str] = []
+    first_vertex = 1  # indices of OBJ begin at 1, and count over all sheets
+    for sheet in sheets:
+        positions, rest, triangles = (
+            content.read(f"{sheet}{part}", alone)[0] for part in MESH_PARTS
+        )
+        # Texture coordinates and faces are the same at all instants.
+        low = rest.min(axis=0)
+        uv = ((rest - low) / (rest.max(axis=0) - low).max()).astype(np.float32)
+        lines = [f"vt {u:.9g} {v:.9g}\n" for u, v in uv.tolist()]
+        for a, b, c in (triangles + first_vertex).tolist():
+            lines.append(f"f {a}/{a} {b}/{b} {c}/{c}\n")
+        fixed = "".join(lines)
+        first_vertex += len(rest)
+
+        name = sheet.removesuffix(".") or "cloth"
+        files = files or [""] * len(positions)
+        for instant, vertices in enumerate(positions.tolist()):
+            # Nine digits give each 32-bit float back, bit by bit.
+            moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
+            files[instant] += f"o {name}\n{moved}{fixed}"
+    return files
 
 
 def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> None:
@@ -364,8 +378,9 @@ def _feature(array: ArrayLayout) -> Any:
 
 
 def _column(values: Array, kind: Any) -> Any:
-    """Return values as an Arrow array of the type `kind`: plain numbers, or lists in lists for the
-    further axes.
+    """Return values as an Arrow array of the type `kind`.
+
+    The array has plain numbers, or lists in lists for the further axes.
     """
     import pyarrow
 
@@ -380,7 +395,8 @@ def _column(values: Array, kind: Any) -> Any:
 def _card(content: Content, splits: list[str]) -> str:
     files = "".join(f"  - split: {split}\n    path: data/{split}-*.parquet\n" for split in splits)
     arrays = "\n".join(
-        f"| `{array.name}` | {' x '.join(map(str, array.shape)) or 'one value'} | {array.dtype} | {array.description} |"
+        f"| `{array.name}` | {' x '.join(map(str, array.shape)) or 'one value'} | "
+        f"{array.dtype} | {array.description} |"
         for array in content.arrays
     )
     return f"""---
@@ -391,8 +407,9 @@ configs:
 
 # {content.title}
 
-This is an export of the dataset `{content.name}`, which stickslip made: {len(content.slots)} samples. The manifest of
-that version is `{MANIFEST_COPY}` here; its SHA-256 is `{content.reader.manifest_digest}`.
+This is an export of the dataset `{content.name}`, made by stickslip: {len(content.slots)} samples.
+The manifest of that version is `{MANIFEST_COPY}` here. Its SHA-256 is
+`{content.reader.manifest_digest}`.
 `{DESCRIPTION}` describes the arrays for programs.
 
 ```python

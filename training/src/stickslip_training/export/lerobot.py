@@ -1,5 +1,6 @@
-"""LeRobotDataset v3 [huggingface/lerobot, codebase version v3.0]: what holders do to cloth, for
-learning robots.
+"""LeRobotDataset v3 [huggingface/lerobot, codebase version v3.0], for learning robots.
+
+An episode shows how holders move cloth.
 
 An episode is a simulation with one texture and one look of light and floor, seen by all viewpoints
 of the dataset. `action` has of each holder its position, the first two columns of its rotation
@@ -12,6 +13,7 @@ Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset ha
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,8 @@ import numpy as np
 from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.arrays import Array
-from stickslip_training.export.formats import Content, OnBytes, strict_json
+from stickslip_training.export.formats import Content, OnBytes
+from stickslip_training.export.strict_json import strict_json
 
 FILES = 1000
 """Files of a folder."""
@@ -39,96 +42,177 @@ _COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write the files into an empty directory.
 
-    Raise ValueError where there are no holders or no whole episode.
+    Raises ValueError if the scene has no holders, or no episode is whole.
     """
-    import pandas
-    import pyarrow
-    from pyarrow import parquet
-
-    arrays = {array.name: array for array in content.arrays}
-    if missing := [name for name in NEEDED if name not in arrays]:
+    names = [array.name for array in content.arrays]
+    missing = [name for name in NEEDED if name not in names]
+    if missing:
         raise ValueError(
-            f"LeRobot needs the arrays {', '.join(NEEDED)} of a scene with holders, and {', '.join(missing)} are not "
-            f"in this part of {content.name}"
+            f"LeRobot needs the arrays {', '.join(NEEDED)} of a scene with holders, and "
+            f"{', '.join(missing)} are not in this part of {content.name}"
         )
-    episodes = list(_episodes(content))
-    views = list(episodes[0][1])
-    instants = np.array(arrays["video"].attributes["instants"])
-    length, span = len(instants), int(np.ptp(instants))
-    per_second = Fraction(
-        arrays["holder_pose"].attributes["instants_per_second"]
-    ).limit_denominator(1000)
-    rate = (
-        per_second * (length - 1) / span if span else Fraction(1)
-    )  # a video has its frames evenly
-    every: list[dict[str, Any]] = []
-    rows: list[dict[str, Any]] = []
-    tables: list[Any] = []
-    for number, (_, slots) in enumerate(episodes):
-        chunk, file = divmod(number, FILES)
-        frames, names = _numbers(content, slots[views[0]], instants)
-        frames["observation.time"] = (instants[:, None] / float(per_second)).astype(np.float32)
+    _Export(content, directory, on_bytes).write()
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Times of the frames of an episode."""
+
+    instants: Array
+    """Simulated instants that the frames show, (frames,)."""
+    per_second: Fraction
+    """Simulated instants a second."""
+
+    @property
+    def length(self) -> int:
+        return len(self.instants)
+
+    @property
+    def seconds(self) -> Array:
+        """Times in the scene, (frames, 1) [s]."""
+        return (self.instants[:, None] / float(self.per_second)).astype(np.float32)
+
+    @property
+    def rate(self) -> Fraction:
+        """Frames a second of the video, which has its frames evenly."""
+        span = int(np.ptp(self.instants))
+        if span == 0:
+            return Fraction(1)
+        return self.per_second * (self.length - 1) / span
+
+
+class _Export:
+    """One export: files of the episodes, and then those about all of them."""
+
+    def __init__(self, content: Content, directory: Path, on_bytes: OnBytes) -> None:
+        self.content = content
+        self.directory = directory
+        self.on_bytes = on_bytes
+        arrays = {array.name: array for array in content.arrays}
+        per_second = Fraction(arrays["holder_pose"].attributes["instants_per_second"])
+        self.clock = _Clock(
+            instants=np.array(arrays["video"].attributes["instants"]),
+            per_second=per_second.limit_denominator(1000),
+        )
+        self.clip_shape = arrays["video"].shape
+        self.episodes = list(_episodes(content))
+        self.views = list(self.episodes[0][1])
+        self.statistics: list[dict[str, Any]] = []
+        """Of each episode, by feature."""
+        self.rows: list[dict[str, Any]] = []
+        """Of the table of episodes."""
+
+    def write(self) -> None:
+        """Write all files."""
+        from pyarrow import parquet
+
+        names: dict[str, list[str]] = {}
+        tables: list[Any] = []
+        for number, (_, slots) in enumerate(self.episodes):
+            frames, names = self._frames(slots)
+            videos = self._write_videos(number, slots)
+            self._add_row(number, slots, videos)
+
+            # Frames of many episodes share a file: LeRobot opens each file once.
+            tables.append(_table(frames, number, self.clock.rate))
+            is_last = number == len(self.episodes) - 1
+            if len(tables) == EPISODES_IN_FILE or is_last:
+                _write_tables(parquet, tables, self.directory / DATA.format(**_file_of(number)))
+                tables = []
+        self._write_meta(names)
+
+    def _frames(self, slots: dict[str, int]) -> tuple[dict[str, Array], dict[str, list[str]]]:
+        """Return the numbers of the frames of an episode, by feature, and their names."""
+        # All views show one simulation: the numbers of any of them will do.
+        frames, names = _numbers(self.content, slots[self.views[0]], self.clock.instants)
+        frames["observation.time"] = self.clock.seconds
         names["observation.time"] = ["s"]
-        stats = {name: _statistics(values) for name, values in frames.items()}
-        where: dict[str, Any] = {}
+        self.statistics.append({name: _statistics(values) for name, values in frames.items()})
+        return frames, names
+
+    def _write_videos(self, number: int, slots: dict[str, int]) -> dict[str, Any]:
+        """Write a video for each view, and return the columns that say where it is."""
+        chunk, file = divmod(number, FILES)
+        columns: dict[str, Any] = {}
         for view, slot in slots.items():
-            key, video = f"observation.images.{view}", content.read("video", np.array([slot]))[0]
-            _encode(
-                video,
-                directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file),
-                rate,
-            )
-            stats[key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
-            where |= {
+            key = f"observation.images.{view}"
+            video = self.content.read("video", np.array([slot]))[0]
+            path = self.directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
+            _encode(video, path, self.clock.rate)
+            self.statistics[-1][key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
+            columns |= {
                 f"videos/{key}/chunk_index": chunk,
                 f"videos/{key}/file_index": file,
                 f"videos/{key}/from_timestamp": 0.0,
-                f"videos/{key}/to_timestamp": float(length / rate),
+                f"videos/{key}/to_timestamp": float(self.clock.length / self.clock.rate),
             }
-            on_bytes(content.sample_bytes)
-        every.append(stats)
-        tables.append(_table(frames, number, rate))
-        data_chunk, data_file = divmod(number // EPISODES_IN_FILE, FILES)
-        if len(tables) == EPISODES_IN_FILE or number == len(episodes) - 1:
-            path = directory / DATA.format(chunk_index=data_chunk, file_index=data_file)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parquet.write_table(pyarrow.concat_tables(tables), path)
-            tables = []
-        rows.append(
-            {
-                **_labels(content, slots[views[0]]),
-                "episode_index": number,
-                "tasks": [content.title],
-                "length": length,
-                "dataset_from_index": number * length,
-                "dataset_to_index": (number + 1) * length,
-                "data/chunk_index": data_chunk,
-                "data/file_index": data_file,
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-                **where,
-                **{
-                    f"stats/{name}/{key}": value
-                    for name, own in stats.items()
-                    for key, value in own.items()
-                },
-            }
-        )
-    path = directory / "meta/episodes/chunk-000/file-000.parquet"
-    path.parent.mkdir(parents=True)
-    parquet.write_table(pyarrow.Table.from_pylist(rows), path)
-    pandas.DataFrame({"task_index": [0]}, index=[content.title]).to_parquet(
-        directory / "meta" / "tasks.parquet"
-    )
-    totals = {name: _merged([stats[name] for stats in every]) for name in every[0]}
-    (directory / "meta" / "stats.json").write_bytes(strict_json(totals))
-    info = _info(episodes, names, views, float(rate), arrays["video"].shape)
-    (directory / "meta" / "info.json").write_bytes(strict_json(info, indent=2))
+            self.on_bytes(self.content.sample_bytes)
+        return columns
+
+    def _add_row(
+        self,
+        number: int,
+        slots: dict[str, int],
+        videos: dict[str, Any],
+    ) -> None:
+        """Add an episode to the table of episodes."""
+        length = self.clock.length
+        data = _file_of(number)
+        row = _labels(self.content, slots[self.views[0]]) | {
+            "episode_index": number,
+            "tasks": [self.content.title],
+            "length": length,
+            "dataset_from_index": number * length,
+            "dataset_to_index": (number + 1) * length,
+            "data/chunk_index": data["chunk_index"],
+            "data/file_index": data["file_index"],
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        row |= videos
+        for feature, statistics in self.statistics[-1].items():
+            for key, value in statistics.items():
+                row[f"stats/{feature}/{key}"] = value
+        self.rows.append(row)
+
+    def _write_meta(self, names: dict[str, list[str]]) -> None:
+        """Write the files about all episodes: their table, tasks, statistics and features."""
+        import pandas
+        import pyarrow
+        from pyarrow import parquet
+
+        meta = self.directory / "meta"
+        table = pyarrow.Table.from_pylist(self.rows)
+        _write_tables(parquet, [table], meta / "episodes/chunk-000/file-000.parquet")
+        tasks = pandas.DataFrame({"task_index": [0]}, index=[self.content.title])
+        tasks.to_parquet(meta / "tasks.parquet")
+        totals = {
+            feature: _merged([episode[feature] for episode in self.statistics])
+            for feature in self.statistics[0]
+        }
+        (meta / "stats.json").write_text(strict_json(totals))
+        info = _info(self.episodes, names, self.views, float(self.clock.rate), self.clip_shape)
+        (meta / "info.json").write_text(strict_json(info, indent=2))
+
+
+def _file_of(number: int) -> dict[str, int]:
+    """Return the numbers of folder and file of the frames of an episode."""
+    chunk, file = divmod(number // EPISODES_IN_FILE, FILES)
+    return {"chunk_index": chunk, "file_index": file}
+
+
+def _write_tables(parquet: Any, tables: list[Any], path: Path) -> None:
+    """Write tables of equal columns into one Parquet file."""
+    import pyarrow
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pyarrow.concat_tables(tables), path)
 
 
 def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
-    """Yield the split and the samples by viewpoint of each episode that all viewpoints see, split
-    by split.
+    """Yield the split and the samples by viewpoint of each episode, split by split.
+
+    An episode is whole if all viewpoints see it.
     """
     reader = content.reader
     labels = [
@@ -146,7 +230,8 @@ def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
     whole = [(key[0], slots) for key, slots in seen.items() if slots.keys() == every]
     if not whole:
         raise ValueError(
-            f"an episode needs a clip of each of {', '.join(sorted(every))}, and no simulation of this part of "
+            f"an episode needs a clip of each of {', '.join(sorted(every))}, and no "
+            "simulation of this part of "
             f"{content.name} has them all"
         )
     for split, slots in sorted(whole, key=lambda found: found[0]):
@@ -156,8 +241,9 @@ def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
 def _numbers(
     content: Content, slot: int, instants: Array
 ) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Return `action` and `observation.state` of the frames of a sample, float32, and the names of
-    their numbers.
+    """Return `action` and `observation.state` of the frames of a sample, and their names.
+
+    Numbers are float32.
     """
     alone = np.array([slot])
     arrays = {array.name: array for array in content.arrays}
@@ -165,12 +251,14 @@ def _numbers(
     def over_time(name: str) -> Array:
         return np.asarray(content.read(name, alone)[0][instants])
 
-    poses, grasped = _flat_poses(over_time("holder_pose")), over_time("grasped").astype(np.float32)
+    poses = _flat_poses(over_time("holder_pose"))
+    grasped = over_time("grasped").astype(np.float32)
     holders = np.concatenate([poses, grasped[..., None]], axis=2)
     things = arrays["holder_pose"].attributes["names"]
     own = [f"{holder}.{what}" for holder in things for what in (*_POSE, "grasp")]
     held = holders.reshape(len(holders), -1)
-    parts, names = [held], list(own)
+    parts = [held]
+    names = list(own)
     if "body_pose" in arrays:
         parts.append(_flat_poses(over_time("body_pose")).reshape(len(holders), -1))
         names += [
@@ -181,7 +269,8 @@ def _numbers(
         rest = content.read(f"{sheet}.rest", alone)[
             0
         ]  # a flat sheet (V, 2): its corners and its middle are tracked
-        low, high = rest.min(axis=0), rest.max(axis=0)
+        low = rest.min(axis=0)
+        high = rest.max(axis=0)
         places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
         tracked = [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
         parts.append(over_time(name)[:, tracked].reshape(len(holders), -1))
@@ -195,7 +284,10 @@ def _numbers(
 
 
 def _flat_poses(poses: Array) -> Array:
-    """Return poses (n, things, 3, 4) as places and first two columns of rotations, (n, things, 9)."""
+    """Return poses (n, things, 3, 4) as positions and two columns of rotations.
+
+    The shape is (n, things, 9).
+    """
     return np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
 
 
@@ -236,7 +328,10 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
 
 
 def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
-    """Return what LeRobot normalises with, of values (n, k), as lists of a shape, (k,) by default."""
+    """Return the statistics with which LeRobot normalises, of values (n, k).
+
+    They are lists of a shape, (k,) by default.
+    """
     exact = values.astype(np.float64)
     found = {
         "min": exact.min(axis=0),
@@ -266,8 +361,9 @@ def _merged(parts: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _labels(content: Content, slot: int) -> dict[str, Any]:
-    """Return the labels of an episode: those that are one number of a sample, and names instead of
-    codes.
+    """Return the labels of an episode that are one number a sample.
+
+    Categories are names, and not codes.
     """
     found: dict[str, Any] = {}
     for array in content.labels:
