@@ -1,5 +1,6 @@
-"""Draw one clip of each file with the true friction and the answer of a reader, the last of them
-half a leg too late.
+"""Draw one clip of each file with the true friction and the answer of a reader.
+
+The last clip is half a leg too late.
 
     python benchmarks/training/answers.py PICTURE CLIPS.npz ... [--model FILE] [--seed 0]
 
@@ -29,7 +30,9 @@ def main() -> None:
     parser.add_argument("--model", type=Path, default=WEIGHTS)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    model, random, fabrics = load_friction(args.model), np.random.default_rng(args.seed), set[str]()
+    model = load_friction(args.model)
+    random = np.random.default_rng(args.seed)
+    fabrics = set[str]()
     columns = -(-len(args.clips) // 2)
     figure = Figure(figsize=(3.0 * columns, 6.7), dpi=100, layout="constrained")
     for place, path in enumerate(args.clips):
@@ -45,7 +48,8 @@ def main() -> None:
         read = clips[np.array([one])]
         if late := place == len(args.clips) - 1:
             read.crops[:] = read.crops[:, LATE]
-        found, reason = estimates(model.estimate(read).mu, model.bins), model.judge(read)[1][0]
+        found = estimates(model.estimate(read).mu, model.bins)
+        reason = model.judge(read)[1][0]
         answer = (
             f"{found.median[0]:.2f} ({found.low[0]:.2f} to {found.high[0]:.2f})"
             if reason is None

@@ -1,5 +1,4 @@
-"""Render clips of packed simulations with Blender, to test a network on a renderer that it has not
-seen.
+"""Render clips of packed simulations with Blender, to test a network on another renderer.
 
     $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz CLIPS.npz [--clips 24] [--seed 0]
     [--only RUN ...]
@@ -11,6 +10,8 @@ those of `--only`, take turns.
 
 import argparse
 import json
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,17 @@ from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.spec.names import Texture
 
 
-def main() -> None:
-    """Render, and write videos and what is true of them."""
+@dataclass(frozen=True)
+class Look:
+    """One clip to render, with several textures."""
+
+    run: int
+    textures: list[Texture]
+    document: ClothDragRender
+
+
+def parsed_arguments() -> argparse.Namespace:
+    """Return the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("runs", type=Path)
     parser.add_argument("out", type=Path)
@@ -57,68 +67,96 @@ def main() -> None:
     parser.add_argument(
         "--segmentation", action="store_true", help="write the segmentation of every pixel, too"
     )
-    args = parser.parse_args()
-    with np.load(args.runs) as file:
-        low, high = file["differences"]
-        positions = (
-            np.cumsum(np.stack([low, high], axis=-1).view(np.int16)[..., 0], axis=1, dtype=np.int16)
-            * 1e-5
-        )
-        rest, triangles, instants = (
-            file["rest"],
-            file["triangles"].astype(np.int32),
-            file["instants"].tolist(),
-        )
-        about = [json.loads(str(line)) for line in file["about"]]
-    shown = instants if args.instants == ["all"] else [int(instant) for instant in args.instants]
-    frames = [instants.index(instant) for instant in shown]
-    runs = list(range(len(about))) if args.only is None else args.only
+    return parser.parse_args()
+
+
+class PackedRuns:
+    """Simulations of one mesh, from a file of `cloth_runs.py --pack`."""
+
+    def __init__(self, path: Path) -> None:
+        with np.load(path) as file:
+            self.rest = file["rest"]
+            self.triangles = file["triangles"].astype(np.int32)
+            self.instants = file["instants"].tolist()
+            self.about = [json.loads(str(line)) for line in file["about"]]
+            low, high = file["differences"]
+        # Differences of positions, low and high bytes apart, in steps of 10 um.
+        differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
+        self.positions = np.cumsum(differences, axis=1, dtype=np.int16) * 1e-5
+        """(runs, instants, vertices, 3) [m]"""
+
+
+def looks(args: argparse.Namespace, runs: PackedRuns) -> Iterator[Look]:
+    """Yield the look of each clip: runs and viewpoints in turn, all else at random."""
+    numbers = args.only or list(range(len(runs.about)))
     textures = list(Texture)[-4:] if args.held_out_textures else list(Texture)[:-4]
-    views = VIEWPOINTS[3:] if args.held_out_viewpoints else VIEWPOINTS[:3]
-    cameras = {camera.name: camera for camera in load_rig("drag")}
-    random = np.random.default_rng(args.seed)
-    own = None
+    viewpoints = VIEWPOINTS[3:] if args.held_out_viewpoints else VIEWPOINTS[:3]
+    instants = runs.instants if args.instants == ["all"] else list(map(int, args.instants))
+    finish = None
     if args.albedo is not None:
-        own = {"albedo": tuple(args.albedo), "roughness": (0.4, 0.9), "grain": args.grain}
-    floor = {"substrate": args.substrate, "finish": own}
-    renderer = ClothRenderer(triangles, rest, Holders)
-    videos, seen, told = [], [], []
+        finish = {"albedo": tuple(args.albedo), "roughness": (0.4, 0.9), "grain": args.grain}
+    random = np.random.default_rng(args.seed)
     for clip in range(args.clips):
-        run, view = runs[clip % len(runs)], views[clip % len(views)]
-        chosen = [textures[place] for place in random.permutation(len(textures))[: args.textures]]
-        look = ClothDragRender.model_validate(
-            {
-                "material": about[run]["material"],
-                "texture": chosen[0],
-                "viewpoint": view,
-                "lighting": args.lighting,
-                **floor,
-                "quality": Quality(args.quality),
-                "rig": "drag",
-                "rig_digest": "0" * 64,
-                "instants": tuple(shown),
-                "light_seed": int(random.integers(2**31)),
-                "crease_seed": int(random.integers(2**31)),
-            }
-        )
-        made = renderer.clip(look, cameras[view], positions[run][frames])
-        videos += list(
-            made.clips(made.shading(), [texture_image(texture) for texture in chosen])[0]
-        )
+        run = numbers[clip % len(numbers)]
+        # The order of these draws is part of what a seed means.
+        chosen = [textures[index] for index in random.permutation(len(textures))[: args.textures]]
+        document = {
+            "material": runs.about[run]["material"],
+            "texture": chosen[0],
+            "viewpoint": viewpoints[clip % len(viewpoints)],
+            "lighting": args.lighting,
+            "substrate": args.substrate,
+            "finish": finish,
+            "quality": Quality(args.quality),
+            "rig": "drag",
+            "rig_digest": "0" * 64,
+            "instants": tuple(instants),
+            "light_seed": int(random.integers(2**31)),
+            "crease_seed": int(random.integers(2**31)),
+        }
+        yield Look(run, chosen, ClothDragRender.model_validate(document))
+
+
+def main() -> None:
+    """Render, and write videos and their true values."""
+    args = parsed_arguments()
+    runs = PackedRuns(args.runs)
+    cameras = {camera.name: camera for camera in load_rig("drag")}
+    renderer = ClothRenderer(runs.triangles, runs.rest, Holders)
+    videos: list[Any] = []
+    segmentations: list[Any] = []
+    truths: list[dict[str, Any]] = []
+    instants: tuple[int, ...] = ()
+    for look in looks(args, runs):
+        document = look.document
+        instants = document.instants
+        frames = [runs.instants.index(instant) for instant in instants]
+        camera = cameras[document.viewpoint]
+        clip = renderer.clip(document, camera, runs.positions[look.run][frames])
+        # One shading serves all textures.
+        pictures = [texture_image(texture) for texture in look.textures]
+        videos += list(clip.clips(clip.shading(), pictures)[0])
         if args.segmentation:
-            seen += len(chosen) * [made.ground_truth(["segmentation"])["segmentation"]]
-        for texture in chosen:
-            told.append(
-                {"run": run, "viewpoint": view, "texture": texture.value, **floor, **about[run]}
-            )
-            print(json.dumps(told[-1]), flush=True)
+            segmentation = clip.ground_truth(["segmentation"])["segmentation"]
+            segmentations += len(pictures) * [segmentation]
+        for texture in look.textures:
+            truth = {
+                "run": look.run,
+                "viewpoint": document.viewpoint,
+                "texture": texture.value,
+                "substrate": args.substrate,
+                "finish": document.finish and document.finish.model_dump(),
+                **runs.about[look.run],
+            }
+            truths.append(truth)
+            print(json.dumps(truth), flush=True)
     arrays: dict[str, Any] = {
         "video": np.stack(videos),
-        "instants": np.array(shown, np.int16),
-        "about": np.array([json.dumps(line) for line in told]),
+        "instants": np.array(instants, np.int16),
+        "about": np.array([json.dumps(truth) for truth in truths]),
     }
-    if seen:
-        arrays["segmentation"] = np.stack(seen)
+    if segmentations:
+        arrays["segmentation"] = np.stack(segmentations)
     np.savez_compressed(args.out, **arrays)
 
 

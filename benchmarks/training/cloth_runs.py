@@ -54,8 +54,9 @@ class Point:
 def points(
     fabric: str, runs: int, seed: int, ranges: dict[str, tuple[float, float]]
 ) -> list[Point]:
-    """Return the points of the runs of a fabric: a scrambled Sobol sequence of its own over mu and
-    what varies.
+    """Return the points of the runs of a fabric.
+
+    They are a scrambled Sobol sequence over mu and the factors that vary.
     """
     varied = [name for name in FACTORS if ranges[name][0] < ranges[name][1]]
     engine = qmc.Sobol(
@@ -98,7 +99,8 @@ def simulate(
         frames=frames,
         self_friction=self_friction,
     ).run()
-    held, free = scene.rest[:, 1].argmax(), scene.rest[:, 1].argmin()
+    held = scene.rest[:, 1].argmax()
+    free = scene.rest[:, 1].argmin()
     edges = [np.isclose(scene.rest[:, 1], scene.rest[vertex, 1]) for vertex in (held, free)]
     fell = (
         scene.positions[DROPPED, edges[1], 0].mean() - scene.positions[DROPPED, edges[0], 0].mean()
@@ -134,13 +136,12 @@ def simulate(
 
 
 def at_vertices(run: dict[str, Any], rest: Any) -> Any:
-    """Return the positions of a run at the vertices of a mesh that is as fine or coarser, (frames,
-    V, 3).
-    """
+    """Return the positions of a run at the vertices of a coarser mesh, (frames, V, 3)."""
     if np.array_equal(run["rest"], rest):
         return run["positions"]
     order = grid_order(rest)
-    grid, places = run["positions"][:, grid_order(run["rest"])], np.linspace(0, 1, len(order))
+    grid = run["positions"][:, grid_order(run["rest"])]
+    places = np.linspace(0, 1, len(order))
     for axis in (1, 2):
         grid = make_interp_spline(np.linspace(0, 1, grid.shape[axis]), grid, axis=axis)(places)
     at = np.empty((len(grid), len(rest), 3), np.int16)
@@ -183,7 +184,8 @@ def pack(folder: Path, file: Path) -> None:
             and (finer or np.array_equal(run["triangles"], first["triangles"]))
         ):
             raise ValueError(
-                f"the runs in {folder} must be of one square and as many frames: pack a folder for each"
+                f"the runs in {folder} must be of one square and as many frames: pack a "
+                "folder for each"
             )
         run["positions"] = at_vertices(run, first["rest"])
     about = [str(run["about"]) for run in runs]

@@ -54,7 +54,8 @@ class Process:
     @staticmethod
     def of(known: Array, values: Floats) -> "Process":
         """Choose length and noise, and condition on `values` (clips,) at `known` (clips, n)."""
-        mean, squared = float(values.mean()), cdist(known, known, "sqeuclidean")
+        mean = float(values.mean())
+        squared = cdist(known, known, "sqeuclidean")
         centred = values - mean
 
         def solved(log_length: float, log_noise: float) -> tuple[tuple[Array, bool], Array, float]:
@@ -83,8 +84,9 @@ class Process:
         )
 
     def predict(self, seen: Array) -> Estimates:
-        """Return mu at `seen` (clips, n), with the central interval of the share `SHARE`, within
-        the known mu.
+        """Return mu at `seen` (clips, n), and the central interval of the probability `SHARE`.
+
+        All are within the known range of mu.
         """
         kernel = np.exp(-0.5 * cdist(seen, self.known, "sqeuclidean") / self.length**2)
         left = 1 + self.noise**2 - np.einsum("ij,ji->i", kernel, cho_solve(self.factor, kernel.T))
@@ -129,12 +131,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    started, model = time.process_time(), load_friction()
+    started = time.process_time()
+    model = load_friction()
     train = load_runs(args.runs).named(model.materials)
-    reader = Reader.of(model, render_clips(train, RENDERS, args.seed, drawn_world=True))
+    reader = Reader.of(model, render_clips(train, RENDERS, args.seed, with_surroundings=True))
     fitted = reader.process
     print(
-        f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise {fitted.noise:.3g}"
+        f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise "
+        f"{fitted.noise:.3g}"
     )
     shown = {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
     shown["all files"] = Clips.joined(list(shown.values()))

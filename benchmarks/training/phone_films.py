@@ -32,7 +32,9 @@ from stickslip_training.cloth.posterior import Estimates
 from stickslip_training.cloth.runs import STEP, grid_order, load_runs
 from stickslip_training.cloth.video import import_video
 
-START, FRAMES_A_SECOND, DISTORTION = 1.7, 9, (-0.12, 0.05, 0.001, -0.0005, 0.0)
+START = 1.7
+FRAMES_A_SECOND = 9
+DISTORTION = (-0.12, 0.05, 0.001, -0.0005, 0.0)
 SHAKE = 0.05
 """Standard deviation of a hand's steps from frame to frame, a walk [px]: 1.5 px after 95 s."""
 
@@ -44,8 +46,9 @@ frames follow the last instant that is read."""
 
 
 def meshes(source: Path, out: Path, only: list[int]) -> None:
-    """Write the meshes of films and clips as a packed file of runs, whose instants are the numbers
-    of the pictures.
+    """Write the meshes of films and clips as a packed file of runs.
+
+    The instants of the file are the numbers of the pictures.
     """
     runs = load_runs(source)
     film = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
@@ -69,16 +72,19 @@ def meshes(source: Path, out: Path, only: list[int]) -> None:
 
 
 def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel) -> dict[str, Any]:
-    """Return what the model says of a film, of its variants and of the clip that ends `video` (F,
-    H, W, 3).
+    """Return the answers of a model for a film, its variants, and the clip at its end.
+
+    `video` is (F, H, W, 3).
 
     An answer is mu with its interval, why there is none, or why the film is refused.
     """
     camera = next(camera for camera in load_rig(RIG) if camera.name == true["viewpoint"])
     lens = Camera.model_validate({**camera.model_dump(), "distortion": DISTORTION})
-    frames, clip = video[: -len(INSTANTS)], video[-len(INSTANTS) :]
+    frames = video[: -len(INSTANTS)]
+    clip = video[-len(INSTANTS) :]
     shake = np.random.default_rng(number).normal(0.0, SHAKE, (len(frames), 2)).cumsum(axis=0)
-    told, imported = {name: true[name] for name in ("viewpoint", "texture", "material", "mu")}, None
+    told = {name: true[name] for name in ("viewpoint", "texture", "material", "mu")}
+    imported = None
 
     def answer(clips: Clips) -> list[float] | str:
         found = predictions(model.estimate(clips), [0], model.judge(clips))[0]
@@ -137,7 +143,8 @@ def measure(films: list[Path], model: FrictionModel, record: Path | None) -> Non
     told: list[dict[str, Any]] = []
     for path in films:
         with np.load(path) as file:
-            videos, about = file["video"], [json.loads(str(line)) for line in file["about"]]
+            videos = file["video"]
+            about = [json.loads(str(line)) for line in file["about"]]
         for video, true in zip(videos, about, strict=True):
             told.append({"floor": path.stem} | answers(video, true, len(told), model))
             print(json.dumps(told[-1]), flush=True)

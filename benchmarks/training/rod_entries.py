@@ -1,5 +1,6 @@
-"""Answer a test set of rods by our methods: one file of predictions each, for `stickslip-train
-benchmark score`.
+"""Answer a test set of rods by our methods, in one file of predictions each.
+
+`stickslip-train benchmark score` reads the files.
 
     python benchmarks/training/rod_entries.py INPUTS.npz OUT [--table-5-1 MODEL.pt]
 
@@ -73,7 +74,9 @@ def main() -> None:
     parser.add_argument("--table-5-1", type=Path)
     args = parser.parse_args()
     with np.load(args.inputs) as file:
-        slots, noises, lines = file["slot"].tolist(), file["noise"].tolist(), file["centerline"]
+        slots = file["slot"].tolist()
+        noises = file["noise"].tolist()
+        lines = file["centerline"]
     methods = {
         "finite-differences": at_once(finite_difference_curvature),
         "cubic-spline": at_once(cubic_spline_curvature),

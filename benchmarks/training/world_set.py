@@ -1,5 +1,6 @@
-"""Score a reader of friction on `cloth-2`: clips of Blender as a phone would film them, and clips
-without an answer.
+"""Score a reader of friction on `cloth-2`.
+
+The set has clips of Blender as a phone would film them, and clips without an answer.
 
     $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz FLOOR.npz --segmentation ... # for
     each sort of floor python benchmarks/training/world_set.py MODEL RUNS.npz FLOOR.npz ... --record
@@ -44,15 +45,14 @@ COLUMNS = ("mae", "within_01", "within_02", "coverage", "interval")
 
 def clamp(video: Any, camera: Camera, random: Random) -> Any:
     """Draw a bulldog clip over each held patch."""
-    wide, high, level = (
-        random.uniform(6, 16) / 1000,
-        random.uniform(6, 16) / 1000,
-        random.uniform(20, 200),
-    )
+    wide = random.uniform(6, 16) / 1000
+    high = random.uniform(6, 16) / 1000
+    level = random.uniform(20, 200)
     for frame, points in zip(video, holder_points(np.array(INSTANTS, dtype=float)), strict=True):
         pixels, depth = camera.project(points)
         for (u, v), far in zip(pixels, depth, strict=True):
-            w, h = wide * camera.fx / far / 2, high * camera.fx / far / 2
+            w = wide * camera.fx / far / 2
+            h = high * camera.fx / far / 2
             box = np.array(
                 [[u - w, v - h], [u + w, v - h], [u + 0.7 * w, v + h], [u - 0.7 * w, v + h]]
             )
@@ -88,11 +88,9 @@ def hands(video: Any, camera: Camera, random: Random) -> Any:
 def shadow(video: Any, camera: Camera, random: Random) -> Any:
     """Darken what is beyond a soft line that stays, and a blot that moves."""
     rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
-    angle, place, soft = (
-        random.uniform(0, 2 * np.pi),
-        random.uniform(-50, 50),
-        random.uniform(2, 15),
-    )
+    angle = random.uniform(0, 2 * np.pi)
+    place = random.uniform(-50, 50)
+    soft = random.uniform(2, 15)
     across = (columns - camera.cx) * np.cos(angle) + (rows - camera.cy) * np.sin(angle) - place
     still = 1 - random.uniform(0.2, 0.55) / (1 + np.exp(-across / soft))
     return np.clip(video * still[None, :, :, None], 0, 255).astype(np.uint8)
@@ -122,8 +120,9 @@ def roll(video: Any, camera: Camera, random: Random) -> Any:
 
 
 def position(video: Any, camera: Camera, random: Random) -> Any:
-    """Move the camera 1 cm: about as much as the holders are off in the picture, which registration
-    then takes back.
+    """Move the camera by 1 cm.
+
+    The holders are off in the picture by about as much, and the registration corrects that.
     """
     return warped(
         video, camera, 1 + random.uniform(-0.007, 0.007), 0.0, random.uniform(-0.6, 0.6, 2)
@@ -134,7 +133,9 @@ def h264(video: Any, camera: Camera, random: Random) -> Any:
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+        stream.width = camera.width
+        stream.height = camera.height
+        stream.pix_fmt = "yuv420p"
         stream.options = {"crf": str(int(random.integers(23, 31)))}
         for frame in video:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
@@ -183,7 +184,8 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
         videos = file["video"]
     crops = []
     for place, (video, told) in enumerate(zip(videos, about, strict=True)):
-        random, camera = np.random.default_rng((SEED, place)), named[told["viewpoint"]]
+        random = np.random.default_rng((SEED, place))
+        camera = named[told["viewpoint"]]
         holds = (clamp, hands)[random.integers(2)]
         for step in steps:
             if len(steps) == 1 or step not in (clamp, hands) or step is holds:
@@ -202,7 +204,10 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
 
     def shown(positions: Any, seed: int) -> Clips:
         return render_clips(
-            replace(runs, positions=positions.astype(np.float32)), 2, SEED + seed, drawn_world=True
+            replace(runs, positions=positions.astype(np.float32)),
+            2,
+            SEED + seed,
+            with_surroundings=True,
         )
 
     meshes = runs.positions

@@ -17,7 +17,10 @@ MODULES = [
 
 def loaded(*modules: str) -> set[str]:
     """Return the packages that are loaded after the import of modules in a process of its own."""
-    code = "import importlib, sys; [importlib.import_module(name) for name in sys.argv[1:]]; print(*sys.modules)"
+    code = (
+        "import importlib, sys; [importlib.import_module(name) for name in "
+        "sys.argv[1:]]; print(*sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code, *modules], capture_output=True, text=True, check=True
     )

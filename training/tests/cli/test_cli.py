@@ -53,9 +53,9 @@ def test_a_mistake_is_one_line_and_status_1(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = runner.invoke(app, [command[0], "nowhere", *command[1:]])
     assert result.exit_code == 1
-    assert (
-        result.stderr
-        == "stickslip-train: nowhere/manifest.json is not there: this is no committed dataset version\n"
+    assert result.stderr == (
+        "stickslip-train: nowhere/manifest.json is not there: this is no committed "
+        "dataset version\n"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -9,6 +9,7 @@ from stickslip_training.cloth.clips import read_clips
 from stickslip_training.cloth.crop import HEIGHT, WIDTH
 from stickslip_training.cloth.familiarity import ALARMS
 from stickslip_training.cloth.model import WEIGHTS
+from stickslip_training.cloth.scope import package_scope
 from stickslip_training.data.reader import DatasetReader
 from typer.testing import CliRunner
 
@@ -68,7 +69,8 @@ def test_train_and_resume(packed, tmp_path):
 
 
 def test_predictions_of_a_dataset_are_a_list(clips):
-    result = runner.invoke(app, ["cloth", "predict", str(clips.root), "--json"])
+    predict = ["cloth", "predict", str(clips.root), "--model", str(WEIGHTS)]
+    result = runner.invoke(app, [*predict, "--json"])
     assert result.exit_code == NO_ANSWER, result.output
     answers = json.loads(result.stdout)
     assert [answer["slot"] for answer in answers] == [0, 2, 3]
@@ -79,7 +81,7 @@ def test_predictions_of_a_dataset_are_a_list(clips):
         assert answer["mu"] is None
         assert answer["no_answer"]
         assert answer["familiarity"] < ALARMS
-    table = runner.invoke(app, ["cloth", "predict", str(clips.root)])
+    table = runner.invoke(app, predict)
     assert "no answer" in table.output
 
 
@@ -113,3 +115,30 @@ def test_what_cannot_be_measured_is_refused(clips, rods, make_clips):
     assert "splits train and validation must have simulations" in refused(
         "train", str(clips.root), "--out", str(clips.root / "out")
     )
+
+
+def test_a_dataset_outside_of_the_weights_is_refused(make_clips):
+    coarse = make_clips(
+        axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0}, preset="fast"
+    )
+    result = runner.invoke(app, ["cloth", "predict", str(coarse.root)])
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    message = " ".join(result.stderr.split())
+    mesh = coarse.spec.mesh
+    assert (
+        f"know: mesh {mesh} (known: 41 and finer), preset fast (known: certified, fine)." in message
+    )
+    assert "examples/friction-cloth.yaml" in message
+    assert "--model" in message
+
+
+def test_the_scope_names_materials_and_friction_that_are_unknown(clips):
+    scope = package_scope(("gray-interlock", "11oz-black-denim"))
+    spec = clips.spec.model_copy(update={"mesh": 41, "preset": "certified"})
+    assert scope.outside(spec, {"gray-interlock"}, 1.6) == []
+    scope.check(spec, {"gray-interlock"}, 1.6)
+    assert scope.outside(spec, {"gray-interlock", "felt", "canvas"}, 2.0) == [
+        "material canvas, felt (known: gray-interlock, 11oz-black-denim)",
+        "mu 2 (known: 0 to 1.6)",
+    ]

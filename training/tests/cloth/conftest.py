@@ -12,7 +12,7 @@ RUNS = Path(__file__).with_name("runs.npz")
 
 @pytest.fixture(scope="session")
 def packed() -> Path:
-    """Return the packed file: drop-and-drag of three fabrics at 21 x 21 vertices, in 30 instants."""
+    """Return the packed file: drop-and-drag of three fabrics, 21 x 21 vertices, 30 instants."""
     return RUNS
 
 

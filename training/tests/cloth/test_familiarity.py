@@ -39,7 +39,7 @@ def silhouettes(clips):
 @pytest.mark.slow
 def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split_runs):
     train, judged, _ = split_runs(few, 0.3, 0.0)
-    good = silhouettes(render_clips(judged, 8, 1, drawn_world=True))
+    good = silhouettes(render_clips(judged, 8, 1, with_surroundings=True))
     known = Familiarity.of(train, 2, good)
     share, reasons = known.judge(good)
     assert ((share >= 0) & (share <= 1)).all()
@@ -50,7 +50,7 @@ def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split
         (partial(reordered, frames=[2, 3, 0, 1, 2, 3]), "moves out of phase"),
     ):
         clips = render_clips(
-            replace(judged, positions=made(judged.positions, held)), 4, 3, drawn_world=True
+            replace(judged, positions=made(judged.positions, held)), 4, 3, with_surroundings=True
         )
         told = known.judge(silhouettes(clips))[1]
         assert np.mean([each == reason for each in told]) > 0.8
@@ -64,7 +64,10 @@ def test_the_weights_of_the_package_know_dragged_cloth_and_refuse_what_is_none(f
     clips = render_clips(judged, 2, 5)
     assert np.mean([reason is None for reason in model.judge(clips)[1]]) > 0.9
     empty = render_clips(
-        replace(judged, positions=judged.positions - np.float32([0, 0, 9])), 1, 6, drawn_world=True
+        replace(judged, positions=judged.positions - np.float32([0, 0, 9])),
+        1,
+        6,
+        with_surroundings=True,
     )
     assert all(model.judge(empty)[1])
     assert UNKNOWN.startswith("looks like no square of cloth")

@@ -16,15 +16,8 @@ from stickslip_training.cloth.crop import (
     holder_crops,
     holder_path,
 )
-from stickslip_training.cloth.render import (
-    POINTS,
-    _refined,
-    draw_style,
-    draw_textures,
-    render_crops,
-    splat,
-    turned,
-)
+from stickslip_training.cloth.render import refine, render_crops, rotate_cameras, splat
+from stickslip_training.cloth.style import TEXTURE_SIZE, sample_style, sample_textures
 from stickslip_training.cloth.surroundings import Codec, apply_codec, sample_surroundings
 
 RIG = training_cameras()
@@ -49,8 +42,8 @@ def square(side, center=(0.0, 0.0), half=0.1, x=0.0):
 
 
 def silhouettes(positions, camera, points):
-    """Share of each pixel of the picture that meshes (F, side, side, 3) cover, (F, height, width)."""
-    fine = _refined(positions[None], points)
+    """Fraction of each pixel that meshes (F, side, side, 3) cover, (F, height, width)."""
+    fine = refine(positions[None], points)
     whole = Crops(
         torch.tensor(ANCHOR[::-1]).expand(1, len(positions), 2), torch.ones(1, len(positions))
     )
@@ -113,7 +106,7 @@ def test_crops_of_a_picture_are_what_is_rendered_into_them(runs, camera):
     meshes = torch.from_numpy(runs.positions[:1, frames])
     cameras = Cameras.of([camera])
     crops = holder_crops(cameras, instants)
-    fine = _refined(meshes, POINTS)
+    fine = refine(meshes, TEXTURE_SIZE)
     direct = splat(fine, torch.ones(fine.shape[:-1]), cameras, crops)[0]
     through = cut(silhouettes(meshes[0], camera, points=200)[None], crops)
     assert through.shape == direct.shape == (1, 6, HEIGHT, WIDTH)
@@ -124,9 +117,9 @@ def test_crops_of_a_picture_are_what_is_rendered_into_them(runs, camera):
 
 def test_turning_a_camera_turns_it_about_the_scene():
     cameras = Cameras.of(RIG)
-    still = turned(cameras, torch.zeros(3), torch.zeros(3))
+    still = rotate_cameras(cameras, torch.zeros(3), torch.zeros(3))
     torch.testing.assert_close(still.rotation, cameras.rotation)
-    moved = turned(cameras, torch.full((3,), 0.2), torch.full((3,), -0.1))
+    moved = rotate_cameras(cameras, torch.full((3,), 0.2), torch.full((3,), -0.1))
     middle = torch.tensor([0.15, 0.0, 0.05]).expand(3, 1, 3)
     for before, after in zip(cameras.project(middle), moved.project(middle), strict=True):
         torch.testing.assert_close(after, before, atol=1e-3, rtol=1e-4)
@@ -142,11 +135,11 @@ def test_turning_a_camera_turns_it_about_the_scene():
 
 
 def test_looks_are_drawn_from_the_seed_and_are_many():
-    textures = draw_textures(40, torch.Generator().manual_seed(1))
+    textures = sample_textures(40, torch.Generator().manual_seed(1))
     assert textures.min() >= 0.1
     assert textures.max() <= 0.9
     assert len({tuple(texture.flatten().tolist()) for texture in textures}) == 40
-    assert torch.equal(textures, draw_textures(40, torch.Generator().manual_seed(1)))
+    assert torch.equal(textures, sample_textures(40, torch.Generator().manual_seed(1)))
 
 
 def test_frames_are_found_by_their_instants():
@@ -184,7 +177,7 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
     def seen(seed, drawn=True):
         generator = torch.Generator().manual_seed(seed)
         style, world = (
-            draw_style(3, 6, generator),
+            sample_style(3, 6, generator),
             sample_surroundings(3, generator) if drawn else None,
         )
         return render_crops(meshes, cameras, instants, style, generator, world)

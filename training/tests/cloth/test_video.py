@@ -13,7 +13,7 @@ from stickslip_testing.films import meshes_at, write_film
 from stickslip_training.cloth import video
 from stickslip_training.cloth.clips import INSTANTS, RATE
 from stickslip_training.cloth.crop import ANCHOR, Cameras, Crops, cut, holder_crops
-from stickslip_training.cloth.render import _refined, splat
+from stickslip_training.cloth.render import refine, splat
 from stickslip_training.cloth.video import (
     FLOOR_MAX,
     VideoError,
@@ -46,7 +46,7 @@ def pictures(run, seconds, floor=0.05):
     checks = 0.35 + 0.3 * ((lines[:, None] * 20).floor() + (lines * 20).floor()).remainder(2)
     found = []
     for mesh in torch.from_numpy(meshes_at(run, seconds)).split(32):
-        fine = _refined(mesh[None], 112)
+        fine = refine(mesh[None], 112)
         whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, len(mesh), 2), torch.ones(1, len(mesh)))
         colors = checks.expand(fine.shape[:-1])
         alpha, color = splat(fine, colors, Cameras.of([CAMERA]), whole, size=(224, 224))

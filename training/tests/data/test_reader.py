@@ -108,7 +108,7 @@ def test_works_in_a_forked_child_after_use_in_the_parent(clips):
 
 
 # --- damage
-# ---------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def is_told(root, shard):
@@ -219,7 +219,7 @@ def test_a_shard_that_is_not_in_the_manifest_raises_although_it_is_there(clips, 
 
 
 def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
-    """Another writer took the chunk to be all fill value, and left it out: zarr-python reads zeros."""
+    """Another writer left a chunk out as if it were all fill value: zarr-python reads zeros."""
     made = clips.copy(tmp_path / "v1")
     group = zarr.open_group(str(made.root), mode="r+")
     group["video"][8] = 0

@@ -43,7 +43,7 @@ class Line(Learner):
 
 @pytest.fixture(scope="module", autouse=True)
 def imported():
-    """Torch's first optimizer imports its compiler, for a second of CPU time that is no test's own."""
+    """Torch's first optimizer imports its compiler, which costs a second of CPU time."""
     Line().optimizer([torch.zeros(1)])
 
 

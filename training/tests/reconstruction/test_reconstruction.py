@@ -117,7 +117,7 @@ def test_noise_and_an_uneven_ground_cost_little():
 
 @pytest.mark.slow
 def test_units_clamp_and_large_pictures_of_the_user():
-    """The same rod, 200 mm long, from a clamp elsewhere, in pictures with three times the pixels."""
+    """The same rod, 200 mm long, with another clamp, in pictures with three times the pixels."""
     line, length, clamp = curl(1.0, 0.8), 200.0, np.array([30.0, -20.0, 500.0])
     cameras = []
     for camera in RIG:

@@ -16,7 +16,7 @@ METHODS = [finite_difference_curvature, cubic_spline_curvature, quintic_spline_c
 
 
 def circle(turns):
-    """A circle of length 1 that goes round `turns` times, in a tilted plane: |kappa| = 2 pi turns."""
+    """A circle of length 1 with several turns, in a tilted plane: |kappa| = 2 pi turns."""
     angle = 2 * np.pi * turns * S
     flat = np.stack([np.cos(angle), np.sin(angle), 0 * S], axis=-1) / (2 * np.pi * turns)
     tilt = np.array([[1, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])

@@ -1,3 +1,1 @@
-"""Named test sets that are open to all: their identity, the scores of entries, and the table of
-results.
-"""
+"""Named test sets that are open to all: identity, scores of entries, table of results."""

@@ -1,5 +1,4 @@
-"""Named test sets, whether a dataset is one of them, and entries: records of scores, and their
-table.
+"""Named test sets, and entries: records of scores, and their table.
 
 A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ
 between machines, and so do manifests. What identifies a set is therefore what its samples hold:
@@ -68,28 +67,30 @@ class NamedSet:
         refused = f"the dataset must be the test set {self.name}, and is not: "
         if reader.spec.content_digest != self.parsed_spec.content_digest:
             raise ValueError(
-                f"{refused}its spec is another one. `stickslip-train benchmark spec {self.name}` prints it"
+                f"{refused}its spec is another one. `stickslip-train benchmark spec "
+                f"{self.name}` prints it"
             )
         slots = reader.slots(self.split)
         if (found := labels_digest(self.task, reader, slots)) != self.labels:
             raise ValueError(
-                f"{refused}the labels of its {len(slots)} samples to answer have SHA-256 {found}, and those of the set "
+                f"{refused}the labels of its {len(slots)} samples to answer have SHA-256 "
+                f"{found}, and those of the set "
                 f"{self.labels}. Samples were rejected here, or the dataset is in parts"
             )
         for name, found_here in self.task.seen(reader, slots).items():
-            off, allowed = (
-                np.abs(found_here - self.seen[name].astype(np.float64)).max(),
-                self.task.tolerances[name],
-            )
+            off = np.abs(found_here - self.seen[name].astype(np.float64)).max()
+            allowed = self.task.tolerances[name]
             if not off <= allowed:
                 raise ValueError(
-                    f"{refused}{name} differs by up to {off:.3g}, and {allowed:g} is allowed. This build or machine "
+                    f"{refused}{name} differs by up to {off:.3g}, and {allowed:g} is "
+                    "allowed. This build or machine "
                     "makes other samples: take a published version"
                 )
         return slots, "published" if reader.manifest_digest in self.published else "remade"
 
 
 def set_names() -> tuple[str, ...]:
+    """Return the names of all test sets, in alphabetical order."""
     return tuple(sorted(file.stem for file in SETS.glob("*.json")))
 
 
@@ -201,20 +202,20 @@ def table(name: str, records: Iterable[Record]) -> str:
 
 
 def with_tables(page: str, records: Iterable[Record]) -> str:
-    """Return a page in which what stands between `<!-- results of NAME -->` and `<!-- end -->` is
-    that table.
+    """Return a page with new tables between its marks.
+
+    The marks are `<!-- results of NAME -->` and `<!-- end -->`.
     """
-    known, place = (
-        list(records),
-        re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S),
-    )
+    known = list(records)
+    place = re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S)
     changed, count = place.subn(
         lambda found: f"{found[1]}\n{table(found[2], known)}\n{found[3]}", page
     )
     missing = {record.set for record in known} - set(re.findall(r"<!-- results of (\S+) -->", page))
     if missing or not count:
         raise ValueError(
-            f"the page must have a place `<!-- results of NAME -->` for {', '.join(sorted(missing))}"
+            "the page must have a place `<!-- results of NAME -->` for "
+            f"{', '.join(sorted(missing))}"
         )
     return changed
 

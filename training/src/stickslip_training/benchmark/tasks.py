@@ -1,4 +1,4 @@
-"""Tasks of test sets, one for each kind of dataset that has any: questions, and scoring of answers."""
+"""Tasks of test sets, one for each kind of dataset: questions, and scoring of answers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,8 @@ class Task(ABC):
         """Return the slots and labels of samples as plain values; a category by its name."""
         columns: dict[str, list[Any]] = {"slot": slots.tolist()}
         for label in self.label_names:
-            names, values = reader.categories(label), reader.label(label)[slots].tolist()
+            names = reader.categories(label)
+            values = reader.label(label)[slots].tolist()
             columns[label] = [names[code] for code in values] if names else values
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -73,8 +74,9 @@ class Task(ABC):
 
 
 class ClothTask(Task):
-    """Friction and material of every clip: answers are what `stickslip-train cloth predict --json`
-    prints.
+    """Friction and material of every clip.
+
+    Answers have the form of `stickslip-train cloth predict --json`.
     """
 
     label_names = ("mu", "material", "texture", "viewpoint", "lighting")
@@ -116,7 +118,8 @@ class ClothTask(Task):
         )
 
     def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
-        blind, bands = scores["blind"], scores["bands"]
+        blind = scores["blind"]
+        bands = scores["bands"]
 
         def error(part: Mapping[str, Any]) -> str:
             return f"{part['mae']['value']:.3f}"
@@ -138,16 +141,15 @@ class ClothTask(Task):
 
 
 class RodTask(Task):
-    """Curvature of hanging rods from noisy centrelines, and their weight over their stiffness,
-    gamma.
+    """Curvature of hanging rods from noisy centrelines, and gamma, weight over stiffness.
 
     A method is given the centrelines of the split test under white noise of three strengths, drawn
     from a secret. Its answers are a list with
 
-        {"slot": 7, "noise": 0.005, "bending": [150 numbers, |kappa| L from the clamp on], "gamma": 812.0}
+        {"slot": 7, "noise": 0.005, "bending": [...], "gamma": 812.0}
 
-    for every rod and noise. `bending` is null where a method has no answer, which counts as
-    infinitely wrong. `gamma` may be left out.
+    for every rod and noise. `bending` has 150 numbers, |kappa| L from the clamp on. It is null if a
+    method has no answer, which counts as infinitely wrong. `gamma` may be left out.
     """
 
     label_names = ("gamma", "phi0", "phi1")
@@ -169,7 +171,8 @@ class RodTask(Task):
 
         Who does not know the secret cannot draw the noise again and take it away.
         """
-        exact, seed = reader.read("centerline", slots), int(sha256(secret), 16)
+        exact = reader.read("centerline", slots)
+        seed = int(sha256(secret), 16)
         lines = np.stack(
             [with_white_noise(exact, noise, (seed, place)) for place, noise in enumerate(NOISES)]
         )
@@ -178,7 +181,8 @@ class RodTask(Task):
     def score(
         self, reader: DatasetReader, slots: Integers, answers: Sequence[Any]
     ) -> dict[str, Any]:
-        truth, gamma = _truth(reader, slots), reader.label("gamma")[slots]
+        truth = _truth(reader, slots)
+        gamma = reader.label("gamma")[slots]
         estimated, weights = _parsed(answers, slots, truth.shape[1])
         found = {}
         for place, noise in enumerate(NOISES):
@@ -209,16 +213,19 @@ def _truth(reader: DatasetReader, slots: Integers) -> Floats:
 
 
 def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:
-    """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods); NaN where a method gives none."""
+    """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods).
+
+    Values are NaN if a method gives none.
+    """
     rows = {int(slot): row for row, slot in enumerate(slots)}
-    estimated, gamma = (
-        np.full((len(NOISES), len(slots), points), np.nan),
-        np.full((len(NOISES), len(slots)), np.nan),
-    )
+    estimated = np.full((len(NOISES), len(slots), points), np.nan)
+    gamma = np.full((len(NOISES), len(slots)), np.nan)
     answered = np.zeros(gamma.shape, dtype=bool)
     for place, answer in enumerate(answers):
         try:
-            slot, noise, given = int(answer["slot"]), float(answer["noise"]), answer["bending"]
+            slot = int(answer["slot"])
+            noise = float(answer["noise"])
+            given = answer["bending"]
             values = None if given is None else np.array(given, dtype=np.float64)
             weight = None if answer.get("gamma") is None else float(answer["gamma"])
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -227,7 +234,8 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
             ) from None
         if slot not in rows or noise not in NOISES:
             raise ValueError(
-                f"slot and noise of answer {place} must be of the test set, whose noises are {NOISES}: they are {slot} "
+                f"slot and noise of answer {place} must be of the test set, whose noises "
+                f"are {NOISES}: they are {slot} "
                 f"and {noise:g}"
             )
         where = NOISES.index(noise), rows[slot]
@@ -239,7 +247,8 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
         if values is not None:
             if values.shape != (points,) or not (np.isfinite(values).all() and (values >= 0).all()):
                 raise ValueError(
-                    f"bending of answer {place} must be {points} finite numbers of 0 or more, or null"
+                    f"bending of answer {place} must be {points} finite numbers of 0 or "
+                    "more, or null"
                 )
             estimated[where] = values
         if weight is not None:
@@ -251,7 +260,8 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
     if not answered.all():
         noise, row = (int(index[0]) for index in np.nonzero(~answered))
         raise ValueError(
-            f"every slot of the test set must be answered at every noise, and {(~answered).sum()} are not, "
+            "every slot of the test set must be answered at every noise, and "
+            f"{(~answered).sum()} are not, "
             f"{slots[row]} at {NOISES[noise]:g} first"
         )
     return estimated, gamma

@@ -4,7 +4,8 @@ import typer
 
 from stickslip_training.cli.benchmark import benchmark
 from stickslip_training.cli.cloth import cloth
-from stickslip_training.cli.commands import curvature, export, info, reconstruct
+from stickslip_training.cli.datasets import export, info
+from stickslip_training.cli.rods import curvature, reconstruct
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="Read stickslip datasets and train on them."

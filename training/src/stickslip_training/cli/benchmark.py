@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from stickslip_schemas.store import write_durably
 
-from stickslip_training.cli.commands import DatasetArgument, readable_errors
+from stickslip_training.cli.shared import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
 
 benchmark = typer.Typer(no_args_is_help=True, help="Named test sets: enter yours, and compare.")
@@ -61,11 +61,14 @@ def inputs(
     secret: Annotated[
         Path,
         typer.Option(
-            help="file that the noise is drawn from; the scorer keeps it, and the first call makes it"
+            help=(
+                "file that the noise is drawn from; the scorer keeps it, and the first "
+                "call makes it"
+            )
         ),
     ],
 ) -> None:
-    """Write what a method is given, where that is not the dataset itself: rods are seen with noise."""
+    """Write the input of a method, if it is not the dataset itself: rods get noise."""
     import numpy as np
 
     from stickslip_training.benchmark.sets import load_set

@@ -1,15 +1,21 @@
 """The commands `stickslip-train cloth ...`: friction and material of dragged cloth from video."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from stickslip_training.cli.commands import readable_errors, shows_epochs
+from stickslip_training.cli.shared import readable_errors, report_epochs
 from stickslip_training.data.reader import DatasetReader, Split
+
+if TYPE_CHECKING:
+    from stickslip_training.cloth.clips import Clips
+    from stickslip_training.cloth.model import FrictionModel
+    from stickslip_training.cloth.scope import Scope
 
 NO_ANSWER = 3
 """Exit status of `predict` where no clip has an answer."""
@@ -46,7 +52,10 @@ def train(
     clips: Annotated[
         list[str] | None,
         typer.Option(
-            help="train on these clips of Blender, too: a dataset, or files of blender_clips.py (.npz)"
+            help=(
+                "train on these clips of Blender, too: a dataset, or files of "
+                "blender_clips.py (.npz)"
+            )
         ),
     ] = None,
     start: Annotated[
@@ -62,8 +71,9 @@ def train(
         bool, typer.Option("--resume", help="go on from the checkpoint in --out")
     ] = False,
 ) -> None:
-    """Train a network that estimates material and friction, on pictures rendered from simulations
-    while it trains.
+    """Train a network that estimates material and friction.
+
+    It learns from pictures that are rendered from simulations while it trains.
     """
     from stickslip_schemas.base import sha256
 
@@ -99,7 +109,7 @@ def train(
             out=out,
             identity=source,
             resume=resume,
-            on_epoch=shows_epochs(console, steps),
+            on_epoch=report_epochs(console, steps),
         )
         model.card.update(source)
         save_friction(out / "friction.safetensors", model)
@@ -136,67 +146,117 @@ def predict(
         typer.Option("--json", help="print a list of {slot, material, mu, familiarity, no_answer}"),
     ] = False,
 ) -> None:
-    """Estimate material and friction, with its 80 % interval, of each clip of a dataset or of your
-    own video.
+    """Estimate material and friction, with its 80 % interval, of each clip.
 
-    A clip that is unlike those of training has no answer, and a reason; if all are so, the exit
-    status is 3.
+    The clips are those of a dataset, or your own video. A dataset that the weights of the package
+    do not know, for example of a coarse mesh, is refused. A clip that is unlike those of training
+    has no answer, and a reason; if all are so, the exit status is 3.
     """
-    from stickslip_training.cloth.clips import read_clips
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.model import WEIGHTS, load_friction
-    from stickslip_training.cloth.video import import_video, load_camera
+    from stickslip_training.cloth.scope import package_scope
 
     with readable_errors():
         friction = load_friction(model or WEIGHTS)
-        true: list[str] = []
         if camera is not None:
             if split is not None:
                 raise ValueError(
-                    f"split must not be given with camera: a video has none, and it is {split!r}"
+                    f"--split must not be given with --camera: a video has none, and it is {split}"
                 )
-            calibration = load_camera(camera)
-            clips, found_in = import_video(source, calibration, start=start, frame_rate=frame_rate)
-            Console(stderr=True).print(f"the video: {found_in}", soft_wrap=True)
-            slots = [0]
+            request = _clip_of_video(source, camera, start, frame_rate)
         else:
-            for name, value in (("start", start), ("frame_rate", frame_rate)):
+            for name, value in (("--start", start), ("--frame-rate", frame_rate)):
                 if value is not None:
                     raise ValueError(
-                        f"{name} must come with --camera: clips of a dataset have times; it is {value}"
+                        f"{name} must come with --camera: clips of a dataset have times; "
+                        f"it is {value:g}"
                     )
-            with DatasetReader(source) as reader:
-                clips, found = read_clips(reader, cast("Split | None", split), friction.materials)
-                names = reader.categories("material")
-                fabrics = [names[code] for code in reader.label("material")[found].tolist()]
-            slots = found.tolist()
-            true = [
-                f"{mu:.2f}, {fabric}" for fabric, mu in zip(fabrics, clips.mu.tolist(), strict=True)
-            ]
-        answers = predictions(friction.estimate(clips), slots, friction.judge(clips))
+            # The card of a model of one's own does not say on which meshes it was trained.
+            scope = package_scope(friction.materials) if model is None else None
+            request = _clips_of_dataset(source, split, friction, scope)
+        posterior = friction.estimate(request.clips)
+        answers = predictions(posterior, request.slots, friction.judge(request.clips))
     if as_json:
-        typer.echo(json.dumps(answers, indent=1))
+        typer.echo(json.dumps(answers, indent=1, allow_nan=False))
     else:
-        Console().print(_answers(answers, true))
+        Console().print(_answers(answers, request.truths))
     if all(answer["no_answer"] for answer in answers):
         raise typer.Exit(NO_ANSWER)
 
 
-def _answers(answers: list[dict[str, Any]], true: list[str]) -> Table:
-    table = Table()
-    for title in ("slot", "material", "mu", "80 %", *(["truth"] if true else []), "familiarity"):
-        table.add_column(title, justify="left" if title in ("material", "truth") else "right")
-    for place, answer in enumerate(answers):
-        name, probability = max(answer["material"].items(), key=lambda item: item[1])
-        mu = answer["mu"]
-        if mu is None:
-            cells = ["", "no answer", answer["no_answer"]]
-        else:
-            bounds = f"{mu['low']:.2f} to " + (
-                f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}"
+@dataclass(frozen=True)
+class _Request:
+    """Clips to measure."""
+
+    clips: "Clips"
+    slots: list[int]
+    truths: list[str]
+    """Their true values, for the table; empty for a video."""
+
+
+def _clip_of_video(
+    path: str, camera: Path, start: float | None, frame_rate: float | None
+) -> _Request:
+    """Return the clip of a video, and print its registration."""
+    from stickslip_training.cloth.video import import_video, load_camera
+
+    calibration = load_camera(camera)
+    clip, registration = import_video(path, calibration, start=start, frame_rate=frame_rate)
+    line = (
+        f"the video: the holders start at {registration.start:.2f} s, give or take "
+        f"{registration.timing:.2f} s; residual {registration.residual:.2f} px"
+    )
+    Console(stderr=True).print(line, soft_wrap=True)
+    return _Request(clip, [0], [])
+
+
+def _clips_of_dataset(
+    source: str, split: str | None, friction: "FrictionModel", scope: "Scope | None"
+) -> _Request:
+    """Return the clips of a dataset; raise ValueError if it is outside of a scope."""
+    from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+
+    from stickslip_training.cloth.clips import read_clips
+
+    with DatasetReader(source) as reader:
+        chosen = cast("Split | None", split)
+        if scope is not None and isinstance(reader.spec, ClothDragSpec):
+            slots = reader.slots(chosen)
+            materials = [reader.categories("material")[c] for c in reader.label("material")[slots]]
+            scope.check(
+                reader.spec, set(materials), float(reader.label("mu")[slots].max(initial=0))
             )
-            cells = [f"{name} ({probability:.0%})", f"{mu['median']:.2f}", bounds]
-        table.add_row(
-            str(answer["slot"]), *cells, *true[place : place + 1], f"{answer['familiarity']:.2f}"
-        )
+        clips, slots = read_clips(reader, chosen, friction.materials)
+        names = reader.categories("material")
+        codes = reader.label("material")[slots].tolist()
+    truths = [f"{mu:.2f}, {names[code]}" for code, mu in zip(codes, clips.mu.tolist(), strict=True)]
+    return _Request(clips, slots.tolist(), truths)
+
+
+def _answers(answers: list[dict[str, Any]], truths: list[str]) -> Table:
+    """Return a table of answers, with the true values if they are known."""
+    table = Table()
+    has_truth = bool(truths)
+    table.add_column("slot", justify="right")
+    table.add_column("material", overflow="fold")
+    table.add_column("mu", justify="right")
+    table.add_column("80 %", justify="right")
+    if has_truth:
+        table.add_column("truth", overflow="fold")
+    table.add_column("familiarity", justify="right")
+    for row, answer in enumerate(answers):
+        cells = [str(answer["slot"]), *_estimate_cells(answer)]
+        if has_truth:
+            cells.append(truths[row])
+        table.add_row(*cells, f"{answer['familiarity']:.2f}")
     return table
+
+
+def _estimate_cells(answer: dict[str, Any]) -> tuple[str, str, str]:
+    """Return the likeliest material, the median of mu and its interval, or the reason of none."""
+    mu = answer["mu"]
+    if mu is None:
+        return "", "no answer", answer["no_answer"]
+    name, probability = max(answer["material"].items(), key=lambda item: item[1])
+    high = f"above {mu['above']:g}" if mu["above"] else f"{mu['high']:.2f}"
+    return f"{name} ({probability:.0%})", f"{mu['median']:.2f}", f"{mu['low']:.2f} to {high}"

@@ -14,9 +14,12 @@ from stickslip_training.cloth.posterior import SHARE, Bins, Posterior, estimates
 def likeliest_temperatures(
     material: SingleFloats, mu: SingleFloats, true_material: Integers, true_mu: Floats, bins: Bins
 ) -> tuple[float, float]:
-    """Return the temperatures of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at which
-    the truth is the most likely."""
-    rows, tried = np.arange(len(true_mu)), np.geomspace(0.4, 4.0, 47)
+    """Return the temperatures at which the truth is the most likely.
+
+    They are those of log p(m), (clips, M), and log p(mu | m), (clips, M, K).
+    """
+    rows = np.arange(len(true_mu))
+    tried = np.geomspace(0.4, 4.0, 47)
 
     def likeliest(log_p: SingleFloats, place: Integers) -> float:
         losses = [float(-np.log(softmax(log_p / t)[rows, place] + 1e-12).mean()) for t in tried]
@@ -35,8 +38,10 @@ def covering_temperature(
     of_material: float,
     share: float = SHARE,
 ) -> float:
-    """Return the temperature of mu at which the intervals that should hold `share` of the truths
-    hold that share.
+    """Return the temperature of mu at which intervals hold the truth as often as they should.
+
+    `share` is the probability that an interval should hold, and the fraction of the truths that it
+    then holds.
 
     A few large errors raise the likeliest temperature, which then widens all intervals; they hardly
     change this one.

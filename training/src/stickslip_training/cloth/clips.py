@@ -21,8 +21,9 @@ from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_training.arrays import Array, Floats, Integers
 from stickslip_training.cloth.crop import Cameras, cut, grey, holder_crops
 from stickslip_training.cloth.evaluation import Truth
-from stickslip_training.cloth.render import draw_style, randomly_turned, render_crops
+from stickslip_training.cloth.render import jitter_cameras, render_crops
 from stickslip_training.cloth.runs import Runs, load_runs, runs_of_dataset
+from stickslip_training.cloth.style import sample_style
 from stickslip_training.cloth.surroundings import sample_surroundings
 from stickslip_training.data.reader import DatasetReader, Split
 from stickslip_training.engine.fit import seed_of_step
@@ -49,7 +50,9 @@ LATE_MAX = 0.06
 CHUNK = 32
 """Clips that are rendered or estimated at once outside of training."""
 
-TRAINING, VALIDATION, CHOICE = 0, 1, 2
+TRAINING = 0
+VALIDATION = 1
+CHOICE = 2
 """Streams of random numbers."""
 
 SPLITS: tuple[Split, ...] = ("train", "validation")
@@ -92,8 +95,7 @@ class Clips(Truth):
 
 @dataclass(frozen=True, eq=False)
 class RenderedClips:
-    """Clips of another renderer, over dark floors, to train on besides the pictures that are
-    rendered while training.
+    """Clips of another renderer, over dark floors, to train on besides rendered pictures.
 
     They are a share of each batch, with worlds drawn about their cloth; `validation` chooses the
     weights and the temperature.
@@ -107,21 +109,23 @@ class RenderedClips:
             part: Clips = getattr(self, name)
             if not len(part) or (part.material < 0).any():
                 raise ValueError(
-                    f"the clips for {name} must be some, and of materials of the runs: {len(part)} clips"
+                    f"the clips for {name} must be some, and of materials of the runs: "
+                    f"{len(part)} clips"
                 )
         if self.train.cover.isnan().any():
             raise ValueError(
-                "the clips for train must have a segmentation: other floors are drawn under their cloth"
+                "the clips for train must have a segmentation: other floors are drawn "
+                "under their cloth"
             )
         if shared := set(self.train.run.tolist()) & set(self.validation.run.tolist()):
             raise ValueError(
-                f"clips of one simulation must not be in both splits: simulations {sorted(shared)[:5]}"
+                "clips of one simulation must not be in both splits: simulations "
+                f"{sorted(shared)[:5]}"
             )
 
 
 def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[float, ...]]:
-    """Return the frames that are nearest to the instants that a network sees, and their own
-    instants.
+    """Return the frames nearest to the instants that a network reads, and their instants.
 
     Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX`
     from any frame.
@@ -131,13 +135,15 @@ def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[floa
     for frame, instant in zip(frames, INSTANTS, strict=True):
         if abs(shown[frame] - instant) > LATE_MAX * RATE:
             raise ValueError(
-                f"a clip must have a frame within {LATE_MAX:g} s of {instant / RATE:.2f} s after the start; its "
+                f"a clip must have a frame within {LATE_MAX:g} s of {instant / RATE:.2f} s "
+                "after the start; its "
                 f"nearest of {len(shown)} is at {shown[frame] / RATE:.2f} s"
             )
     return frames, tuple(shown[frames].tolist())
 
 
 def training_cameras() -> tuple[Camera, ...]:
+    """Return the cameras of the viewpoints that a network is trained on."""
     return tuple(camera for camera in load_rig(RIG) if camera.name in VIEWPOINTS)
 
 
@@ -147,29 +153,34 @@ def render_clips(
     seed: int,
     *,
     spread: float = 0.0,
-    drawn_world: bool = False,
+    with_surroundings: bool = False,
     device: str = "cpu",
 ) -> Clips:
     """Render every run `renders` times, each with a look of its own, by the cameras in turn.
 
-    `spread` is the standard deviation of random turns of the cameras [degree]; with `drawn_world`
-    each picture has a world of its own, and a dark floor without. `device` renders.
+    `spread` is the standard deviation of random rotations of the cameras [degree]. With
+    `with_surroundings` each clip has surroundings of its own, and a dark floor without. `device`
+    renders.
     """
     frames, instants = frames_at(runs.instants)
     number = np.repeat(np.arange(len(runs)), renders)
-    crops, covers, directions = [], [], []
+    crops = []
+    covers = []
+    directions = []
     with torch.device(device):
         rig = Cameras.of(training_cameras())
         for start in range(0, len(number), CHUNK):
             chosen = number[start : start + CHUNK]
             generator = torch.Generator(device).manual_seed(seed_of_step(seed, VALIDATION, start))
-            seen = randomly_turned(
+            seen = jitter_cameras(
                 rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator
             )
-            looks = draw_style(len(chosen), len(frames), generator)
+            style = sample_style(len(chosen), len(frames), generator)
             meshes = torch.from_numpy(runs.positions[chosen][:, frames]).to(device)
-            world = sample_surroundings(len(chosen), generator) if drawn_world else None
-            picture, cover = render_crops(meshes, seen, instants, looks, generator, world)
+            surroundings = (
+                sample_surroundings(len(chosen), generator) if with_surroundings else None
+            )
+            picture, cover = render_crops(meshes, seen, instants, style, generator, surroundings)
             crops.append(picture.cpu())
             covers.append(cover.cpu())
             directions.append(seen.rotation[:, 2].cpu())
@@ -202,7 +213,7 @@ def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
 
 
 # --- reading
-# ---------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def read_clips(
@@ -251,10 +262,13 @@ def read_clips(
 def _cropped(
     pictures: Iterable[Sequence[Array]], seen: Cameras, instants: tuple[float, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return crops and coverage of batches of pictures (n, F, H, W, 3) and, where they are known,
-    classes.
+    """Return crops and coverage of batches of pictures (n, F, H, W, 3).
+
+    A batch may have the classes of its pixels, too. Coverage is NaN without them.
     """
-    crops, covers, first = [], [], 0
+    crops = []
+    covers = []
+    first = 0
     for video, *classes in pictures:
         place = holder_crops(seen[first : first + len(video)], instants)
         first += len(video)
@@ -268,21 +282,21 @@ def _cropped(
 
 
 def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[dict[str, Any]]]:
-    """Return the crops of the clips that `benchmarks/training/blender_clips.py` wrote, and what is
-    true of each.
+    """Return the crops of the clips of a file, and the true values of each.
+
+    `benchmarks/training/blender_clips.py` writes such files.
 
     `Clips.run` is the number of the simulation in the packed file that the clips are of.
     """
     with np.load(path) as file:
         if not {"video", "segmentation", "instants", "about"} <= set(file.files):
             raise ValueError(
-                f"{path} must be a file of clips with video, segmentation, instants and about: it has {file.files}"
+                f"{path} must be a file of clips with video, segmentation, instants and "
+                f"about: it has {file.files}"
             )
-        video, classes, shown = (
-            file["video"],
-            file["segmentation"],
-            tuple(map(int, file["instants"])),
-        )
+        video = file["video"]
+        classes = file["segmentation"]
+        shown = tuple(map(int, file["instants"]))
         about = [json.loads(str(line)) for line in file["about"]]
     frames, instants = frames_at(shown)
     named = {camera.name: camera for camera in load_rig(RIG)}
@@ -320,7 +334,8 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
             raise ValueError(
                 "validation must be a packed file of simulations, as runs is one: it is not given"
             )
-        train, judged = load_runs(source), load_runs(validation)
+        train = load_runs(source)
+        judged = load_runs(validation)
         named = {
             name: sha256(Path(of).read_bytes())
             for name, of in (("runs", source), ("validation", validation))
@@ -328,12 +343,14 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
         return named, train, judged.named(train.materials)
     if validation is not None:
         raise ValueError(
-            f"validation must not be given with a dataset, which has a split for it: it is {validation}"
+            "validation must not be given with a dataset, which has a split for it: it is "
+            f"{validation}"
         )
     with DatasetReader(source) as reader:
         if missing := [split for split in SPLITS if not len(reader.slots(split))]:
             raise ValueError(
-                f"the splits train and validation must have simulations: {', '.join(missing)} has none"
+                "the splits train and validation must have simulations: "
+                f"{', '.join(missing)} has none"
             )
         train, judged = (runs_of_dataset(reader, split, INSTANTS)[0] for split in SPLITS)
         return (
@@ -346,8 +363,7 @@ def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], 
 def training_clips(
     sources: list[str], train: Runs, validation: Runs
 ) -> tuple[list[str], RenderedClips]:
-    """Return what identifies clips of simulations to train on and to validate, and the clips of
-    both.
+    """Return the identity of clips to train on and to validate, and both sets of clips.
 
     `sources` are one dataset, or files of clips, whose material and mu name their simulations.
     """
@@ -368,7 +384,8 @@ def training_clips(
     places = [numbers.get(clip, -1) for clip in zip(shown.material, shown.mu, strict=True)]
     if others := places.count(-1):
         raise ValueError(
-            f"clips must show simulations to train on or to validate: {others} of {len(shown)} do not"
+            f"clips must show simulations to train on or to validate: {others} of "
+            f"{len(shown)} do not"
         )
     known = replace(shown, run=np.array(places))
     named = [sha256(Path(source).read_bytes()) for source in sources]
@@ -376,8 +393,9 @@ def training_clips(
 
 
 def simulations(reader: DatasetReader, slots: Integers) -> Integers:
-    """Return a number for each slot that is the same for the clips of one simulation: one fabric,
-    mu and bias.
+    """Return the number of the simulation of each slot.
+
+    Clips of one fabric, mu and bias are of one simulation.
     """
     names = [
         name

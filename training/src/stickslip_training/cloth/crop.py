@@ -15,7 +15,8 @@ from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_training.arrays import Array, Floats
 
-HEIGHT, WIDTH = 72, 88
+HEIGHT = 72
+WIDTH = 88
 """Of a crop [px]."""
 
 SCALE = 290.0
@@ -45,7 +46,8 @@ class Cameras:
     def of(cameras: Sequence[Camera]) -> "Cameras":
         if bent := [camera.name for camera in cameras if any(camera.distortion)]:
             raise ValueError(
-                f"clips must be without lens distortion, and those of {', '.join(sorted(set(bent)))} have it"
+                "clips must be without lens distortion, and those of "
+                f"{', '.join(sorted(set(bent)))} have it"
             )
         return Cameras(
             torch.tensor([camera.rotation for camera in cameras], dtype=torch.float32),
@@ -80,8 +82,9 @@ class Crops:
         return Crops(self.origin[chosen], self.scale[chosen])
 
     def off_by(self, shift: torch.Tensor, stretch: torch.Tensor) -> "Crops":
-        """Return crops whose registration is wrong: by pixels of the crop (B, F, 2), and by a
-        factor (B,) in scale.
+        """Return crops with an error of the registration.
+
+        It is a shift by pixels of the crop (B, F, 2), and a factor (B,) in scale.
         """
         scale = self.scale * stretch[:, None]
         return Crops(self.origin - shift / scale[..., None], scale)
@@ -95,8 +98,9 @@ class Crops:
 
 
 def holder_path(instants: Sequence[float] | Array) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return where the middle of the holders is at instants, of 2.4 a second and whole or not: x
-    and z (F,) [m] [thesis, 4.2.3].
+    """Return the path of the middle of the holders: x and z, (F,) [m] [thesis, 4.2.3].
+
+    Instants are of 2.4 a second, whole or not.
 
     6 cm down, then 30 cm to and fro: 10 mm/s^2 up to 10 mm/s, and as it began to an end.
     """
@@ -147,8 +151,9 @@ def _thirds(count: int) -> torch.Tensor:
 
 
 def grey(video: torch.Tensor) -> torch.Tensor:
-    """Return the grey levels, 0 to 1, (..., H, W), of 8-bit sRGB (..., H, W, 3): the colour of
-    cloth means nothing.
+    """Return the grey levels, 0 to 1, (..., H, W), of 8-bit sRGB (..., H, W, 3).
+
+    The colour of cloth says nothing about its friction.
     """
     weights = torch.tensor([0.299, 0.587, 0.114], device=video.device) / 255
     return video.to(torch.float32) @ weights

@@ -1,5 +1,6 @@
-"""Scores of estimates of friction: the thesis's shares, calibration, bands of mu, and intervals
-over simulations.
+"""Scores of estimates of friction, with intervals over simulations.
+
+They are fractions as in the thesis, calibration, and errors in bands of mu.
 
 Clips of one simulation are not independent. So intervals are over simulations, which are drawn
 again with replacement [bootstrap] together with all their clips.
@@ -116,8 +117,9 @@ def errors(found: Estimates, mu: Floats, run: Integers) -> Errors:
 
 
 def measure(values: Floats, run: Integers) -> Measure:
-    """Return the mean of `values` (clips,), and the 5 % and 95 % quantile of it over drawn
-    simulations.
+    """Return the mean of `values` (clips,), and its 5 % and 95 % quantiles.
+
+    The quantiles are over simulations that are drawn with replacement.
     """
     _, number = np.unique(run, return_inverse=True)
     totals = np.bincount(number, values)
@@ -186,7 +188,8 @@ def score_predictions(
             probabilities = {str(name): float(p) for name, p in answer["material"].items()}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(
-                f"answer {place} must have slot, material and mu with median, low and high: {error!r}"
+                f"answer {place} must have slot, material and mu with median, low and "
+                f"high: {error!r}"
             ) from None
         if slot not in slots:
             raise ValueError(f"slot of answer {place} must be one of the test set, and is {slot}")
@@ -194,7 +197,8 @@ def score_predictions(
             raise ValueError(f"slot {slot} is answered twice, at {place} for the second time")
         if not (np.isfinite([low, median, high]).all() and low <= median <= high):
             raise ValueError(
-                f"mu of answer {place} must be finite with low <= median <= high, and is {answer['mu']}"
+                f"mu of answer {place} must be finite with low <= median <= high, and is "
+                f"{answer['mu']}"
             )
         unknown = set(probabilities) - set(materials)
         if unknown or any(not 0 <= p <= 1 for p in probabilities.values()):
@@ -205,7 +209,8 @@ def score_predictions(
     missing = sorted(set(slots) - set(found))
     if missing:
         raise ValueError(
-            f"every slot of the test set must be answered, and {len(missing)} are not, {missing[0]} first"
+            f"every slot of the test set must be answered, and {len(missing)} are not, "
+            f"{missing[0]} first"
         )
     materials_found, mu_found = (
         np.array(part) for part in zip(*(found[slot] for slot in slots), strict=True)

@@ -124,7 +124,7 @@ class Familiarity:
         ]
         shown = [
             render_clips(
-                some, 1 if place else 4, seed + place, drawn_world=True, device=device
+                some, 1 if place else 4, seed + place, with_surroundings=True, device=device
             ).cover
             for place, some in enumerate(sorts)
         ]
@@ -137,8 +137,9 @@ class Familiarity:
         return replace(found, good_oddness=np.sort(found.measure(good)[0]))
 
     def measure(self, silhouettes: SingleFloats) -> tuple[Floats, Integers]:
-        """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest known
-        clip.
+        """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest clip.
+
+        The nearest clip is one of the known clips.
         """
         seen = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
         far = cdist(seen, self.known)
@@ -147,8 +148,9 @@ class Familiarity:
         return good**3 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]
 
     def judge(self, silhouettes: SingleFloats) -> tuple[Floats, list[str | None]]:
-        """Return the familiarity of silhouettes (clips, F, 18, 22), and why a clip has no answer,
-        or None.
+        """Return the familiarity of silhouettes (clips, F, 18, 22), and the reason of a refusal.
+
+        The reason is None if the clip has an answer.
         """
         odd, sort = self.measure(silhouettes)
         share = 1.0 - np.searchsorted(self.good_oddness, odd) / len(self.good_oddness)

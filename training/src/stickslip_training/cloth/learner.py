@@ -1,11 +1,10 @@
 """Training of the network that measures friction, on pictures that are rendered while it trains."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -34,14 +33,15 @@ from stickslip_training.cloth.model import (
     silhouettes,
 )
 from stickslip_training.cloth.posterior import MU_BINS, Posterior
-from stickslip_training.cloth.render import draw_style, pictured, randomly_turned, render_crops
+from stickslip_training.cloth.render import expose, jitter_cameras, render_crops
 from stickslip_training.cloth.runs import Runs, between
+from stickslip_training.cloth.style import sample_style
 from stickslip_training.cloth.surroundings import cloth_of_clip, sample_surroundings
 from stickslip_training.engine.fit import (
-    EpochReport,
     FitSettings,
     Fitted,
     Learner,
+    RunOptions,
     check_positive,
     cosine_rate,
     fit,
@@ -70,7 +70,10 @@ KEPT = 20
 
 @dataclass(frozen=True, kw_only=True)
 class ClothTraining(FitSettings):
-    """How a network is trained. The same settings, runs, machine and threads give the same weights."""
+    """Settings of a training.
+
+    The same settings, runs, machine and threads give the same weights.
+    """
 
     steps: int = 1500
     epoch: int = 250
@@ -141,10 +144,8 @@ def train_friction(
     *,
     clips: RenderedClips | None = None,
     start: FrictionModel | None = None,
-    out: Path | None = None,
     identity: dict[str, Any] | None = None,
-    resume: bool = False,
-    on_epoch: Callable[[EpochReport], None] | None = None,
+    **run: Unpack[RunOptions],
 ) -> FrictionModel:
     """Train a network on runs, calibrate it on the runs for validation, and return the model.
 
@@ -154,21 +155,18 @@ def train_friction(
         settings: Settings of the training.
         clips: Clips of another renderer to train on, too.
         start: A model whose weights are the first. What cloth is, it knows: its silhouettes stay.
-        out: Directory of the checkpoint; None writes none.
-        identity: Names the runs and the clips; a run that is resumed must have the same.
-        resume: Continue from the checkpoint in `out`.
-        on_epoch: Called with the report of every epoch.
+        identity: Names the runs and the clips. A run that is resumed must have the same.
+        **run: Checkpoint, resume and reports, as `fit` has them.
     """
     if start is not None and clips is None:
         train, validation = (runs.named(start.materials) for runs in (train, validation))
     with torch_threads(settings.threads):
         learner = FrictionLearner(train, validation, settings, clips, start)
-        identity = (identity or {}) | {
-            n: v for n, v in asdict(settings).items() if n not in ("threads", "device")
-        }
-        return learner.calibrated(
-            fit(learner, settings, out=out, identity=identity, resume=resume, on_epoch=on_epoch)
-        )
+        # The same weights come of any number of threads and any device, or nearly so.
+        machine = ("threads", "device")
+        decisive = {name: value for name, value in asdict(settings).items() if name not in machine}
+        identity = (identity or {}) | decisive
+        return learner.calibrated(fit(learner, settings, identity=identity, **run))
 
 
 class FrictionLearner(Learner):
@@ -189,7 +187,8 @@ class FrictionLearner(Learner):
     ) -> None:
         if len(train) == 0 or len(validation) == 0:
             raise ValueError(
-                f"there must be runs to train on and to validate: {len(train)} and {len(validation)}"
+                f"there must be runs to train on and to validate: {len(train)} and "
+                f"{len(validation)}"
             )
         self.settings = settings
         self.frames, self.instants = frames_at(train.instants)
@@ -206,7 +205,9 @@ class FrictionLearner(Learner):
         with torch.device(settings.device):
             self.rig = Cameras.of(training_cameras())
         self.clips = clips
-        self.render = partial(render_clips, drawn_world=settings.worlds, device=settings.device)
+        self.render = partial(
+            render_clips, with_surroundings=settings.worlds, device=settings.device
+        )
         self.validation = (
             self.render(validation, 6, settings.seed, spread=settings.turn)
             if clips is None
@@ -231,7 +232,8 @@ class FrictionLearner(Learner):
             self.net.to(settings.device).standardize(crops, direction, cover)
         elif start.materials != train.materials or start.net.sizes != self.net.sizes:
             raise ValueError(
-                f"the model to start from must know the runs' materials, and be {self.net.sizes}: it knows "
+                "the model to start from must know the runs' materials, and be "
+                f"{self.net.sizes}: it knows "
                 f"{', '.join(start.materials)}, and is {start.net.sizes}"
             )
         else:
@@ -262,20 +264,14 @@ class FrictionLearner(Learner):
         return torch.as_tensor(loss)
 
     def chosen(self, step: int) -> tuple[torch.Tensor, ...]:
-        """Return what a step learns from: clips of the last batches, and what is true of them; half
-        are mirrored.
-        """
+        """Return the batch of a step: clips of the last batches, half of them mirrored."""
         newest = step // self.settings.repeats
         last = range(max(0, newest - KEPT + 1), newest + 1)
         self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
-        random, count = (
-            np.random.default_rng((self.settings.seed, CHOICE, step)),
-            self.settings.batch_size,
-        )
-        drawn, places = (
-            list(self.drawn.values()),
-            random.integers(len(last) * count, size=count).tolist(),
-        )
+        random = np.random.default_rng((self.settings.seed, CHOICE, step))
+        count = self.settings.batch_size
+        drawn = list(self.drawn.values())
+        places = random.integers(len(last) * count, size=count).tolist()
         parts = zip(
             *([part[at % count] for part in drawn[at // count]] for at in places), strict=True
         )
@@ -286,15 +282,15 @@ class FrictionLearner(Learner):
         return crops, direction, material, mu, silhouettes
 
     def batch(self, number: int) -> tuple[torch.Tensor, ...]:
-        """Return the crops, directions of view, materials, mu and silhouettes: true ones before
-        `settled`.
+        """Return crops, directions of view, materials, mu and silhouettes.
+
+        Silhouettes are the true ones before batch `settled`.
         """
-        device, seeds = self.settings.device, (self.settings.seed, TRAINING, number)
+        device = self.settings.device
+        seeds = (self.settings.seed, TRAINING, number)
         with torch.device(device):
-            random, generator = (
-                np.random.default_rng(seeds),
-                torch.Generator(device).manual_seed(seed_of_step(*seeds)),
-            )
+            random = np.random.default_rng(seeds)
+            generator = torch.Generator(device).manual_seed(seed_of_step(*seeds))
             some = (
                 0
                 if self.clips is None
@@ -306,11 +302,12 @@ class FrictionLearner(Learner):
             near = torch.from_numpy(share).to(device)[:, None, None, None, None]
             meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
             views = torch.from_numpy(random.integers(len(self.rig.focal), size=count))
-            cameras = randomly_turned(self.rig[views], self.settings.turn, generator)
-            looks = draw_style(count, len(self.frames), generator)
+            cameras = jitter_cameras(self.rig[views], self.settings.turn, generator)
+            looks = sample_style(count, len(self.frames), generator)
             world = sample_surroundings(count, generator) if self.settings.worlds else None
             crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
-            first, second = self.train.mu[chosen[:, 0]], self.train.mu[chosen[:, 1]]
+            first = self.train.mu[chosen[:, 0]]
+            second = self.train.mu[chosen[:, 1]]
             mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(
                 device
             )
@@ -332,13 +329,11 @@ class FrictionLearner(Learner):
         shown, cover, direction = (
             part.to(device) for part in (clips.crops, clips.cover, clips.direction)
         )
-        looks, world = (
-            draw_style(len(clips), len(self.frames), generator),
-            sample_surroundings(len(clips), generator),
-        )
+        looks = sample_style(len(clips), len(self.frames), generator)
+        world = sample_surroundings(len(clips), generator)
         cloth, world, cover = cloth_of_clip(shown, cover, looks, world, generator)
         cameras = self.rig[torch.cdist(direction, self.rig.rotation[:, 2]).argmin(dim=1)]
-        crops = pictured(
+        crops = expose(
             cloth,
             cameras,
             holder_crops(cameras, self.instants),
@@ -352,7 +347,8 @@ class FrictionLearner(Learner):
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
-        clips, log_p = self.validation, log_histograms(net, self.validation)
+        clips = self.validation
+        log_p = log_histograms(net, self.validation)
         # Overconfidence does not count: temperatures correct it in the end.
         temperature = likeliest_temperatures(*log_p, clips.material, clips.mu, MU_BINS)
         posterior = Posterior.of(*log_p, self.train.materials, MU_BINS, temperature)
@@ -362,7 +358,9 @@ class FrictionLearner(Learner):
         """Return the model of a trained network, calibrated on the clips for validation."""
         net = fitted.net.cpu()
         assert isinstance(net, PosteriorNet)
-        settings, train, clips = self.settings, self.train, self.validation
+        settings = self.settings
+        train = self.train
+        clips = self.validation
         # Exposures and registrations differ as those of new clips may.
         generator = torch.Generator().manual_seed(seed_of_step(settings.seed, VALIDATION, 1))
         varied = replace(clips, crops=jittered(clips.crops, generator))

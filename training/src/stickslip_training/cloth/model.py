@@ -28,8 +28,10 @@ _SILHOUETTE_AT = 2  # number of the convolution that sees the silhouette: frames
 
 
 class PosteriorNet(nn.Module):
-    """Holder-registered crops (B, F, 72, 88) and directions of view (B, 3) to log p(m), (B, M), and
-    log p(mu | m), (B, M, K).
+    """Network from holder-registered crops to log p(m) and log p(mu | m).
+
+    Crops are (B, F, 72, 88), directions of view (B, 3), log p(m) is (B, M), and log p(mu | m) is
+    (B, M, K).
 
     Every frame goes through the same four convolutions and keeps its places: friction shows in
     where an edge lies, to a part of a pixel. The third also sees the silhouette, which has its
@@ -70,8 +72,9 @@ class PosteriorNet(nn.Module):
     def standardize(
         self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor
     ) -> None:
-        """Scale and shift each linear unit to mean 0 and deviation 1 over clips [Mishkin & Matas
-        2016].
+        """Scale and shift each linear unit to mean 0 and deviation 1 over clips.
+
+        After [Mishkin & Matas 2016].
         """
 
         def scaled(layer: nn.Module, _: Any, found: torch.Tensor) -> torch.Tensor:
@@ -103,7 +106,8 @@ class PosteriorNet(nn.Module):
         masks = (self.seen_silhouettes(crops) if silhouettes is None else silhouettes).flatten(
             0, 1
         )[:, None]
-        early, late = self.encoder[: 3 * _SILHOUETTE_AT], self.encoder[3 * _SILHOUETTE_AT :]
+        early = self.encoder[: 3 * _SILHOUETTE_AT]
+        late = self.encoder[3 * _SILHOUETTE_AT :]
         seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), masks], dim=1)
         features = self.frame(late(seen))
         return torch.as_tensor(
@@ -117,14 +121,16 @@ class PosteriorNet(nn.Module):
 
     @torch.no_grad()
     def seen_silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
-        """Return the silhouettes that the network sees, 0 to 1, (B, F, 18, 22): the reader does not
-        teach them.
+        """Return the silhouettes that the network sees, 0 to 1, (B, F, 18, 22).
+
+        No gradient flows back: the reader does not teach the silhouettes.
         """
         return self.silhouettes(crops).sigmoid()
 
     def silhouettes(self, crops: torch.Tensor) -> torch.Tensor:
-        """Return logits of the share that cloth covers of each 4 x 4 pixels of crops (B, F, 72,
-        88): (B, F, 18, 22).
+        """Return logits of the coverage by cloth, (B, F, 18, 22), of crops (B, F, 72, 88).
+
+        A value stands for 4 x 4 pixels.
 
         Mean and deviation over the frames of a clip are seen, too: a floor stays, and cloth moves.
         """
@@ -168,8 +174,9 @@ class FrictionModel:
         )
 
     def judge(self, clips: Clips) -> tuple[Floats, list[str | None]]:
-        """Return the familiarity of every clip, (clips,), and why it has no answer, or None: see
-        `familiarity`.
+        """Return the familiarity of every clip, (clips,), and the reason of a refusal.
+
+        The reason is None if the clip has an answer: see `familiarity`.
         """
         return self.familiarity.judge(silhouettes(self.net, clips))
 
@@ -225,7 +232,8 @@ def mean_model(models: Sequence[FrictionModel]) -> FrictionModel:
 
     They must know the same materials.
     """
-    first, states = models[0], [model.net.state_dict() for model in models]
+    first = models[0]
+    states = [model.net.state_dict() for model in models]
     if len({(each.materials, str(each.net.sizes)) for each in models}) > 1:
         raise ValueError(
             "the models to start from must know the same materials, and be of the same sizes"

@@ -94,10 +94,12 @@ class Posterior:
         bins: Bins,
         temperature: tuple[float, float],
     ) -> "Posterior":
-        """Return the histograms of log p(m), (clips, M), and log p(mu | m), (clips, M, K), at these
-        temperatures.
+        """Return the histograms at these temperatures.
+
+        They are of log p(m), (clips, M), and of log p(mu | m), (clips, M, K).
         """
-        p_material, p_mu = softmax(log_material / temperature[0]), softmax(log_mu / temperature[1])
+        p_material = softmax(log_material / temperature[0])
+        p_mu = softmax(log_mu / temperature[1])
         return Posterior(materials, bins, p_material[..., None] * p_mu)
 
 
@@ -119,5 +121,6 @@ def estimates(histogram: Floats, bins: Bins, share: float = SHARE) -> Estimates:
         ends = np.searchsorted(c, c + share - 1e-12)
         starts = np.flatnonzero(ends < len(edges))
         first = starts[np.argmin(edges[ends[starts]] - edges[starts])]
-        low[clip], high[clip] = edges[first], edges[ends[first]]
+        low[clip] = edges[first]
+        high[clip] = edges[ends[first]]
     return Estimates(median, low, high)

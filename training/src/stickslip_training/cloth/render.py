@@ -1,15 +1,18 @@
-"""Pictures of cloth meshes in torch, made while a network trains: any texture, view and light,
-drawn afresh.
+"""Renderer of cloth meshes in torch, for the pictures that a network trains on.
 
 The mesh is refined to a grid of points, a little closer together than pixels of the crop. Each
-visible point adds its brightness to the four pixels about it, with bilinear weights and in the
-measure of the area that it stands for:
+visible point adds its brightness to the four pixels about it. Its weight there is bilinear, times
+the area a that the point stands for. With w the weight, and c the brightness of the point,
 
-    alpha = min(1, sum_i w_i a_i),   picture = sum_i w_i a_i c_i / sum_i w_i a_i  over the background by alpha
+    alpha = min(1, sum_i w_i a_i),   picture = sum_i w_i a_i c_i / sum_i w_i a_i
 
-so an edge moves through a pixel as smoothly as it does in a photograph. A point is visible where
-nothing on its pixel is nearer by more than `LAYER`. Light is one distant lamp and some from all
-around. What is about the cloth is in `world`.
+and the picture lies over the background by alpha, so an edge moves through a pixel as smoothly as
+it does in a photograph. A point is visible if nothing on its pixel is nearer by more than `LAYER`.
+The light is one distant lamp and some light from all around.
+
+    style          texture, lamp, exposure, noise        sampled
+    surroundings   floor, shadows, holders, codec        sampled; without them the floor is dark
+    render_crops   mesh -> cloth layer -> picture
 """
 
 import math
@@ -19,281 +22,267 @@ from functools import cache
 import numpy as np
 import torch
 from scipy.interpolate import CubicHermiteSpline
+from torch import Tensor
 
 from stickslip_training.cloth.crop import HEIGHT, WIDTH, Cameras, Crops, holder_crops
+from stickslip_training.cloth.style import TEXTURE_SIZE, Style
 from stickslip_training.cloth.surroundings import (
+    DRAG_MIDDLE,
     ClothLayer,
     Surroundings,
     apply_codec,
     blurred,
     composite,
-    enlarged,
 )
 
-POINTS = 56
-"""Points along a side of the refined mesh."""
-
 LAYER = 0.012
-"""[m]: points nearer than this behind the nearest one on a pixel are of the same layer."""
+"""Points nearer than this behind the nearest one on a pixel are of the same layer [m]."""
+
+TURN_CENTER = (DRAG_MIDDLE, 0.0, 0.05)
+"""The point about which cameras are rotated, in the middle of the drag scene [m]."""
+
+# ---- Cameras
+# --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Style:
-    """What clips look like; every tensor has one row a clip."""
+def rotate_cameras(cameras: Cameras, azimuth: Tensor, elevation: Tensor) -> Cameras:
+    """Rotate cameras about the middle of the drag scene.
 
-    texture: torch.Tensor
-    """(B, N, N): reflectance of the points of the cloth, 0 to 1."""
-    lamp: torch.Tensor
-    """(B, 3): direction to the lamp."""
-    ambient: torch.Tensor
-    """(B,): light from all around, over that of the lamp."""
-    exposure: torch.Tensor
-    """(B,)"""
-    floor: torch.Tensor
-    """(B,): brightness of the background."""
-    gamma: torch.Tensor
-    """(B,): exponent of brightness to grey level."""
-    blur: torch.Tensor
-    """(B,): standard deviation [px]."""
-    noise: torch.Tensor
-    """(B,): standard deviation of grey levels."""
-    shift: torch.Tensor
-    """(B, F, 2) [px]: what the registration of the holders is off."""
-    stretch: torch.Tensor
-    """(B,): the scale over that of the crop."""
-
-
-def draw_style(clips: int, frames: int, generator: torch.Generator) -> Style:
-    """Draw what clips look like."""
-
-    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
-        return low + (high - low) * torch.rand(clips, *shape, generator=generator)
-
-    azimuth, elevation = torch.deg2rad(uniform(-110, 50)), torch.deg2rad(uniform(32, 72))
-    lamp = torch.stack(
-        [
-            torch.cos(elevation) * torch.cos(azimuth),
-            torch.cos(elevation) * torch.sin(azimuth),
-            torch.sin(elevation),
-        ],
-        -1,
-    )
-    wander = 0.25 * torch.randn(clips, frames, 2, generator=generator)
-    steady = 0.4 * torch.randn(clips, 1, 2, generator=generator)
-    return Style(
-        texture=draw_textures(clips, generator),
-        lamp=lamp,
-        ambient=uniform(0.1, 0.6),
-        exposure=uniform(0.6, 1.5),
-        floor=uniform(0.0, 0.04),
-        gamma=uniform(0.38, 0.6),
-        blur=uniform(0.0, 0.6),
-        noise=uniform(0.0, 0.02),
-        shift=wander * uniform(0.0, 1.0, 1, 1) + steady * uniform(0.0, 1.0, 1, 1),
-        stretch=1.0 + 0.005 * torch.randn(clips, generator=generator),
-    )
-
-
-def draw_textures(clips: int, generator: torch.Generator) -> torch.Tensor:
-    """Draw reflectances of cloth, (clips, POINTS, POINTS): plain, stripes, checks, dots, blots, and
-    mixtures of them."""
-    v, u = torch.meshgrid(torch.linspace(0, 1, POINTS), torch.linspace(0, 1, POINTS), indexing="ij")
-    r = torch.rand(14, clips, 1, 1, generator=generator)
-    first, second = (_wave(u, v, r[start : start + 5]) for start in (0, 5))
-    plain, mean = torch.full_like(first, 0.5), 0.5 * (first + second)
-    coarse = torch.randint(5, 18, (clips, 1), generator=generator).expand(-1, 2)
-    blots = torch.sigmoid(
-        12 * (enlarged(torch.rand(clips, 17, 17, generator=generator), coarse, POINTS) - 0.5)
-    )
-    sorts = [plain, first, first * second, torch.maximum(first, second), mean, blots]
-    pattern = torch.stack(sorts)[(6 * r[10, :, 0, 0]).long(), torch.arange(clips)]
-    low, high = 0.12 + 0.75 * r[11:13].amin(dim=0), 0.12 + 0.75 * r[11:13].amax(dim=0)
-    return low + (high - low) * torch.where(r[13] < 0.5, pattern, 1 - pattern)
-
-
-def _wave(u: torch.Tensor, v: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
-    """Return stripes, 0 to 1: of any direction, width and sharpness."""
-    angle = math.pi * torch.where(r[1] < 0.4, r[0], r[0].round() / 2)
-    wave = torch.sin(
-        2 * math.pi * ((3 + 14 * r[2] ** 2) * (u * torch.cos(angle) + v * torch.sin(angle)) + r[3])
-    )
-    return torch.sigmoid((1 + 12 * r[4]) * (wave - 0.6 * (r[3] - 0.5)))
-
-
-def turned(cameras: Cameras, azimuth: torch.Tensor, elevation: torch.Tensor) -> Cameras:
-    """Turn cameras about the middle of the drag scene by angles (B,) [rad]: about the vertical, and
-    up.
+    The angles (B,) [rad] are about the vertical, and up.
     """
-    middle = cameras.translation.new_tensor([0.15, 0.0, 0.05]).expand(len(azimuth), 3)
-    seen = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
-    c, s, zero, one = (
-        torch.cos(azimuth),
-        torch.sin(azimuth),
-        torch.zeros_like(azimuth),
-        torch.ones_like(azimuth),
-    )
-    around = torch.stack([c, s, zero, -s, c, zero, zero, zero, one], dim=-1).reshape(-1, 3, 3)
-    c, s = torch.cos(elevation), torch.sin(elevation)
-    up = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], dim=-1).reshape(-1, 3, 3)
-    rotation = up @ cameras.rotation @ around
-    return Cameras(
-        rotation, seen - (rotation @ middle[..., None])[..., 0], cameras.focal, cameras.center
-    )
+    middle = cameras.translation.new_tensor(TURN_CENTER).expand(len(azimuth), 3)
+    in_camera = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
+    zero = torch.zeros_like(azimuth)
+    one = torch.ones_like(azimuth)
+
+    # About the vertical axis of the world, and then about the horizontal axis of the camera.
+    cos, sin = torch.cos(azimuth), torch.sin(azimuth)
+    around = torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], dim=-1)
+    cos, sin = torch.cos(elevation), torch.sin(elevation)
+    up = torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1)
+    rotation = up.reshape(-1, 3, 3) @ cameras.rotation @ around.reshape(-1, 3, 3)
+
+    # The middle of the scene stays in its place in the picture.
+    translation = in_camera - (rotation @ middle[..., None])[..., 0]
+    return Cameras(rotation, translation, cameras.focal, cameras.center)
 
 
-def randomly_turned(cameras: Cameras, deviation: float, generator: torch.Generator) -> Cameras:
-    """Turn each camera by angles of its own of this standard deviation [degree]."""
-    azimuth, elevation = torch.deg2rad(
-        deviation * torch.randn(2, len(cameras.focal), generator=generator)
-    )
-    return turned(cameras, azimuth, elevation)
+def jitter_cameras(cameras: Cameras, deviation: float, generator: torch.Generator) -> Cameras:
+    """Rotate each camera by random angles of this standard deviation [degree]."""
+    angles = deviation * torch.randn(2, len(cameras.focal), generator=generator)
+    azimuth, elevation = torch.deg2rad(angles)
+    return rotate_cameras(cameras, azimuth, elevation)
+
+
+# ---- Pictures
+# --------------------------------------------------------------------------------------------------
 
 
 def render_crops(
-    positions: torch.Tensor,
+    positions: Tensor,
     cameras: Cameras,
     instants: tuple[float, ...],
     style: Style,
     generator: torch.Generator | None = None,
-    world: Surroundings | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render the holder-registered crops of meshes (B, F, side, side, 3) [m], and how much of each
-    pixel cloth covers.
+    surroundings: Surroundings | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Render the holder-registered crops of meshes.
 
-    Both are (B, F, 72, 88), grey levels and shares. `cameras` register the crops; `world` says how
-    the true ones differ, and what else is in the picture: without it, nothing but a dark floor.
-    `generator` draws the noise; without it there is none.
+    Args:
+        positions: Vertices of the meshes, (B, F, side, side, 3) [m].
+        cameras: Cameras by which the crops are registered.
+        instants: Instant of each of the F frames.
+        style: Style of each of the B clips.
+        generator: Draws the noise; None adds no noise.
+        surroundings: Objects in the picture, and by how much the true cameras differ from
+            `cameras`; None leaves a dark floor.
+
+    Returns:
+        Grey levels, and the fraction of each pixel that cloth covers, (B, F, 72, 88) each.
     """
     crops = holder_crops(cameras, instants)
-    true = cameras if world is None else world.true_cameras(cameras)
-    shade = shading(positions, true, style)
-    parts = []
-    count = (
-        1 if positions.device.type == "cpu" else len(positions)
-    )  # one clip's points fit into a processor's cache
-    for clip in range(0, len(positions), count):
-        one = slice(clip, clip + count)
-        fine = _refined(torch.cat([positions[one], shade[one, ..., None]], dim=-1), POINTS)
-        points, colors = fine[..., :3], fine[..., 3] * style.texture[one, None]
-        place = true[one], crops[one].off_by(style.shift[one], style.stretch[one])
-        lamp = style.lamp[one][:, None, None, None]
-        fallen = points - lamp * (points[..., 2:] / lamp[..., 2:])
-        shadow = (
-            torch.zeros(1) if world is None else splat(fallen, torch.ones_like(colors), *place)[0]
+    true_cameras = cameras if surroundings is None else surroundings.true_cameras(cameras)
+    shade = shading(positions, true_cameras, style)
+    has_shadows = surroundings is not None
+
+    # One clip's points fit into the cache of a processor; a GPU takes all clips at once.
+    size = 1 if positions.device.type == "cpu" else len(positions)
+    layers = []
+    for start in range(0, len(positions), size):
+        batch = slice(start, start + size)
+        view = _View(
+            true_cameras[batch], crops[batch].off_by(style.shift[batch], style.stretch[batch])
         )
-        parts.append((*splat(points, colors, *place), shadow))
-    cloth = ClothLayer(*(torch.cat(part) for part in zip(*parts, strict=True)))
-    return pictured(cloth, true, crops, instants, style, generator, world), cloth.alpha
+        layers.append(_cloth_layer(positions[batch], shade[batch], view, style, batch, has_shadows))
+    cloth = ClothLayer(
+        alpha=torch.cat([layer.alpha for layer in layers]),
+        light=torch.cat([layer.light for layer in layers]),
+        shadow=torch.cat([layer.shadow for layer in layers]),
+    )
+    pictures = expose(cloth, true_cameras, crops, instants, style, generator, surroundings)
+    return pictures, cloth.alpha
 
 
-def pictured(
+@dataclass(frozen=True)
+class _View:
+    """The cameras of a batch, and the place of its crops."""
+
+    cameras: Cameras
+    crops: Crops
+
+
+def _cloth_layer(
+    positions: Tensor, shade: Tensor, view: _View, style: Style, batch: slice, has_shadows: bool
+) -> ClothLayer:
+    """Draw the cloth of a batch of clips, and its shadow on the floor."""
+    # Positions and light are refined together, so that both are as smooth.
+    fields = torch.cat([positions, shade[..., None]], dim=-1)
+    fine = refine(fields, TEXTURE_SIZE)
+    points = fine[..., :3]
+    colors = fine[..., 3] * style.texture[batch, None]
+    alpha, light = splat(points, colors, view.cameras, view.crops)
+
+    shadow = torch.zeros(1)
+    if has_shadows:
+        # The shadow is the cloth, moved along the rays of the lamp down to the floor.
+        lamp = style.lamp[batch][:, None, None, None]
+        on_floor = points - lamp * (points[..., 2:] / lamp[..., 2:])
+        shadow = splat(on_floor, torch.ones_like(colors), view.cameras, view.crops)[0]
+    return ClothLayer(alpha, light, shadow)
+
+
+def expose(
     cloth: ClothLayer,
     cameras: Cameras,
     crops: Crops,
     instants: tuple[float, ...],
     style: Style,
     generator: torch.Generator | None,
-    world: Surroundings | None,
-) -> torch.Tensor:
-    """Return the grey levels of cloth in a world, or over the dark floor of `style`, (B, F, 72,
-    88).
+    surroundings: Surroundings | None,
+) -> Tensor:
+    """Return the grey levels that a camera records, (B, F, 72, 88).
+
+    Without surroundings the cloth lies on the dark floor of `style`.
     """
-    if world is None:
+    gamma = style.gamma[:, None, None, None]
+    if surroundings is None:
         floor = style.floor[:, None, None, None]
-        light = (
-            style.exposure[:, None, None, None] * cloth.alpha * cloth.light
-            + (1.0 - cloth.alpha) * floor
-        )
+        exposure = style.exposure[:, None, None, None]
+        light = exposure * cloth.alpha * cloth.light + (1.0 - cloth.alpha) * floor
     else:
-        light = composite(cloth, cameras, crops, instants, style, world).clamp(max=1.0)
-    picture = light.clamp(min=1e-5) ** style.gamma[:, None, None, None]
-    picture = blurred(picture, style.blur)
+        light = composite(cloth, cameras, crops, instants, style, surroundings).clamp(max=1.0)
+
+    # A camera blurs, adds noise, and compresses, in this order.
+    pictures = blurred(light.clamp(min=1e-5) ** gamma, style.blur)
     if generator is not None:
-        picture = picture + style.noise[:, None, None, None] * torch.randn(
-            picture.shape, generator=generator
-        )
-    return (picture if world is None else apply_codec(picture, world.codec)).clamp(0.0, 1.0)
+        noise = torch.randn(pictures.shape, generator=generator)
+        pictures = pictures + style.noise[:, None, None, None] * noise
+    if surroundings is not None:
+        pictures = apply_codec(pictures, surroundings.codec)
+    return pictures.clamp(0.0, 1.0)
 
 
-def _refined(fields: torch.Tensor, points: int) -> torch.Tensor:
+def shading(positions: Tensor, cameras: Cameras, style: Style) -> Tensor:
+    """Return the light that vertices send to the camera per reflectance [Lambert].
+
+    Vertices are (B, F, side, side, 3) [m]. Cloth is lit on the side that the camera sees.
+    """
+    across, along = torch.gradient(positions, dim=(2, 3))
+    normal = torch.nn.functional.normalize(torch.linalg.cross(across, along), dim=-1)
+    eye = -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0]
+    to_eye = eye[:, None, None, None] - positions
+    facing = torch.sign((normal * to_eye).sum(dim=-1))
+    lamp = (normal * style.lamp[:, None, None, None]).sum(dim=-1) * facing
+    return style.ambient[:, None, None, None] + lamp.clamp(min=0.0)
+
+
+# ---- Refinement
+# --------------------------------------------------------------------------------------------------
+
+
+def refine(fields: Tensor, points: int) -> Tensor:
     """Refine fields on meshes (B, F, side, side, n) to (B, F, points, points, n), smoothly."""
     weights = _spline(fields.shape[2], points).to(fields.device)
     clips, frames, side, _, count = fields.shape
+    # The spline is separable: rows of the grid first, then columns.
     rows = weights @ fields.reshape(clips * frames, side, side * count)
     fine = weights @ rows.reshape(clips * frames * points, side, count)
     return fine.reshape(clips, frames, points, points, count)
 
 
 @cache
-def _spline(nodes: int, points: int) -> torch.Tensor:
+def _spline(nodes: int, points: int) -> Tensor:
     """Return W, (points, nodes): W @ y are values of the Catmull-Rom spline through y."""
     unit = np.eye(nodes)
     spline = CubicHermiteSpline(np.arange(nodes), unit, np.gradient(unit, axis=0))
     return torch.from_numpy(spline(np.linspace(0, nodes - 1, points)).astype(np.float32))
 
 
-def shading(positions: torch.Tensor, cameras: Cameras, style: Style) -> torch.Tensor:
-    """Return the light that vertices (B, F, side, side, 3) send to the camera per reflectance
-    [Lambert].
-    """
-    across, along = torch.gradient(positions, dim=(2, 3))
-    normal = torch.nn.functional.normalize(torch.linalg.cross(across, along), dim=-1)
-    eye = -(cameras.rotation.transpose(1, 2) @ cameras.translation[..., None])[..., 0]
-    facing = torch.sign((normal * (eye[:, None, None, None] - positions)).sum(dim=-1))
-    lamp = (normal * style.lamp[:, None, None, None]).sum(dim=-1) * facing
-    return style.ambient[:, None, None, None] + lamp.clamp(min=0.0)
+# ---- Points to pixels
+# --------------------------------------------------------------------------------------------------
 
 
 def splat(
-    points: torch.Tensor,
-    colors: torch.Tensor,
+    points: Tensor,
+    colors: Tensor,
     cameras: Cameras,
     crops: Crops,
     *,
     size: tuple[int, int] = (HEIGHT, WIDTH),
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return coverage and colour of each pixel, (B, F, *size), of points (B, F, N, N, 3) with
-    colours (B, F, N, N).
+) -> tuple[Tensor, Tensor]:
+    """Return the coverage and the colour of each pixel, (B, F, *size).
+
+    Points are (B, F, N, N, 3) [m], with colours (B, F, N, N).
     """
     clips, frames = points.shape[:2]
     height, width = size
     pixels, depth = cameras.project(points)
-    places = crops.of_pixels(pixels)
-    area = _areas(places)
-    # A border takes what is out of sight: one pixel before the picture, two after it.
-    wide, high = width + 3, height + 3
-    column = places[..., 0].clamp(-1.0, width)
-    row = places[..., 1].clamp(-1.0, height)
-    left, top = column.floor(), row.floor()
-    right, down = column - left, row - top
+    positions = crops.of_pixels(pixels)
+    area = _areas(positions)
+
+    # A border takes the points out of sight: one pixel before the picture, two after it.
+    wide = width + 3
+    high = height + 3
+    column = positions[..., 0].clamp(-1.0, width)
+    row = positions[..., 1].clamp(-1.0, height)
+    left = column.floor()
+    top = row.floor()
+    right = column - left
+    down = row - top
     start = (torch.arange(clips * frames) * (wide * high)).reshape(clips, frames, 1, 1)
     corner = start + (top.long() + 1) * wide + left.long() + 1
+
+    # A depth buffer of the nearest pixel of each point decides which points are visible.
     nearest = corner + (right > 0.5) + (down > 0.5) * wide
     total = clips * frames * wide * high
-    buffer = torch.full((total,), math.inf).scatter_reduce_(
-        0, nearest.reshape(-1), depth.reshape(-1), "amin"
-    )
+    empty = torch.full((total,), math.inf)
+    buffer = empty.scatter_reduce_(0, nearest.reshape(-1), depth.reshape(-1), "amin")
     weight = area * (depth <= buffer[nearest] + LAYER)
+
+    # Each point adds to four pixels, with bilinear weights.
     sums = torch.zeros(2, total)
-    for step, share in (
+    for step, bilinear in (
         (0, (1 - right) * (1 - down)),
         (1, right * (1 - down)),
         (wide, (1 - right) * down),
         (wide + 1, right * down),
     ):
-        place, w = (corner + step).reshape(-1), weight * share
-        sums[0].index_add_(0, place, w.reshape(-1))
-        sums[1].index_add_(0, place, (w * colors).reshape(-1))
+        index = (corner + step).reshape(-1)
+        added = weight * bilinear
+        sums[0].index_add_(0, index, added.reshape(-1))
+        sums[1].index_add_(0, index, (added * colors).reshape(-1))
     sums = sums.reshape(2, clips, frames, high, wide)[..., 1:-2, 1:-2]
     return sums[0].clamp(max=1.0), sums[1] / sums[0].clamp(min=1e-6)
 
 
-def _areas(places: torch.Tensor) -> torch.Tensor:
-    """Return the area that each point of a grid stands for [px^2], (B, F, N, N); half of it at
-    edges.
+def _areas(positions: Tensor) -> Tensor:
+    """Return the area that each point of a grid stands for [px^2], (B, F, N, N).
+
+    A point on an edge stands for half of it.
     """
-    across, along = torch.gradient(places, dim=(2, 3))
+    across, along = torch.gradient(positions, dim=(2, 3))
     area = (across[..., 0] * along[..., 1] - across[..., 1] * along[..., 0]).abs()
-    edge = torch.ones(places.shape[2])
-    edge[0] = edge[-1] = 0.5
+    edge = torch.ones(positions.shape[2])
+    edge[0] = 0.5
+    edge[-1] = 0.5
     return area * edge[:, None] * edge

@@ -72,8 +72,10 @@ def load_runs(path: str | Path) -> Runs:
         with np.load(path) as file:
             low, high = file["differences"]
             about = [json.loads(str(line)) for line in file["about"]]
-            rest, instants = file["rest"], tuple(map(int, file["instants"]))
-        names, mu = [run["material"] for run in about], np.array([run["mu"] for run in about])
+            rest = file["rest"]
+            instants = tuple(map(int, file["instants"]))
+        names = [run["material"] for run in about]
+        mu = np.array([run["mu"] for run in about])
     except (BadZipFile, zlib.error, KeyError, EOFError) as error:
         raise ValueError(f"{path} must be a packed file of simulations: {error}") from error
     differences = np.stack([low, high], axis=-1).view(np.int16)[..., 0]
@@ -86,8 +88,7 @@ def load_runs(path: str | Path) -> Runs:
 def runs_of_dataset(
     reader: DatasetReader, split: Split | None, instants: Sequence[int]
 ) -> tuple[Runs, Integers]:
-    """Return the simulations of a dataset that stores its meshes, and the slot of one sample of
-    each.
+    """Return the simulations of a dataset with meshes, and the slot of one sample of each.
 
     Samples of one simulation have the same material, mu and the mesh at the last instant that is
     read.
@@ -95,9 +96,12 @@ def runs_of_dataset(
     for name in ("positions", "rest", "material", "mu"):
         if name not in reader.arrays:
             raise ValueError(
-                f"the dataset must have the array {name} to train from meshes: its spec says store_positions: false"
+                f"the dataset must have the array {name} to train from meshes: its spec "
+                "says store_positions: false"
             )
-    slots, meshes, seen = [], [], set()
+    slots = []
+    meshes = []
+    seen = set()
     for slot in reader.slots(split).tolist():
         mesh = reader.read("positions", [slot])[0][list(instants)]
         if (key := mesh[-1].tobytes()) not in seen:
@@ -131,8 +135,9 @@ def _runs(
 
 
 def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
-    """Return the side along x, +1 or -1, of the free edge of positions at the instant `SLIDING`,
-    (runs, V, 3) [m].
+    """Return the side along x, +1 or -1, of the free edge, (runs,).
+
+    Positions are (runs, V, 3) [m] at the instant `SLIDING`.
     """
     x = positions[:, :, 0]
     free, held = (
@@ -154,13 +159,15 @@ def grid_order(rest: SingleFloats) -> Integers:
         if all(np.allclose(step, step.flat[0], atol=1e-6) and step.flat[0] > 0 for step in steps):
             return order.reshape(side, side)
     raise ValueError(
-        f"rest must be a square grid of vertices to be rendered from: its {len(rest)} vertices are none"
+        f"rest must be a square grid of vertices to be rendered from: its {len(rest)} "
+        "vertices are none"
     )
 
 
 def between(runs: Runs, gap: float) -> list[tuple[int, int]]:
-    """Return pairs of runs of one fabric and one landed side that are neighbours in mu, no farther
-    apart than `gap`.
+    """Return pairs of runs of one fabric and landed side that are neighbours in mu.
+
+    Neighbours are no farther apart than `gap`.
 
     The mesh of a friction between theirs is close to the mean of theirs: the steady states of a leg
     move with mu, and keep their kind. Below `STEEP` they move fast, and two branches exist:

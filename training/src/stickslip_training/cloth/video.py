@@ -86,9 +86,11 @@ class Registration:
     def refusals(self) -> list[str]:
         """Return why the video must not be measured, if it must not."""
         rules = {
-            f"the holders must move as one on their path to within {RESIDUAL_MAX:g} px of a picture 224 px wide, and "
+            f"the holders must move as one on their path to within {RESIDUAL_MAX:g} px of "
+            "a picture 224 px wide, and "
             f"are {self.residual:.2f} px off": self.residual <= RESIDUAL_MAX,
-            f"the start must be the same in both halves of the video to within {TIMING_MAX:g} s, and differs by "
+            "the start must be the same in both halves of the video to within "
+            f"{TIMING_MAX:g} s, and differs by "
             f"{self.timing:.2f} s": self.timing <= TIMING_MAX,
         }
         return [rule for rule, holds in rules.items() if not holds]
@@ -139,7 +141,8 @@ def import_video(
     last = INSTANTS[-1] / RATE - CUT_MAX
     if times[-1] - times[0] < last:
         raise VideoError(
-            f"the video must show {last:.0f} s from the start on, and lasts {times[-1] - times[0]:.1f} s"
+            f"the video must show {last:.0f} s from the start on, and lasts "
+            f"{times[-1] - times[0]:.1f} s"
         )
     if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
         raise VideoError(
@@ -150,7 +153,8 @@ def import_video(
         raise VideoError("; ".join(reasons))
     chosen, instants = frames_at((times - registration.start) * RATE)
     first, *pictures = _pictures(path, camera, [0, *chosen])
-    pixel, off = camera.width / _WIDE, wanders[chosen]
+    pixel = camera.width / _WIDE
+    off = wanders[chosen]
     found = [
         floor_motion(first, picture, near)
         for picture, near in zip(pictures, off / pixel, strict=True)
@@ -158,7 +162,10 @@ def import_video(
     motions, deviations = map(np.array, zip(*found, strict=True))
     if max(deviations) <= FLOOR_MAX:
         if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
-            rule = f"must show one motion of the camera to within {APART_MAX:g} px of a picture 224 px wide"
+            rule = (
+                f"must show one motion of the camera to within {APART_MAX:g} px of a "
+                "picture 224 px wide"
+            )
             raise VideoError(f"the floor and the holders {rule}, and differ by {apart:.1f}")
         off = motions * pixel
     registered = holder_crops(Cameras.of([camera.straight]), instants)
@@ -205,8 +212,9 @@ def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
 
 
 def holder_points(instants: Array) -> Floats:
-    """Return the middles of the two held patches at instants (F,), which need not be whole: (F, 2,
-    3) [m].
+    """Return the middles of the two held patches, (F, 2, 3) [m], at instants (F,).
+
+    Instants need not be whole.
     """
     x, z = (np.asarray(part, dtype=np.float64) for part in holder_path(instants))
     return np.stack(
@@ -235,7 +243,8 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
         height, width = picture.shape
         if (width, height) != (camera.width, camera.height):
             raise VideoError(
-                f"frames must have the size of the calibration, {camera.width} x {camera.height}, and have "
+                f"frames must have the size of the calibration, {camera.width} x "
+                f"{camera.height}, and have "
                 f"{width} x {height}"
             )
         if before is not None:
@@ -247,7 +256,9 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
             first = {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
             place, found, _ = flow(kept, picture, kept_place, step.copy(), **first)
             if not found.all() or np.abs(place - step).max() > MATCH_MAX:
-                place, kept, kept_place = step, picture, step
+                place = step
+                kept = picture
+                kept_place = step
         else:
             kept = picture
         times.append(time)
@@ -255,7 +266,8 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
         before = picture
     if len(times) < 2:
         raise VideoError(f"{path} must have frames, and has {len(times)}")
-    focal, center = np.array((camera.fx, camera.fy)), np.array((camera.cx, camera.cy))
+    focal = np.array((camera.fx, camera.fy))
+    center = np.array((camera.cx, camera.cy))
     u, v = np.moveaxis((np.array(places, dtype=np.float64) - center) / focal, -1, 0)
     flat = np.stack(undistorted(u, v, camera.distortion), axis=-1)
     return np.array(times), focal * flat + center
@@ -264,8 +276,10 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
 def _register(
     times: Floats, tracks: Floats, camera: Camera, start: float | None
 ) -> tuple[Registration, Floats]:
-    """Return the registration, and the common motion of both holders besides the path, from the
-    first frame on, (N, 2) [px]."""
+    """Return the registration, and the motion of the camera, (N, 2) [px].
+
+    The motion is the common motion of both holders besides the path, from the first frame on.
+    """
 
     def off(t0: float, some: slice = slice(None)) -> Floats:
         """Return tracks less the path, less their mean, (N, 2, 2)."""
@@ -312,8 +326,7 @@ def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.N
 def floor_motion(
     before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], near: Floats
 ) -> tuple[Floats, float]:
-    """Return how far the floor has moved between two pictures (H, W), (2,), and the standard
-    deviation of that.
+    """Return the motion of the floor between two pictures (H, W), (2,), and its deviation.
 
     All are in pixels of a picture 224 px wide. The motion is looked for within 2 px or so of
     `near`, which the holders tell, and of 0, since they may be lost and a tripod does not move. The
@@ -334,8 +347,9 @@ def floor_motion(
 
 
 def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:
-    """Return the motion d from picture A to B, (H, W) each without what is wider than 3 px, and its
-    deviation [px].
+    """Return the motion d from picture A to B, (H, W) each, and its deviation [px].
+
+    The pictures have nothing that is wider than 3 px.
 
     From `start` on, Gauss-Newton steps with the weights of the step before minimize
 
@@ -350,7 +364,9 @@ def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:
         return np.asarray(field)[..., 8:-8, 8:-8].reshape(*np.shape(field)[:-2], -1)
 
     rounded = 1 / 12  # variance of grey levels that are rounded to whole ones
-    motion, step, slopes = start.copy(), np.ones(2), inner(np.gradient(a)[::-1])
+    motion = start.copy()
+    step = np.ones(2)
+    slopes = inner(np.gradient(a)[::-1])
     for _ in range(20):
         place = np.hstack([np.eye(2), motion[:, None]])
         moved = cv2.warpAffine(

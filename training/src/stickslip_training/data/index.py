@@ -1,5 +1,6 @@
-"""Where a version keeps its samples, and reading them: labels, curves of many samples a chunk, one
-chunk a sample.
+"""Index of a version: the place of each sample in its files, and reading.
+
+A file holds labels, curves of many samples a chunk, or one chunk a sample.
 
 A read of bytes per clip, mesh or set of views: shard indexes are kept, a chunk's crc32c is checked,
 and it is decoded into its place in the caller's buffer.
@@ -71,11 +72,11 @@ class Index:
         )
 
     # --- files
-    # --------------------------------------------------------------------------------------------------
+    # ----------------------------------------------------------------------------------------------
 
     @contextmanager
     def contents(self) -> Iterator[Contents]:
-        """Give the manifest's contents; within the block a broken section raises CorruptDataError."""
+        """Yield the manifest's contents; a broken section then raises CorruptDataError."""
         try:
             yield self._contents
         except BrokenSectionError as error:
@@ -120,8 +121,9 @@ class Index:
             )
 
     def check_section(self, slot: int) -> None:
-        """Check that the section of a sample fits the labels, and lists every shard with a valid
-        sample.
+        """Check that the section of a sample fits the labels, and lists all shards.
+
+        Each shard with a valid sample must be listed.
         """
         number = self._contents.number_of(slot)
         if number in self._checked_sections:
@@ -152,12 +154,13 @@ class Index:
         self._checked_sections.add(number)
 
     # --- arrays
-    # -------------------------------------------------------------------------------------------------
+    # ----------------------------------------------------------------------------------------------
 
     def label(self, name: str) -> Array:
         """Return a label of all slots, (slots, ...), read-only."""
         if name not in self._labels:
-            array, count = self.arrays[name], self.manifest.sample_count
+            array = self.arrays[name]
+            count = self.manifest.sample_count
             numbers = range(-(-count // self.manifest.spec.samples_per_file(array)))
             values = np.concatenate([self._read_chunk(array, number) for number in numbers])[:count]
             values.flags.writeable = False

@@ -118,9 +118,7 @@ class DatasetReader:
 
     @cached_property
     def chosen(self) -> Array:
-        """True where there is a sample in the part of the version that the source holds, bool
-        (slots,).
-        """
+        """Mask of the samples in the part of the version that the source holds, bool (slots,)."""
         return self.selection.choose_samples(self.arrays.values(), self.label)
 
     def __len__(self) -> int:
@@ -150,7 +148,7 @@ class DatasetReader:
         return np.flatnonzero(chosen).astype(np.int64)
 
     def array(self, name: str) -> ArrayLayout:
-        """Return the layout of an array; raise ValueError where the version has none of this name."""
+        """Return the layout of an array; raise ValueError if there is none of this name."""
         try:
             return self.arrays[name]
         except KeyError:
@@ -159,9 +157,7 @@ class DatasetReader:
             ) from None
 
     def label(self, name: str) -> Array:
-        """Return a label of all slots, (slots,), or (slots, n) for one that is a small vector;
-        read-only.
-        """
+        """Return a label of all slots, read-only: (slots,), or (slots, n) for a small vector."""
         array = self.array(name)
         if not array.is_label:
             raise ValueError(f"{name} is no label; the labels are {', '.join(self.label_names)}")
@@ -195,8 +191,7 @@ class DatasetReader:
         return out
 
     def read_into(self, name: str, slots: Slots, out: Array) -> None:
-        """Read array `name` of the samples in `slots` into `out`, C-ordered, (len(slots), *sample
-        shape).
+        """Read array `name` of the samples in `slots` into `out`, (len(slots), *sample shape).
 
         `out` of clips may also have the order in memory that their chunks have, which is quicker.
 
@@ -214,7 +209,8 @@ class DatasetReader:
         )
         if out.shape != shape or out.dtype != np.dtype(array.dtype) or not ordered:
             raise ValueError(
-                f"out must be C-ordered {array.dtype} of shape {shape} for {name}, and is {out.dtype} of {out.shape}"
+                f"out must be C-ordered {array.dtype} of shape {shape} for {name}, and is "
+                f"{out.dtype} of {out.shape}"
             )
         for place, slot in enumerate(map(int, slots)):
             self._check_slot(slot)
@@ -235,7 +231,7 @@ class DatasetReader:
             )
 
     # --- checks
-    # -------------------------------------------------------------------------------------------------
+    # ----------------------------------------------------------------------------------------------
 
     def verify(self) -> None:
         """Check the size and the SHA-256 of every file of the manifest.
@@ -254,8 +250,11 @@ class DatasetReader:
             self.index.check_section(slot)
 
     def _check_metadata(self, group: dict[str, Any]) -> None:
-        """Check the Zarr metadata against the layout: what is read follows from the layout alone,
-        and a chunk of another shape or codec would be nonsense that passes its checksum."""
+        """Check the Zarr metadata against the layout.
+
+        All reading follows from the layout alone. A chunk of another shape or codec would be
+        nonsense that passes its checksum.
+        """
         if group.get("zarr_format") != 3 or group.get("node_type") != "group":
             raise InvalidDatasetError(f"{GROUP_NAME} must be of a Zarr v3 group")
         inline = group.get("consolidated_metadata")
@@ -283,7 +282,8 @@ class DatasetReader:
             self.index.check_section(0)
         if (valid_count := int(np.count_nonzero(self.valid))) != self.manifest.valid_count:
             raise InvalidDatasetError(
-                f"valid_count of the manifest is {self.manifest.valid_count}, and array valid has {valid_count}"
+                f"valid_count of the manifest is {self.manifest.valid_count}, and array "
+                f"valid has {valid_count}"
             )
         split = self.label("split")
         if split.max() >= len(SPLITS):
@@ -294,14 +294,16 @@ class DatasetReader:
         stated = [self.manifest.split_counts.get(name, 0) for name in SPLITS]
         if stated != counts:
             raise InvalidDatasetError(
-                f"split_counts of the manifest are {self.manifest.split_counts}, and those of the arrays "
+                f"split_counts of the manifest are {self.manifest.split_counts}, and those "
+                "of the arrays "
                 f"{dict(zip(SPLITS, counts, strict=True))}"
             )
 
 
 def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
-    """Return the manifest's digest, the group's metadata and the manifest's bytes, all checked
-    against one another.
+    """Return the manifest's digest, the group's metadata and the manifest's bytes.
+
+    All are checked against one another.
     """
     manifest = source.read_manifest()
     group = source.fetch(GROUP_NAME).data
@@ -313,8 +315,9 @@ def _read_sealed(source: Source) -> tuple[str, dict[str, Any], bytes]:
 
 
 def _read_selection(source: Source, manifest: str) -> Selection:
-    """Return the part of the version with this manifest that the source holds, which may be all of
-    it.
+    """Return the part of the version with this manifest that the source holds.
+
+    A source may hold all of it.
     """
     if not isinstance(source, DirectorySource):
         return Selection()  # servers have whole versions
@@ -341,7 +344,8 @@ def _parse_manifest(data: bytes) -> Manifest:
     listed = manifest.sample_count if manifest.sections else len(manifest.sample_keys)
     if listed != manifest.sample_count or manifest.spec.sample_count != manifest.sample_count:
         raise InvalidDatasetError(
-            f"sample_count of the manifest is {manifest.sample_count}, its spec asks for {manifest.spec.sample_count} "
+            f"sample_count of the manifest is {manifest.sample_count}, its spec asks for "
+            f"{manifest.spec.sample_count} "
             f"and it lists {len(manifest.sample_keys)} sample keys"
         )
     return manifest
@@ -395,7 +399,8 @@ def _check_array(
     for field, rule in expected.items():
         if found.get(field) != rule:
             raise InvalidDatasetError(
-                f"array {array.name}: {field} must be {json.dumps(rule)}, and is {json.dumps(found.get(field))}"
+                f"array {array.name}: {field} must be {json.dumps(rule)}, and is "
+                f"{json.dumps(found.get(field))}"
             )
 
 
@@ -428,8 +433,10 @@ _DEFAULTS = {"default": {"separator": "/"}, "sharding_indexed": {"index_location
 
 
 def _normalised(codec: Any, defaults: Mapping[str, dict[str, str]]) -> Any:
-    """Give a codec or an encoding, or each of a list, its configuration, but for what a reader need
-    not know: the level of zstd, all of blosc's."""
+    """Give a codec or an encoding, or each of a list, its configuration.
+
+    A reader need not know the level of zstd, nor anything about blosc: they are left out.
+    """
     if isinstance(codec, list):
         return [_normalised(each, defaults) for each in codec]
     codec = {"name": codec} if isinstance(codec, str) else codec

@@ -170,7 +170,10 @@ class Samples(Dataset[Item]):
         return Item(item, self.categories)
 
     def __getitems__(self, indices: Sequence[int]) -> Batch:
-        """Return a batch of samples, read into one buffer for each array; see the module on `ring`."""
+        """Return a batch of samples, read into one buffer for each array.
+
+        See the module on `ring`.
+        """
         chosen = np.asarray(indices, dtype=np.int64)
         slots = self.slots[chosen]
         batch = Batch(self._buffers(len(slots)), self.categories)
@@ -260,18 +263,23 @@ class Stream:
         )
         if batch_size < 1 or self.world_size < 1:
             raise ValueError(
-                f"batch_size and world_size must be at least 1, and are {batch_size} and {self.world_size}"
+                f"batch_size and world_size must be at least 1, and are {batch_size} and "
+                f"{self.world_size}"
             )
         if not 0 <= self.rank < self.world_size:
             raise ValueError(f"rank must be from 0 to {self.world_size - 1}, and is {self.rank}")
-        self.dataset, self.batch_size, self.seed, self.shuffle = dataset, batch_size, seed, shuffle
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.seed = seed
+        self.shuffle = shuffle
         self._options = options
         self.epoch = 0
         self.drawn = 0
         """Batches of this epoch that have been given out."""
         if not len(self):
             raise ValueError(
-                f"a round is {batch_size * self.world_size} samples, and the dataset has {len(dataset)}"
+                f"a round is {batch_size * self.world_size} samples, and the dataset has "
+                f"{len(dataset)}"
             )
 
     def __len__(self) -> int:
@@ -288,7 +296,8 @@ class Stream:
             self.drawn += 1
             assert isinstance(batch, Batch)
             yield batch
-        self.epoch, self.drawn = self.epoch + 1, 0
+        self.epoch = self.epoch + 1
+        self.drawn = 0
 
     def _batches(self) -> list[list[int]]:
         count = len(self.dataset)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import scipy
@@ -71,8 +71,9 @@ class Learner(ABC):
 
     @abstractmethod
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
-        """Return the loss of the batch of `step`, which must depend on nothing but the seed and
-        `step`.
+        """Return the loss of the batch of `step`.
+
+        It must depend on nothing but the seed and `step`.
         """
 
     def learning_rate(self, step: int) -> float | None:
@@ -120,8 +121,9 @@ class Fitted:
     run: Progress
 
     def facts(self) -> dict[str, Any]:
-        """Return what a report says of every run, as plain values, with the versions that its
-        numbers depend on.
+        """Return the facts that a report states of every run, as plain values.
+
+        They include the versions on which its numbers depend.
         """
         return {
             "steps": self.run.step,
@@ -132,6 +134,17 @@ class Fitted:
             "versions": {"stickslip-training": __version__, "python": platform.python_version()}
             | {library.__name__: str(library.__version__) for library in (torch, np, scipy)},
         }
+
+
+class RunOptions(TypedDict, total=False):
+    """Options of a run that do not change its result."""
+
+    out: Path | None
+    """Directory of the checkpoint; None writes none."""
+    resume: bool
+    """Continue from the checkpoint in `out`."""
+    on_epoch: Callable[[EpochReport], None] | None
+    """Called with the report of every epoch."""
 
 
 def fit(
@@ -225,8 +238,9 @@ class _Run:
                 held.copy_(value)
 
     def _end_epoch(self) -> None:
-        """Validate, keep the weights if they are the best so far (or if there is nothing to choose
-        them by), report.
+        """Validate, keep the weights if they are the best so far, and report.
+
+        Without a validation the last weights are the best.
         """
         state = self.state
         validation = self.learner.validate(self.averaged.eval())
@@ -287,7 +301,7 @@ class _Run:
 
 
 # --- files
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def save_tensors(path: Path, content: dict[str, Any]) -> None:
@@ -324,7 +338,7 @@ def seed_of_step(*numbers: int) -> int:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Let torch draw from `seed` within the block, and go on after it as if it had not been there."""
+    """Let torch draw from `seed` within the block, and restore its state after it."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         yield
@@ -342,8 +356,9 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def cosine_rate(highest: float, step: int, steps: int, warm_up: int) -> float:
-    """Return a learning rate that rises for `warm_up` steps and falls to nothing at `steps` like
-    half a cosine.
+    """Return a learning rate that rises for `warm_up` steps, and falls to nothing at `steps`.
+
+    It falls like half a cosine.
     """
     return highest * min(1.0, (step + 1) / warm_up) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
@@ -354,7 +369,8 @@ def check_device(name: str) -> None:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(
-            f"device must be one that torch can use here, and is {name!r}: {str(error).splitlines()[0]}"
+            f"device must be one that torch can use here, and is {name!r}: "
+            f"{str(error).splitlines()[0]}"
         ) from None
 
 

@@ -1,5 +1,6 @@
-"""A user's photographs: a folder with one picture for each camera of a calibration file, named as
-the camera.
+"""Photographs of a user: a folder with one picture for each camera of a calibration file.
+
+A picture has the name of its camera.
 """
 
 import json
@@ -18,7 +19,8 @@ from stickslip_schemas.spec.cameras import Camera, read_rigs
 from stickslip_training.reconstruction.pipeline import Reconstruction, reconstruct
 from stickslip_training.reconstruction.views import ReconstructionError
 
-FOUND, TRUE = (0, 255, 255), (255, 60, 255)
+FOUND = (0, 255, 255)
+TRUE = (255, 60, 255)
 """Colours of centrelines."""
 LEAST_HEIGHT = 600  # [px]: smaller pictures are enlarged by a whole factor
 
@@ -41,8 +43,10 @@ def save_overlay(
     found: npt.NDArray[np.float64],
     true: npt.NDArray[np.float64] | None = None,
 ) -> None:
-    """Write a PNG of the views (y, x, rgb) side by side, with the reconstructed centreline (n, 3)
-    [camera unit] and, below it, the true one if it is known."""
+    """Write a PNG of the views (y, x, rgb) side by side, with centrelines over them.
+
+    The reconstructed centreline (n, 3) [camera unit] is drawn over the true one, if that is known.
+    """
     module = import_pillow()
     from PIL import ImageDraw
 
@@ -136,16 +140,15 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
     for camera in rigs[rig]:
         if any(camera.distortion):
             raise ReconstructionError(
-                f"distortion must be 0: undistort the photographs (cv2.undistort); that of {camera.name} in {path} is "
+                "distortion must be 0: undistort the photographs (cv2.undistort); that of "
+                f"{camera.name} in {path} is "
                 f"{list(camera.distortion)}"
             )
     return rigs[rig]
 
 
 def read_photograph(folder: Path, camera: Camera) -> npt.NDArray[np.uint8]:
-    """Return the one picture of a folder that is named as the camera, upright as its EXIF says, (y,
-    x, rgb).
-    """
+    """Return the picture of a camera in a folder, (y, x, rgb), upright as its EXIF says."""
     image = import_pillow()
     from PIL import ImageOps
 

@@ -119,7 +119,8 @@ def reconstruct(
         )
     if points < 2:
         raise ValueError(f"points must be at least 2; got {points}")
-    origin, heading = _vector("clamp", clamp), _vector("direction", direction)
+    origin = _vector("clamp", clamp)
+    heading = _vector("direction", direction)
     if not np.linalg.norm(heading) > 0.0:
         raise ValueError("direction must not be zero")
     heading = heading / np.linalg.norm(heading)
@@ -170,13 +171,15 @@ def _silhouettes(
     images = [np.asarray(picture) for picture in pictures]  # type: ignore[union-attr]
     if len(images) != len(cameras) or len(images) < 2:
         raise ValueError(
-            f"there must be one view for each of at least 2 cameras; got {len(images)} for {len(cameras)}"
+            f"there must be one view for each of at least 2 cameras; got {len(images)} for "
+            f"{len(cameras)}"
         )
     seen = []
     for image, camera in zip(images, cameras, strict=True):
         if image.shape[:2] != (camera.height, camera.width):
             raise ReconstructionError(
-                f"view {camera.name!r} must be {camera.width} x {camera.height} pixels as its camera; "
+                f"view {camera.name!r} must be {camera.width} x {camera.height} pixels as "
+                "its camera; "
                 f"got {image.shape[1]} x {image.shape[0]}"
             )
         try:
@@ -192,13 +195,15 @@ def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: 
     coverage = silhouette(light)
     again = int(_half_width(coverage) / WIDEST_ROD * 2.0)
     if again > 1:
-        factor, coverage = factor * again, silhouette(shrink_image(light, again))
+        factor = factor * again
+        coverage = silhouette(shrink_image(light, again))
     return View.of(camera, coverage, length=length, clamp=clamp, factor=factor)
 
 
 def _half_width(coverage: Floats) -> float:
-    """Estimate the rod's half width [px]: a strip's is its area over its outline, both sides
-    counted.
+    """Estimate the rod's half width [px] from its area and its outline.
+
+    That of a strip is its area over the length of its outline, both sides counted.
     """
     solid = np.minimum(coverage, 1.0)
     return float(solid.sum() / max(float(np.hypot(*np.gradient(solid)).sum()), 1e-9))
@@ -260,7 +265,8 @@ def _match(views: Sequence[View], fit: Fit) -> tuple[float, float, float]:
         drawn[image.pixel] = image.value
         known = np.ones(view.coverage.size, dtype=bool)
         known[image.left_out] = False
-        seen, drawn = np.minimum(view.coverage.ravel(), 1.5)[known], drawn[known]
+        seen = np.minimum(view.coverage.ravel(), 1.5)[known]
+        drawn = drawn[known]
         seen_sum += seen.sum()
         drawn_sum += drawn.sum()
         difference += np.abs(seen - drawn).sum()
@@ -294,8 +300,9 @@ def _deviation(fit: Fit, points: int) -> Floats:
 
 
 def _residual(views: Sequence[View], fit: Fit, points: int) -> Floats:
-    """Return, in each view, the sideways shift [px] that would fit the pixels about each point
-    best.
+    """Return the sideways shift [px] that would fit the pixels about each point best.
+
+    Each view has one.
     """
     s = samples(views, fit)
     residual = np.full((len(views), points), np.nan)

@@ -70,7 +70,8 @@ def samples(views: Sequence[View], fit: Fit) -> Floats:
 
 def draw(view: View, index: int, fit: Fit, s: Floats, extra_blur: float = 0.0) -> TubeImage:
     """Draw the fit as view number `index` sees it, at parameters s half a pixel apart."""
-    N, points = _hats(s), basis(s, len(fit.control)) @ fit.control
+    N = _hats(s)
+    points = basis(s, len(fit.control)) @ fit.control
     blur = float(np.hypot(fit.blur, extra_blur))
     return tube_image(view, points, fit.radius, blur, N @ fit.light[index], N @ fit.slope[index])
 
@@ -103,7 +104,9 @@ def refine(
         tried = problem.system(x + step)
         if tried.cost < system.cost:
             gain = system.cost - tried.cost
-            x, system, damping = x + step, tried, max(damping / 5.0, 1e-9)
+            x = x + step
+            system = tried
+            damping = max(damping / 5.0, 1e-9)
             if gain < TOLERANCE * system.cost:
                 break
         else:
@@ -135,8 +138,9 @@ class _System:
 
 
 class _Problem:
-    """Unknowns x = (control points, log radius, log blur, light and slope of each view) and their
-    sum of squares.
+    """Least squares with the unknowns of a fit.
+
+    The unknowns x are control points, log radius, log blur, and light and slope of each view.
     """
 
     def __init__(
@@ -148,7 +152,8 @@ class _Problem:
         shading: bool,
         fixed_radius: bool,
     ) -> None:
-        self._views, self._extra = views, extra_blur
+        self._views = views
+        self._extra = extra_blur
         self._K = K = len(fit.control)
         self._s = samples(views, fit)
         self._B = basis(self._s, K)
@@ -179,7 +184,8 @@ class _Problem:
         )
 
     def unpack(self, x: Floats) -> Fit:
-        K, n = self._K, self._shape[0] * self._shape[1]
+        K = self._K
+        n = self._shape[0] * self._shape[1]
         return Fit(
             control=x[: 3 * K].reshape(K, 3),
             radius=float(np.exp(x[3 * K])),
@@ -192,7 +198,8 @@ class _Problem:
         """Return the cost at x with its gradient and Gauss-Newton matrix."""
         fit = self.unpack(x)
         size = len(x)
-        normal, gradient = self._prior_rows.T @ self._prior_rows, np.zeros(size)
+        normal = self._prior_rows.T @ self._prior_rows
+        gradient = np.zeros(size)
         error = self._prior_rows @ x - self._prior_target
         gradient += self._prior_rows.T @ error
         cost = 0.5 * float(error @ error)
@@ -212,28 +219,34 @@ class _Problem:
         gradient[:end] += J.T @ stretch
         cost += 0.5 * float(stretch @ stretch)
 
-        squares, count = 0.0, 0
+        squares = 0.0
+        count = 0
         for index, view in enumerate(self._views):
             image = draw(view, index, fit, self._s, self._extra)
             error = (image.value - view.coverage.ravel()[image.pixel]) / PIXEL
             weight = 1.0 / (1.0 + (error / ROBUST) ** 2)
             cost += 0.5 * ROBUST**2 * float(np.log1p((error / ROBUST) ** 2).sum())
-            squares, count = squares + float(weight @ error**2), count + len(error)
+            squares = squares + float(weight @ error**2)
+            count = count + len(error)
             J = self._derivatives(image, fit) / PIXEL
             columns = self._columns[index]
             normal[np.ix_(columns, columns)] += (J * weight[:, None]).T @ J
             gradient[columns] += J.T @ (weight * error)
         fixed = ~self._free
-        normal[fixed], normal[:, fixed], gradient[fixed] = 0.0, 0.0, 0.0
+        normal[fixed] = 0.0
+        normal[:, fixed] = 0.0
+        gradient[fixed] = 0.0
         normal[fixed, fixed] = 1.0
         return _System(cost, normal, gradient, squares / max(count, 1))
 
     def _derivatives(self, image: TubeImage, fit: Fit) -> Floats:
         """Return d I / d (control points, log radius, log blur, this view's light and slope)."""
-        K, nodes = self._K, self._shape[1]
+        K = self._K
+        nodes = self._shape[1]
         J = np.zeros((len(image.pixel), 3 * K + 2 + 2 * nodes))
         for side in image.sides:
-            B, N = self._B[side.sample], self._N[side.sample]
+            B = self._B[side.sample]
+            N = self._N[side.sample]
             for axis in range(3):
                 J[:, axis : 3 * K : 3] += B * side.by_point[:, axis, None]
             J[:, 3 * K] += side.by_radius
@@ -244,7 +257,8 @@ class _Problem:
 
     def _linear_priors(self, direction: Floats) -> tuple[Floats, Floats]:
         """Return rows A and targets b of the priors |A x - b|^2 that are linear in x."""
-        K, (views, nodes) = self._K, self._shape
+        K = self._K
+        (views, nodes) = self._shape
         size = len(self._free)
         blocks: list[tuple[Floats, Floats]] = []
 

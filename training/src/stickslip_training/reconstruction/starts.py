@@ -70,7 +70,8 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
         kept = _best_of_cells(places, flat, total)
         turn = _rotation(heading[parent[kept]], flat[kept])
         trail = np.concatenate([trail[parent[kept]], places[kept, None]], axis=1)
-        heading, cost = flat[kept], total[kept]
+        heading = flat[kept]
+        cost = total[kept]
     tracks: list[Floats] = []
     for way in trail[np.argsort(cost, kind="stable")]:
         if all(np.linalg.norm(way - other, axis=1).max() > APART for other in tracks):
@@ -79,7 +80,7 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
 
 
 def _middle(view: View, radius: float) -> Floats:
-    """Return how much of the rod's disc about each pixel lies in the silhouette: 1 in its middle."""
+    """Return the fraction of the rod's disc about each pixel that is in the silhouette."""
     size = radius * view.focal / float(np.linalg.norm(view.t))
     solid = np.minimum(view.coverage, 1.0)
     return np.asarray(ndimage.gaussian_filter(solid, BLUR * size)) / PEAK
@@ -118,7 +119,7 @@ def _squared(vectors: Floats) -> Floats:
 
 
 def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDArray[np.int64]:
-    """Return the cheapest ways, at most BEAM of them and one of each cell of places and directions."""
+    """Return the cheapest paths, at most BEAM, and one of each cell of positions and directions."""
     few = (
         np.argpartition(cost, 8 * BEAM)[: 8 * BEAM]
         if len(cost) > 8 * BEAM
@@ -145,21 +146,24 @@ MOST_CELLS = 400_000  # a hull this large is no rod's
 
 
 def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
-    """Return the points, at most `cell` [L] apart, whose images lie in every silhouette, (n, 3)
-    [L].
+    """Return points whose images lie in every silhouette, (n, 3) [L].
+
+    Points are at most `cell` [L] apart.
 
     There are none where the silhouettes leave room for far more than a slender rod. Cubes are
     halved again and again; those are kept whose surrounding ball touches every silhouette.
     """
     outside = [ndimage.distance_transform_edt(view.coverage < 0.5) for view in views]
     halvings = int(np.ceil(np.log2(2.0 * ROOM / cell)))
-    centers, side = np.zeros((1, 3)), 2.0 * ROOM
+    centers = np.zeros((1, 3))
+    side = 2.0 * ROOM
     corners = np.array(
         [[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25)]
     )
     for level in range(halvings + 1):
         if level > 0:
-            centers, side = (centers[:, None] + side * corners).reshape(-1, 3), side / 2.0
+            centers = (centers[:, None] + side * corners).reshape(-1, 3)
+            side = side / 2.0
         reach = 0.5 * np.sqrt(3.0) * side if level < halvings else 0.0
         for view, distance in zip(views, outside, strict=True):
             centers = centers[_touches(view, distance, centers, reach)]
@@ -185,13 +189,15 @@ def _touches(view: View, distance: Floats, points: Floats, reach: float) -> npt.
 
 
 def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float = 0.01) -> Floats:
-    """Return a polyline (n, 3) [L] through a cloud: centroids of what a cylinder holds that moves
-    along the rod.
+    """Return a polyline (n, 3) [L] through a cloud.
+
+    Its points are centroids of the part of the cloud in a cylinder that moves along the rod.
 
     The cylinder begins at the clamp, reaches two steps ahead and is three radii wide; it turns
     towards each centroid, and the polyline ends where it is empty, or after twice the rod's length.
     """
-    points, heading = [np.zeros(3)], direction / np.linalg.norm(direction)
+    points = [np.zeros(3)]
+    heading = direction / np.linalg.norm(direction)
     for _ in range(int(2.0 / step)):
         offset = cloud - points[-1]
         ahead = offset @ heading

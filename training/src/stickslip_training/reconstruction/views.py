@@ -1,5 +1,4 @@
-"""Views: how much of each pixel a bright rod covers, and what a camera sees of a tube about a
-curve.
+"""Views: the coverage of each pixel by a bright rod, and pictures of a tube about a curve.
 
 A rod a few pixels wide is known to a tenth of a pixel only if the brightness of the pixels on its
 edge is used, not just whether they are bright. So a silhouette is a coverage: the share of each
@@ -8,7 +7,7 @@ pixel that is rod.
 About the projected centreline, at signed distance n from it [px], a tube of half width r has the
 coverage
 
-    c(n) = Phi((n + r) / b) - Phi((n - r) / b)          Phi the normal distribution, b the blur of the picture
+    c(n) = Phi((n + r) / b) - Phi((n - r) / b)     Phi the normal distribution, b the blur
 
 and the brightness c (light + slope n / r): lamps make one side brighter, and a model without the
 slope would move the centreline towards it. Where two parts of the rod cross in a view, the nearer
@@ -47,8 +46,9 @@ class ReconstructionError(ValueError):
 
 
 def silhouette(light: Floats) -> Floats:
-    """Return the coverage (y, x) in a picture of linear light (y, x, channel): 0 on the ground,
-    about 1 on the rod, in between on its edge.
+    """Return the coverage (y, x) in a picture of linear light (y, x, channel).
+
+    It is 0 on the ground, about 1 on the rod, and in between on its edge.
 
     The ground must be darker than the rod but need not be evenly so; the colour of the rod is
     found. Coverage is relative to the brightness of the rod around the pixel, and may exceed 1
@@ -69,7 +69,8 @@ def silhouette(light: Floats) -> Floats:
     floor = max(NOISE_FACTOR * noise, FAINTEST * typical)
     if typical < 2.0 * NOISE_FACTOR * noise or typical < 1e-3:
         raise ReconstructionError(
-            f"image must show a rod brighter than its ground; the brightest stands out by {typical:.3g} of linear "
+            "image must show a rod brighter than its ground; the brightest stands out by "
+            f"{typical:.3g} of linear "
             f"light, noise {noise:.3g}"
         )
     bright = np.where(signal > 0.5 * floor, signal, 0.0)
@@ -81,8 +82,9 @@ def silhouette(light: Floats) -> Floats:
 
 
 def to_linear(image: npt.ArrayLike) -> Floats:
-    """Decode sRGB [IEC 61966-2-1], 8 or 16 bit or floating numbers in [0, 1], to linear light (y,
-    x, channel).
+    """Decode sRGB [IEC 61966-2-1] to linear light (y, x, channel).
+
+    Pixels have 8 or 16 bits, or are floating numbers in [0, 1].
     """
     pixels = np.asarray(image)
     if pixels.ndim == 2:
@@ -102,7 +104,8 @@ def _ground(light: Floats) -> Floats:
     """Fit the ground by a polynomial, leaving out, again and again, what is brighter than it."""
     height, width, channels = light.shape
     step = max(1, int(np.sqrt(height * width / GROUND_SAMPLES)))
-    x, y = np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height)
+    x = np.linspace(-1.0, 1.0, width)
+    y = np.linspace(-1.0, 1.0, height)
     powers = [(i, j) for i in range(GROUND_DEGREE + 1) for j in range(GROUND_DEGREE + 1 - i)]
     grid_y, grid_x = np.meshgrid(y[::step], x[::step], indexing="ij")
     some = np.stack([(grid_y**i * grid_x**j).ravel() for i, j in powers], axis=1)
@@ -131,9 +134,7 @@ def _large_parts(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one camera saw of the rod, and how points of the rod come to its pixels: u = f (R x +
-    t)_xy / depth + c.
-    """
+    """View of the rod by one camera, and the projection u = f (R x + t)_xy / depth + c."""
 
     name: str
     coverage: Floats
@@ -221,8 +222,7 @@ def basis(s: Floats, count: int, derivative: int = 0) -> Floats:
 
 
 def fit_curve(points: Floats, count: int) -> Floats:
-    """Return the control points (count, 3) of the spline nearest to a polyline (n, 3), by its arc
-    length.
+    """Return the control points (count, 3) of the spline nearest to a polyline (n, 3).
 
     The spline's parameter runs from 0 to 1 whatever the polyline's length.
     """
@@ -251,7 +251,7 @@ def at_uniform_arc_length(control: Floats, count: int) -> Floats:
 
 
 # --- tubes
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,9 +312,11 @@ def tube_image(
     beyond = (sample == len(points) - 1) & (along > 0.0)
     distance = np.linalg.norm(offset, axis=1)
     normal[beyond] = offset[beyond] / np.maximum(distance[beyond, None], 1e-9)
-    n, r = np.sum(offset * normal, axis=1), half[sample]
+    n = np.sum(offset * normal, axis=1)
+    r = half[sample]
 
-    high, low = (n + r) / blur, (n - r) / blur
+    high = (n + r) / blur
+    low = (n - r) / blur
     density_high, density_low = (np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) for x in (high, low))
     covered = ndtr(high) - ndtr(low)
     tilt = np.where(beyond, 0.0, np.clip(n / r, -1.5, 1.5))
@@ -336,14 +338,13 @@ def tube_image(
 
 
 def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Integers, Integers]:
-    """Pair each pixel with the nearest sample of every part of the curve that passes it within
-    reach.
-    """
+    """Pair each pixel with the nearest sample of every part of the curve within reach."""
     span = int(np.ceil(reach.max())) + 1
     x, y = (axis.ravel() for axis in np.mgrid[-span : span + 1, -span : span + 1])
     disc = x**2 + y**2 <= (span + 0.5) ** 2
     nearest = np.rint(pixels).astype(np.int64)
-    x, y = nearest[:, :1] + x[disc], nearest[:, 1:] + y[disc]
+    x = nearest[:, :1] + x[disc]
+    y = nearest[:, 1:] + y[disc]
     apart = (x - pixels[:, :1]) ** 2 + (y - pixels[:, 1:]) ** 2
     height, width = shape
     found = np.flatnonzero(
@@ -352,7 +353,9 @@ def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Inte
     sample = found // x.shape[1]
     pixel = y.ravel()[found] * width + x.ravel()[found]
     order = np.argsort(pixel * len(pixels) + sample)  # no two are equal
-    pixel, sample, distance = pixel[order], sample[order], apart.ravel()[found][order]
+    pixel = pixel[order]
+    sample = sample[order]
+    distance = apart.ravel()[found][order]
     if len(pixel) == 0:
         return pixel, sample
     starts = np.flatnonzero(np.concatenate([[True], (np.diff(pixel) != 0) | (np.diff(sample) > 1)]))
@@ -378,7 +381,9 @@ def _compose(
     back = order[np.where(has_back, first + 1, first)]
     kept = ~left_out[front] & ~(left_out[back] & has_back)
     hidden = pixel[front[~kept]]
-    front, back, seen = front[kept], back[kept], has_back[kept].astype(np.float64)
+    front = front[kept]
+    back = back[kept]
+    seen = has_back[kept].astype(np.float64)
     through = seen * (1.0 - part.by_light[front])
     # The front's own derivatives act on I_1 (1 - I_2 c_1 / I_1): its light does not change what it
     # covers.

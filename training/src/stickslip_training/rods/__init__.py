@@ -1,3 +1,1 @@
-"""Curvature of hanging rods: networks that estimate it from a centreline, and what needs no
-learning.
-"""
+"""Curvature of hanging rods: a network that estimates it, and methods without learning."""

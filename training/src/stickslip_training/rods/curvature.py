@@ -1,5 +1,6 @@
-"""Train the curvature network of the thesis on a dataset of rods, and measure it against what needs
-no learning.
+"""Training of the curvature network of the thesis on a dataset of rods.
+
+It is compared with methods that need no learning.
 """
 
 from collections.abc import Callable, Iterable
@@ -85,7 +86,8 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
         slots["test"] = slots["test"][:evaluation_rods]
     if len(slots["test"]) < FEW_RODS:
         notes.append(
-            f"There are only {len(slots['test'])} test rods: take medians and percentiles as a hint."
+            f"There are only {len(slots['test'])} test rods: take medians and percentiles "
+            "as a hint."
         )
     arrays = ("centerline", "curvature")
     return {
@@ -137,8 +139,9 @@ class CurvatureNet(nn.Module):
         self.register_buffer("output_scale", torch.ones(3))
 
     def standardise(self, centerline: torch.Tensor, strains: torch.Tensor, noise: float) -> None:
-        """Set the standardisation from the training rods, (rods, 150, 3) each, seen with `noise`
-        (of L).
+        """Set the standardisation from the training rods, (rods, 150, 3) each.
+
+        They are seen with `noise` (of L).
         """
         spread = centerline.double().var(dim=0, correction=0) + noise**2
         self.input_mean.copy_(centerline.double().mean(dim=0))
@@ -159,8 +162,9 @@ def root_mean_square_loss(estimate: torch.Tensor, truth: torch.Tensor) -> torch.
 
 
 def _positive(scale: torch.Tensor) -> torch.Tensor:
-    """Return `scale`, and 1 where it is 0: a number that is always the same (the clamp's position)
-    stays 0.
+    """Return `scale`, and 1 where it is 0.
+
+    A number that is always the same, for example the position of the clamp, then stays 0.
     """
     return torch.where(scale > 1e-12, scale, torch.ones_like(scale))
 
@@ -225,7 +229,8 @@ def train_curvature(
     """
     with DatasetReader(config.dataset) as reader:
         rods, notes = load_splits(reader, config.evaluation_rods)
-        manifest, digest = reader.manifest, reader.manifest_digest
+        manifest = reader.manifest
+        digest = reader.manifest_digest
     learner = _CurvatureLearner(config, rods["train"], rods["validation"])
     names = ("noise", "batch_size", "learning_rate", "decay")
     identity = {"manifest": digest, **{name: getattr(config, name) for name in names}}

@@ -1,13 +1,13 @@
-"""Curvature of noisy centrelines without learning, which is what a network has to beat, and errors
-of all methods.
+"""Curvature of noisy centrelines without learning, and errors of all methods.
 
-The curvature of a curve x(s) in any parametrisation is |x' × x''| / |x'|^3. Points are at uniform arc length, so s is
-known; lengths are over L, and so curvatures come out times L. Every method here takes centrelines (rods, points, 3) and
-returns |kappa| L, (rods, points).
+A network has to beat these methods. The curvature of a curve x(s) in any parametrisation is
+|x' × x''| / |x'|^3. Points are at uniform arc length, so s is known. Lengths are over L, and so
+curvatures are times L. Every method here takes centrelines (rods, points, 3) and returns
+|kappa| L, (rods, points).
 
-kappa = (twist, bend1, bend2) L are the strains of a rod. Its centreline has the curvature |kappa| = sqrt(bend1^2 +
-bend2^2) L: the twist is that of the material about the centreline, which an estimate from the centreline alone cannot
-see. So errors that compare methods are errors of |kappa|.
+kappa = (twist, bend1, bend2) L are the strains of a rod. The curvature of its centreline is
+|kappa| = sqrt(bend1^2 + bend2^2) L. The twist is that of the material about the centreline, which
+no estimate from the centreline alone can see. So errors that compare methods are errors of |kappa|.
 """
 
 import time
@@ -25,8 +25,9 @@ _CHUNK = 256  # rods that go through a network at once
 
 
 def with_white_noise(centerline: AnyFloats, share: float, seed: tuple[int, ...]) -> SingleFloats:
-    """Add independent normal noise of standard deviation `share` (of L) to every coordinate of
-    every point.
+    """Add independent normal noise to every coordinate of every point.
+
+    `share` is its standard deviation over L.
 
     The same `seed` gives the same noise. `centerline` is over L, (..., points, 3).
     """
@@ -45,22 +46,25 @@ def finite_difference_curvature(centerline: AnyFloats) -> Floats:
     first = np.gradient(x, h, axis=-2, edge_order=2)
     second = np.empty_like(x)
     second[..., 1:-1, :] = (x[..., 2:, :] - 2 * x[..., 1:-1, :] + x[..., :-2, :]) / h**2
-    second[..., 0, :], second[..., -1, :] = second[..., 1, :], second[..., -2, :]
+    second[..., 0, :] = second[..., 1, :]
+    second[..., -1, :] = second[..., -2, :]
     return _curvature(first, second)
 
 
 def cubic_spline_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from cubic smoothing splines, the usual ones.
 
-    They minimise the sum of squares plus lambda ∫ |x''|^2, for which they are straight at their ends: at the free
-    end, where a rod has its natural curvature, they find none. `scipy.interpolate.make_smoothing_spline` gives the same
-    splines, at 50 ms each.
+    They minimise the sum of squares plus lambda ∫ |x''|^2, and so they are straight at their ends:
+    at the free end, where a rod has its natural curvature, they find none.
+    `scipy.interpolate.make_smoothing_spline` gives the same splines, at 50 ms each.
     """
     return _spline_curvature(centerline, 2)
 
 
 def quintic_spline_curvature(centerline: AnyFloats) -> Floats:
-    """Take the derivatives from quintic smoothing splines, which penalise ∫ |x'''|^2 and may be bent at their ends.
+    """Take the derivatives from quintic smoothing splines, which penalise ∫ |x'''|^2.
+
+    They may be bent at their ends.
 
     They halve the error of cubic ones on hanging rods. One order more takes another sixth off, and
     was not worth it.
@@ -77,8 +81,10 @@ def _curvature(first: Floats, second: Floats) -> Floats:
 
 @cache
 def _spline_basis(points: int, order: int) -> tuple[Floats, ...]:
-    """Return a basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1]:
-    values, first and second derivatives at the points, (points, basis) each, and a, (basis,).
+    """Return a basis of the splines of degree 2 `order` - 1 with a knot at each point of [0, 1].
+
+    The arrays are values, first and second derivatives at the points, (points, basis) each, and a,
+    (basis,).
 
     It is orthogonal both in the sum of squares over the points, a, and in the penalty, 1 - a
     [Demmler, Reinsch 1975]: smoothing is a division in it, and every lambda can be tried on every
@@ -117,8 +123,9 @@ by 0.
 
 
 def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
-    """Smooth each coordinate by itself, with the lambda of least generalised cross-validation
-    [Craven, Wahba 1979]:
+    """Smooth each coordinate by itself, with the lambda of least cross-validation.
+
+    The generalised cross-validation [Craven, Wahba 1979] is
 
     GCV = (|y - f|^2 / n) / (1 - tr(A) / n)^2, f = A y.
     """
@@ -128,7 +135,8 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
     y = x.swapaxes(-1, -2).reshape(-1, points)
     z = y @ basis
     power = np.square(y).sum(axis=1)
-    best, smoothing = np.full(len(y), np.inf), np.zeros(len(y))
+    best = np.full(len(y), np.inf)
+    smoothing = np.zeros(len(y))
     for candidate in _SMOOTHING:
         shrunk = 1.0 / (a + candidate * (1.0 - a))  # the coefficients are c = shrunk z
         freedom = float((a * shrunk).sum()) / points
@@ -137,7 +145,8 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
         residual = power - np.square(z) @ (shrunk * (2.0 - a * shrunk))  # |y|^2 - 2 c z + a c^2
         score = residual / (1.0 - freedom) ** 2
         better = score < best
-        best[better], smoothing[better] = score[better], candidate
+        best[better] = score[better]
+        smoothing[better] = candidate
     c = z / (a + smoothing[:, None] * (1.0 - a))
     return _curvature(
         *(
@@ -148,11 +157,14 @@ def _spline_curvature(centerline: AnyFloats, order: int) -> Floats:
 
 
 # --- errors
-# ---------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def estimate_strains(net: torch.nn.Module, centerline: SingleFloats) -> SingleFloats:
-    """Return the strains (twist, bend1, bend2) times L of centrelines over L, both (rods, 150, 3)."""
+    """Return the strains (twist, bend1, bend2) times L of centrelines over L.
+
+    Both are (rods, 150, 3).
+    """
     device = next(net.parameters()).device
     with torch.inference_mode():
         parts = [
@@ -187,8 +199,11 @@ def evaluate(
 
 
 def _method(name: str, estimate: Floats, truth: Floats, started: float) -> dict[str, Any]:
-    """Return how well a method finds |kappa| L: the RMS error over all points of all rods [rad], and the median and
-    90th percentile over the rods of the RMS relative error."""
+    """Return the errors of a method that estimates |kappa| L.
+
+    They are the RMS error over all points of all rods [rad], and the median and 90th percentile
+    over the rods of the RMS relative error.
+    """
     seconds = (time.perf_counter() - started) / len(truth)
     errors = relative_rms_error(estimate, truth)
     median, p90 = np.quantile(errors, (0.5, 0.9)).tolist()
