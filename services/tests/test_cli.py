@@ -146,6 +146,7 @@ def test_a_bad_file_is_refused_in_words(
 def test_other_errors_are_words_too(cli: Any, tmp_path: Path) -> None:
     assert "there is no file" in cli("submit", tmp_path / "none.yaml").stderr
     assert "there is no job" in cli("show", "job-0").stderr
+    assert "there is nothing at /v1/jobs/../jobs" in cli("show", "../jobs").stderr
     assert "job-0" in cli("watch", "job-0").stderr
     assert "no dataset" in cli("verify", tmp_path).stdout
     assert cli("--version").stdout.startswith("stickslip 0.")

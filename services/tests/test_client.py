@@ -97,7 +97,7 @@ def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for()
         raise answer
 
     with (
-        Client("http://127.0.0.1:9", patience=60, sleep=slept.append) as client,
+        Client("http://127.0.0.1:9", retry_timeout=60, sleep=slept.append) as client,
         pytest.raises(UnreachableError),
     ):
         client.workers()

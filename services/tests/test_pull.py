@@ -115,7 +115,7 @@ def test_a_download_that_breaks_goes_on_where_it_stopped(
             )
         return response
 
-    with Client(origin[0], transport=Meddler(PATH, meddle), patience=0) as client:
+    with Client(origin[0], transport=Meddler(PATH, meddle), retry_timeout=0) as client:
         pull(client, origin[1], 1, tmp_path)
     assert ranges == [None, "bytes=100-", "bytes=200-"]
     assert verify(tmp_path) == []
@@ -129,7 +129,7 @@ def test_an_interrupted_pull_is_resumed_by_the_next(
         return httpx.Response(response.status_code, headers=response.headers, stream=Breaks(data))
 
     with (
-        Client(origin[0], transport=Meddler(PATH, cut), patience=0) as client,
+        Client(origin[0], transport=Meddler(PATH, cut), retry_timeout=0) as client,
         pytest.raises(UnreachableError),
     ):
         pull(client, origin[1], 1, tmp_path)
@@ -179,7 +179,7 @@ def test_what_arrives_damaged_gets_no_name(origin: tuple[str, str], tmp_path: Pa
         return httpx.Response(200, content=b"\0" * len(response.content))
 
     with (
-        Client(origin[0], transport=Meddler(PATH, corrupt), patience=0) as client,
+        Client(origin[0], transport=Meddler(PATH, corrupt), retry_timeout=0) as client,
         pytest.raises(DamagedError),
     ):
         pull(client, origin[1], 1, tmp_path)
@@ -280,7 +280,7 @@ def test_a_coordinator_that_is_away_is_waited_for() -> None:
     assert len(slept) == 3
     always = httpx.MockTransport(lambda _request: httpx.Response(503))
     with (
-        Client(transport=always, patience=0) as client,
+        Client(transport=always, retry_timeout=0) as client,
         pytest.raises(UnexpectedError, match="503"),
     ):
         client.workers()
@@ -347,7 +347,7 @@ def test_no_flipped_bit_arrives_in_silence(
     def flip(_request: httpx.Request, response: httpx.Response) -> httpx.Response:
         return httpx.Response(200, content=flipped(response.content, rng))
 
-    with Client(origin[0], transport=Meddler(f"/{name}", flip), patience=0) as client:
+    with Client(origin[0], transport=Meddler(f"/{name}", flip), retry_timeout=0) as client:
         for _ in range(20):
             with pytest.raises((DamagedError, UnexpectedError)):
                 pull(client, origin[1], 1, tmp_path)

@@ -215,7 +215,7 @@ def test_a_new_coordinator_wants_an_answer_of_its_bucket(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     """It must not start an empty queue beside datasets that it cannot see."""
-    monkeypatch.setattr("stickslip_schemas.store.bucket.PATIENCE_SECONDS", 0.5)
+    monkeypatch.setattr("stickslip_schemas.store.bucket.RETRY_SECONDS", 0.5)
     words = ["--data", str(tmp_path / "data"), "--port", "0", "--store"]
     assert program.main([*words, "s3://nobody-has-made-this/store"]) == 2
     assert "cannot be asked whether it holds datasets" in capfd.readouterr().err

@@ -78,7 +78,7 @@ def bucket(proxy: "Proxy", name: str, monkeypatch: pytest.MonkeyPatch) -> Place:
     from stickslip_testing.s3 import make_bucket, no_fault, variables
 
     proxy.fault = no_fault
-    monkeypatch.setattr(stickslip_schemas.store.bucket, "PATIENCE_SECONDS", 5.0)
+    monkeypatch.setattr(stickslip_schemas.store.bucket, "RETRY_SECONDS", 5.0)
     make_bucket(proxy, name)
     for variable, value in variables(proxy).items():
         monkeypatch.setenv(variable, value)

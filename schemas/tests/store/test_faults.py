@@ -86,7 +86,7 @@ def test_every_request_may_fail_once(proxy: Proxy, store: BucketStore, fault: st
 
 
 def test_a_torn_upload_is_never_visible(proxy: Proxy) -> None:
-    impatient = BucketStore("bucket", "torn", patience=0.5)
+    impatient = BucketStore("bucket", "torn", retry_timeout=0.5)
     for k in range(10):
         data = LARGE + bytes([k])
         proxy.fault = lambda method, path: "torn upload" if method == "PUT" else ""
@@ -100,7 +100,7 @@ def test_a_torn_upload_is_never_visible(proxy: Proxy) -> None:
 
 
 def test_a_server_that_stays_away_is_unavailable(proxy: Proxy) -> None:
-    impatient = BucketStore("bucket", "away", patience=0.5)
+    impatient = BucketStore("bucket", "away", retry_timeout=0.5)
     digest = impatient.publish(SMALL)
     proxy.fault = lambda method, path: "503"
     for ask in (

@@ -69,7 +69,7 @@ def proxy() -> Iterator[ForwardProxy]:
 
 
 def get(url: str) -> bytes:
-    client = HttpClient(patience=0.0)
+    client = HttpClient(retry_timeout=0.0)
     try:
         return client.request("GET", url).content
     finally:

@@ -106,7 +106,7 @@ def test_what_is_not_there_is_told(server, clips, clips_url):
 
 def test_a_server_that_refuses_is_told(server, clips_url, monkeypatch):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr(BucketSource, "PATIENCE_SECONDS", 1.0)
+    monkeypatch.setattr(BucketSource, "RETRY_SECONDS", 1.0)
     with pytest.raises(SourceError, match="cannot be read"):
         DatasetReader(clips_url)
 

@@ -171,7 +171,7 @@ def test_a_busy_server_is_asked_again(server):
 
 
 def test_a_server_that_stays_away_is_an_error(server, monkeypatch):
-    monkeypatch.setattr("stickslip_training.data.sources.READER_PATIENCE_SECONDS", 0.5)
+    monkeypatch.setattr("stickslip_training.data.sources.READER_RETRY_SECONDS", 0.5)
     server.failures = 100
     with pytest.raises(SourceError, match=r"manifest.json answered 503, and 200 was expected"):
         DatasetReader(_url(server))

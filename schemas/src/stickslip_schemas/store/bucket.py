@@ -25,7 +25,7 @@ from stickslip_schemas.store import (
     shown_name,
     version_name,
 )
-from stickslip_schemas.transport.objects import PATIENCE_SECONDS, ObjectClient, RefusedError
+from stickslip_schemas.transport.objects import RETRY_SECONDS, ObjectClient, RefusedError
 
 PROBE_SECONDS = 5.0
 """How long a request of a probe is repeated [s]: a probe must tell at once."""
@@ -43,19 +43,21 @@ class BucketStore:
     See `Store`.
     """
 
-    def __init__(self, bucket: str, prefix: str = "", *, patience: float | None = None) -> None:
+    def __init__(
+        self, bucket: str, prefix: str = "", *, retry_timeout: float | None = None
+    ) -> None:
         """Open a store.
 
         Args:
             bucket: Name of the bucket.
             prefix: Path before all names.
-            patience: How long a request is repeated while the server is busy or away [s].
+            retry_timeout: How long a request is repeated while the server is busy or away [s].
 
         Raises:
             ValueError: Variables of the environment contradict each other.
         """
-        seconds = PATIENCE_SECONDS if patience is None else patience
-        self._objects = ObjectClient(bucket, prefix, patience=seconds)
+        seconds = RETRY_SECONDS if retry_timeout is None else retry_timeout
+        self._objects = ObjectClient(bucket, prefix, retry_timeout=seconds)
 
     @property
     def place(self) -> str:
@@ -216,7 +218,7 @@ class BucketStore:
 
     def probe(self) -> None:
         """Write a small object and delete it; raise OSError if that fails."""
-        client = self._objects.impatient(PROBE_SECONDS)
+        client = self._objects.with_retry_timeout(PROBE_SECONDS)
         name = f".probe-{random.randbytes(8).hex()}"
         client.put(name, b"probe", mode="overwrite")
         client.delete([name])

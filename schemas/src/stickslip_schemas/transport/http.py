@@ -23,7 +23,7 @@ CONNECT_SECONDS = 5.0
 """How long a connection may take to be made [s]."""
 TIMEOUT_SECONDS = 60.0
 """How long a server may send nothing [s]."""
-PATIENCE_SECONDS = 60.0
+RETRY_SECONDS = 60.0
 """How long a failed request is repeated [s]."""
 PAUSES_SECONDS = (0.25, 0.5, 1.0, 2.0, 3.0)
 """Longest pauses between attempts [s], the last one repeated; a random fraction is waited."""
@@ -102,7 +102,7 @@ class HttpClient:
         base_url: str = "",
         *,
         api_key: str | None = None,
-        patience: float = PATIENCE_SECONDS,
+        retry_timeout: float = RETRY_SECONDS,
         follow_redirects: bool = False,
         transport: httpx.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep,
@@ -112,7 +112,7 @@ class HttpClient:
         Args:
             base_url: URL before the paths of requests.
             api_key: Key that is sent to the server; it does not follow redirects to others.
-            patience: How long a failed request is repeated [s].
+            retry_timeout: How long a failed request is repeated [s].
             follow_redirects: Whether an answer may lead to another URL.
             transport: Transport of httpx, for tests.
             sleep: Waits between attempts, for tests.
@@ -120,7 +120,7 @@ class HttpClient:
         Raises:
             InvalidKeyError: The key cannot be sent.
         """
-        self.patience = patience
+        self.retry_timeout = retry_timeout
         self._sleep = sleep
         self._was_answered = False
         self._http = httpx.Client(
@@ -161,7 +161,7 @@ class HttpClient:
             TransportError: The server does not answer.
             AnswerError: The body is larger than `limit`, or compressed.
         """
-        until = time.monotonic() + self.patience
+        until = time.monotonic() + self.retry_timeout
         for pause in chain(PAUSES_SECONDS, repeat(PAUSES_SECONDS[-1])):
             is_last = time.monotonic() >= until
             # Requests that change something are idempotent, so every one may be repeated.

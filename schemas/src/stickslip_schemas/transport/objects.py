@@ -25,7 +25,7 @@ import obstore.store
 
 from stickslip_schemas.transport.proxies import object_store_options
 
-PATIENCE_SECONDS = 60.0
+RETRY_SECONDS = 60.0
 """How long a request is repeated while the server is busy or away [s]."""
 
 DELETE_SECONDS = 5.0
@@ -33,8 +33,8 @@ DELETE_SECONDS = 5.0
 
 _REQUEST_SECONDS = 300.0
 """How long one request may take, with its body [s]."""
-_PATIENCES_A_REQUEST = 5.0
-"""A request of an impatient client ends after so many times its patience."""
+_RETRY_TIMEOUTS_A_REQUEST = 5.0
+"""One request ends after so many times the time for repetitions, if that is shorter."""
 _FIRST_PAUSE_SECONDS = 0.1
 _LONGEST_PAUSE_SECONDS = 5.0
 
@@ -69,25 +69,27 @@ class ObjectClient:
     """
 
     def __init__(
-        self, bucket: str, prefix: str = "", *, patience: float = PATIENCE_SECONDS
+        self, bucket: str, prefix: str = "", *, retry_timeout: float = RETRY_SECONDS
     ) -> None:
         """Make a client; nothing is asked yet.
 
         Args:
             bucket: Name of the bucket.
             prefix: Path before the names of all objects.
-            patience: How long a request is repeated [s].
+            retry_timeout: How long a request is repeated [s].
 
         Raises:
             ValueError: Variables of the environment contradict each other.
         """
         self.url = f"s3://{bucket}/{prefix}".rstrip("/")
-        self.patience = patience
+        self.retry_timeout = retry_timeout
         self._bucket = bucket
         self._prefix = prefix
         self._deletes_many = True
         """False once the server has refused the request that deletes many objects."""
-        timeout = timedelta(seconds=min(_REQUEST_SECONDS, patience * _PATIENCES_A_REQUEST))
+        timeout = timedelta(
+            seconds=min(_REQUEST_SECONDS, retry_timeout * _RETRY_TIMEOUTS_A_REQUEST)
+        )
         # `object_store` reads these two itself only if it is given no options of a client.
         allow_http = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
         endpoint = _endpoint(bucket)
@@ -101,7 +103,7 @@ class ObjectClient:
                 bucket,
                 prefix=prefix or None,
                 client_options=client_options,
-                retry_config={"retry_timeout": timedelta(seconds=patience)},
+                retry_config={"retry_timeout": timedelta(seconds=retry_timeout)},
             )
         except obstore.exceptions.BaseError as error:
             raise ValueError(f"the store {self.url} cannot be opened: {_summary(error)}") from error
@@ -205,7 +207,7 @@ class ObjectClient:
         )
 
         url = obstore.sign(self._store, "DELETE", name, timedelta(minutes=_SIGNATURE_MINUTES))
-        client = HttpClient(patience=0.0)
+        client = HttpClient(retry_timeout=0.0)
         try:
             status = client.request("DELETE", url).status_code
         except (TransportError, AnswerError) as error:
@@ -215,15 +217,17 @@ class ObjectClient:
         if status >= HTTPStatus.BAD_REQUEST and status != HTTPStatus.NOT_FOUND:
             raise _BusyError(f"status code: {status}")
 
-    def impatient(self, patience: float) -> "ObjectClient":
-        """Return a client of the same objects that gives up after `patience` seconds."""
-        client = ObjectClient(self._bucket, self._prefix, patience=min(self.patience, patience))
+    def with_retry_timeout(self, retry_timeout: float) -> "ObjectClient":
+        """Return a client of the same objects that gives up after `retry_timeout` seconds."""
+        client = ObjectClient(
+            self._bucket, self._prefix, retry_timeout=min(self.retry_timeout, retry_timeout)
+        )
         client._deletes_many = self._deletes_many
         return client
 
     def _repeat(self, request: Callable[[], T]) -> T:
-        """Make a request until the server answers or the patience ends."""
-        end = time.monotonic() + self.patience
+        """Repeat a request until the server answers or the time for repetitions is over."""
+        end = time.monotonic() + self.retry_timeout
         pause = _FIRST_PAUSE_SECONDS
         while True:
             try:

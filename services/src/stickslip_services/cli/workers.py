@@ -22,7 +22,7 @@ DIGEST_LETTERS = 16
 """Letters of a certificate's digest that a table shows."""
 BUILD_LETTERS = 12
 """Letters of a build that a table shows."""
-REGISTER_PATIENCE_SECONDS = 1.0
+REGISTER_RETRY_SECONDS = 1.0
 """How long a coordinator is waited for after a measurement [s]: it may well not run."""
 
 
@@ -91,7 +91,7 @@ def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
     else:
         tell(f"preset {preset} {'passed' if certificate.passed else 'did NOT pass'}: {file}")
     # The certificate is on the disk and can be registered later.
-    client.patience = REGISTER_PATIENCE_SECONDS
+    client.retry_timeout = REGISTER_RETRY_SECONDS
     try:
         _register(client, directory)
     except UnreachableError:

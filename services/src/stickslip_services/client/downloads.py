@@ -76,7 +76,7 @@ class Downloader:
         # Pauses grow, so that a coordinator that restarts has time to do so.
         fault = ""
         for attempt in range(ATTEMPTS):
-            pause = 0.0 if attempt == 0 else min(2.0**attempt / 4, self.client.patience)
+            pause = 0.0 if attempt == 0 else min(2.0**attempt / 4, self.client.retry_timeout)
             if self.stop.wait(pause):
                 return
             try:

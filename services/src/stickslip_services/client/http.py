@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Self, TypeVar, Unpack
+from urllib.parse import quote
 
 import httpx
 from stickslip_schemas.base import JobState, TaskState
@@ -21,7 +22,7 @@ from stickslip_schemas.transport.addresses import (
 )
 from stickslip_schemas.transport.http import (
     BUSY_STATUS,
-    PATIENCE_SECONDS,
+    RETRY_SECONDS,
     AnswerError,
     HttpClient,
     RequestOptions,
@@ -54,6 +55,11 @@ EVENT_PAUSE_SECONDS = 1.0
 """Pause before a lost event stream is opened again [s]."""
 
 
+def _segment(text: str) -> str:
+    """Return an id as a part of a path; `../x` must not lead to another resource."""
+    return quote(text, safe="")
+
+
 class Client:
     """A client of one coordinator, and a context manager that closes its connections.
 
@@ -66,7 +72,7 @@ class Client:
         url: str | None = None,
         *,
         key: str | None = None,
-        patience: float = PATIENCE_SECONDS,
+        retry_timeout: float = RETRY_SECONDS,
         transport: httpx.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -75,7 +81,7 @@ class Client:
         Args:
             url: Defaults to STICKSLIP_URL, then to this machine.
             key: Defaults to STICKSLIP_API_KEY. If both are empty, requests carry no key.
-            patience: How long a failed request is repeated [s].
+            retry_timeout: How long a failed request is repeated [s].
             transport: Transport of httpx, for tests.
             sleep: Waits between attempts, for tests.
 
@@ -95,7 +101,7 @@ class Client:
             self._http = HttpClient(
                 self.url,
                 api_key=self._api_key,
-                patience=patience,
+                retry_timeout=retry_timeout,
                 transport=transport,
                 sleep=sleep,
             )
@@ -103,13 +109,13 @@ class Client:
             raise ClientError(str(error)) from error
 
     @property
-    def patience(self) -> float:
+    def retry_timeout(self) -> float:
         """How long a failed request is repeated [s]."""
-        return self._http.patience
+        return self._http.retry_timeout
 
-    @patience.setter
-    def patience(self, seconds: float) -> None:
-        self._http.patience = seconds
+    @retry_timeout.setter
+    def retry_timeout(self, seconds: float) -> None:
+        self._http.retry_timeout = seconds
 
     def __enter__(self) -> Self:
         return self
@@ -157,7 +163,7 @@ class Client:
 
     def job(self, job_id: str) -> responses.JobDetail:
         """Return a job."""
-        return self._call(responses.JobDetail, "GET", f"/v1/jobs/{job_id}")
+        return self._call(responses.JobDetail, "GET", f"/v1/jobs/{_segment(job_id)}")
 
     def jobs(
         self, *, search: str = "", state: JobState | None = None, project: str = ""
@@ -176,26 +182,29 @@ class Client:
         """Yield the samples of a job by slot, or only the samples in one state."""
         query = {} if state is None else {"state": str(state)}
         return self._items(
-            responses.Page[responses.SampleState], f"/v1/jobs/{job_id}/samples", query
+            responses.Page[responses.SampleState], f"/v1/jobs/{_segment(job_id)}/samples", query
         )
 
     def prioritise(self, job_id: str, priority: int) -> responses.JobDetail:
         """Set the priority of a job: tasks of the job with the highest number run first."""
         return self._call(
-            responses.JobDetail, "PATCH", f"/v1/jobs/{job_id}", json={"priority": priority}
+            responses.JobDetail,
+            "PATCH",
+            f"/v1/jobs/{_segment(job_id)}",
+            json={"priority": priority},
         )
 
     def cancel(self, job_id: str) -> responses.JobDetail:
         """Cancel a job: running tasks are stopped, and results stay cached."""
-        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:cancel")
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{_segment(job_id)}:cancel")
 
     def pause(self, job_id: str) -> responses.JobDetail:
         """Pause a job: running tasks finish, and no further task starts."""
-        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:pause")
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{_segment(job_id)}:pause")
 
     def resume(self, job_id: str) -> responses.JobDetail:
         """Resume a paused job."""
-        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{job_id}:resume")
+        return self._call(responses.JobDetail, "POST", f"/v1/jobs/{_segment(job_id)}:resume")
 
     def events(self, job_id: str) -> Iterator[Event]:
         """Yield the events of a job from its first one until it ends.
@@ -218,7 +227,7 @@ class Client:
             except TransportError as error:
                 reason = str(error)
             # Keep-alives and events reset the clock: only silence counts.
-            if waited >= self.patience:
+            if waited >= self.retry_timeout:
                 raise UnreachableError(f"{without_password(self.url)}: {reason}")
             self._sleep(EVENT_PAUSE_SECONDS)
             waited += EVENT_PAUSE_SECONDS
@@ -238,7 +247,7 @@ class Client:
         headers = {"Accept": "text/event-stream"}
         if last_id:
             headers["Last-Event-ID"] = last_id
-        path = f"/v1/jobs/{job_id}/events"
+        path = f"/v1/jobs/{_segment(job_id)}/events"
         stream = self._http.stream("GET", path, silence=SILENCE_SECONDS, headers=headers)
         try:
             with stream as response:
@@ -252,11 +261,13 @@ class Client:
         return self._items(responses.Page[responses.Dataset], "/v1/datasets")
 
     def dataset(self, dataset: str) -> responses.Dataset:
-        return self._call(responses.Dataset, "GET", f"/v1/datasets/{dataset}")
+        return self._call(responses.Dataset, "GET", f"/v1/datasets/{_segment(dataset)}")
 
     def version(self, dataset: str, version: int) -> responses.DatasetVersion:
         return self._call(
-            responses.DatasetVersion, "GET", f"/v1/datasets/{dataset}/versions/{version}"
+            responses.DatasetVersion,
+            "GET",
+            f"/v1/datasets/{_segment(dataset)}/versions/{version}",
         )
 
     def find_dataset(self, name: str) -> responses.Dataset:

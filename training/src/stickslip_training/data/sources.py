@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 BLOCK_BYTES = 16 * 2**20
 """Size of the blocks in which a file is read for its digest [bytes]."""
-READER_PATIENCE_SECONDS = 10.0
+READER_RETRY_SECONDS = 10.0
 """How long a failed request of a reader is repeated [s]: a server that restarts costs no epoch."""
 
 
@@ -240,7 +240,7 @@ class BucketSource(_RemoteSource):
     workers needs `multiprocessing_context="spawn"`.
     """
 
-    PATIENCE_SECONDS = 60.0
+    RETRY_SECONDS = 60.0
     """How long a request is repeated while the bucket's server is busy or away [s]."""
 
     def __init__(self, url: str) -> None:
@@ -293,7 +293,9 @@ class BucketSource(_RemoteSource):
                 'multiprocessing_context="spawn"'
             )
         if self._client is None:
-            self._client = ObjectClient(self._bucket, self._prefix, patience=self.PATIENCE_SECONDS)
+            self._client = ObjectClient(
+                self._bucket, self._prefix, retry_timeout=self.RETRY_SECONDS
+            )
             self._pid = os.getpid()
         return self._client  # type: ignore[no-any-return]  # one attribute for both sources
 
@@ -381,7 +383,7 @@ class HttpSource(_RemoteSource):
         if self._client is None or self._pid != os.getpid():
             # A fork shares the parent's sockets: the child must not use them, nor close them.
             self._client = HttpClient(
-                api_key=self._api_key, patience=READER_PATIENCE_SECONDS, follow_redirects=True
+                api_key=self._api_key, retry_timeout=READER_RETRY_SECONDS, follow_redirects=True
             )
             self._pid = os.getpid()
         try:
