@@ -52,7 +52,7 @@ from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling, import_bpy
 from stickslip_blender.cycles.pixels import FrameReader, encode
 from stickslip_blender.raster import Points, Textures, Window, projected, see
-from stickslip_blender.workshop import Workshop, build_digest
+from stickslip_blender.render_context import RenderContext, build_digest
 from stickslip_schemas.documents.tasks import RecordRef, RenderOutput, RenderTask, TaskResult
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
@@ -266,7 +266,7 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
     """
     pictures, known, written = [], [], []
     with tempfile.TemporaryDirectory() as folder:
-        workshop = Workshop(folder)
+        context = RenderContext(folder)
         for view in chosen * 2:
             _, light, other = bench.composed(view, CLOTH_SAMPLING[Quality.standard])
             pictures.append(light + other)
@@ -277,7 +277,7 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
             truth = ground_truth(bench.geometry, now, then, bench.rig[view.view])
             found = time.process_time()
             for values in vars(truth).values():
-                workshop.chunk(values)
+                context.chunk(values)
             known.append(found - start)
             written.append(time.process_time() - found)
     whole = np.array(pictures)

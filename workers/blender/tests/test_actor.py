@@ -21,8 +21,8 @@ from stickslip_blender.cloth import quality
 from stickslip_blender.cloth.looks import drawn_light, drawn_substrate
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING
+from stickslip_blender.render_context import roots
 from stickslip_blender.scenes.rod_hang import RodRenderer, silicone_color, to_linear
-from stickslip_blender.workshop import roots
 from stickslip_schemas.base import Reason, is_sha256
 from stickslip_schemas.documents.tasks import ChunkRef, RenderOutput, TaskResult
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip
@@ -195,8 +195,7 @@ def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> 
     assert RenderActor(str(tmp_path / "elsewhere")).describe() == description
 
 
-# --- cloth
-# ----------------------------------------------------------------------------------------------------
+# --- cloth ---
 
 
 @pytest.fixture

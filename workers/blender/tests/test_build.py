@@ -1,9 +1,9 @@
 """The build digest covers the files of the renderer only."""
 
 import pytest
-from stickslip_blender import workshop
+from stickslip_blender import render_context
 from stickslip_blender.actor import renders
-from stickslip_blender.workshop import build_digest, roots
+from stickslip_blender.render_context import build_digest, roots
 from stickslip_schemas.kinds import KINDS, UnknownKindError
 from stickslip_schemas.plan.builds import UNCOUNTED, sources
 
@@ -11,7 +11,7 @@ from stickslip_schemas.plan.builds import UNCOUNTED, sources
 def test_the_rasteriser_is_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:
     digest = build_digest.__wrapped__  # not the one that is kept
     before = {kind: digest(kind) for kind in KINDS}
-    monkeypatch.setattr(workshop, "BUILD_HASH", "another")
+    monkeypatch.setattr(render_context, "BUILD_HASH", "another")
     assert all(digest(kind) != before[kind] for kind in KINDS)
 
 

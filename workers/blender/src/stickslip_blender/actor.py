@@ -14,7 +14,7 @@ from stickslip_schemas.documents.tasks import RenderTask, TaskResult
 from stickslip_schemas.kinds import KINDS, kind_named
 
 from stickslip_blender.cycles.engine import blender_version, described
-from stickslip_blender.workshop import Workshop, build_digest, check_rig
+from stickslip_blender.render_context import RenderContext, build_digest, check_rig
 
 
 class RenderActor:
@@ -24,7 +24,7 @@ class RenderActor:
     """
 
     def __init__(self, store_root: str) -> None:
-        self._workshop = Workshop(store_root)
+        self._context = RenderContext(store_root)
 
     def describe(self) -> dict[str, Any]:
         """Return the build of each kind, and versions.
@@ -38,10 +38,11 @@ class RenderActor:
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
         """Render the sample of a `RenderTask`; return a `TaskResult`."""
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         job = RenderTask.model_validate(task)
         check_rig(job.render)
-        result = renders(job.render.kind)(job.render, job, self._workshop)
+        result = renders(job.render.kind)(job.render, job, self._context)
         spent = {
             "cpu_seconds": time.process_time() - cpu,
             "wall_seconds": time.perf_counter() - wall,
@@ -49,14 +50,15 @@ class RenderActor:
         return result.model_copy(update=spent).model_dump(mode="json")
 
 
-def renders(kind: str) -> Callable[[Any, RenderTask, Workshop], TaskResult]:
-    """Return the function that renders a kind, from its render document, the task of it and a
-    workshop to a result.
+def renders(kind: str) -> Callable[[Any, RenderTask, RenderContext], TaskResult]:
+    """Return the function that renders a kind.
+
+    It takes the render document, its task and a context, and returns a result.
 
     Raises UnknownKindError where the contract does not have the kind.
     """
     kind_named(kind)
-    render: Callable[[Any, RenderTask, Workshop], TaskResult] = import_module(
+    render: Callable[[Any, RenderTask, RenderContext], TaskResult] = import_module(
         f"stickslip_blender.scenes.{kind}"
     ).render
     return render

@@ -1,5 +1,6 @@
-"""Drawings of a scene before it is simulated: where everything starts, and how bodies and holders
-move.
+"""Drawings of a scene before it is simulated.
+
+They show the starts of all parts, and how bodies and holders move.
 
 `python -m stickslip_blender.preview RECORD.npz SCENE.json DIR` writes `CAMERA.png` of the start and
 `motion.webp`, all cameras side by side. The record has the arrays of `cloth_scene` that the cameras
@@ -27,12 +28,15 @@ SIDE = 320
 """Of a picture [px]."""
 _SHARPNESS = 2  # samples across a pixel
 _LIGHT = np.array([0.35, -0.45, 0.82])
-_DIFFUSE, _SHADOW = 0.6, 0.72
+_DIFFUSE = 0.6
+_SHADOW = 0.72
 _SHEET = np.array(
     [[0.93, 0.90, 0.84], [0.20, 0.42, 0.72]]
 )  # sRGB, of the squares of the sheet that has no picture yet
 _SQUARES = 8
-_GROUND, _LINE, _SKY = 0.62, 0.5, 0.9
+_GROUND = 0.62
+_LINE = 0.5
+_SKY = 0.9
 _LINES, _THICK = 0.1, 0.003  # [m], between lines on the floor, and their thickness
 
 Array = npt.NDArray[Any]
@@ -71,8 +75,9 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
 
 
 def _colors(geometry: Geometry) -> Array:
-    """Return the colour of each triangle (T, 3), sRGB from 0 to 1: of a sheet, that of its picture
-    in its middle.
+    """Return the colour of each triangle (T, 3), sRGB from 0 to 1.
+
+    A triangle of a sheet has the colour of its picture in its middle.
     """
     corners = geometry.uv[geometry.triangles].mean(axis=1)
     squares = np.floor(_SQUARES * corners).astype(int).sum(axis=1) % 2
@@ -117,8 +122,9 @@ def _drawn(
 def _floor(
     geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, ...], light: Array
 ) -> Array:
-    """Return how bright each sample of the background is: the sky, or the floor with its lines and
-    shadows.
+    """Return how bright each sample of the background is.
+
+    It is the sky, or the floor with its lines and shadows.
     """
     height = geometry.surroundings.floor
     if height is None:

@@ -20,7 +20,7 @@ def _srgb(light: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def test_composed_pictures_are_what_the_formula_says() -> None:
-    """In numpy, and in double precision: gloss, light once and twice scattered, in parts of pixels."""
+    """In double precision: gloss, light once and twice scattered, in parts of pixels."""
     height, width, count = 9, 12, 3
     window, around = Window(1, 1, 4, 4).times(FINE), Window(5, 3, 12, 9)
     gloss, once, twice = RANDOM.uniform(-0.02, 0.4, (3, FINE * height, FINE * width))

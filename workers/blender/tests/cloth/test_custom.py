@@ -142,7 +142,7 @@ def test_a_built_in_texture_as_a_file_is_the_texture() -> None:
 def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
-    """The calibration of the rig's own camera, at twice the size and in the middle of a wide image."""
+    """The calibration of a camera of the rig, at twice the size, in a wide image."""
     (ours,) = (camera for camera in load_rig("drag") if camera.name == "left")
     from math import acos
 

@@ -6,7 +6,7 @@ import sys
 from contextlib import suppress
 
 import pytest
-from stickslip_blender import workshop
+from stickslip_blender import render_context
 from stickslip_blender.cycles.engine import (
     CPU,
     DEVICES,
@@ -71,7 +71,7 @@ def test_a_device_that_is_not_there_is_refused(name: str, monkeypatch: pytest.Mo
     with pytest.raises(NoDeviceError):
         new_scene()
     with pytest.raises(NoDeviceError):
-        workshop.build_digest.__wrapped__("rod_hang")
+        render_context.build_digest.__wrapped__("rod_hang")
 
 
 def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,11 +83,11 @@ def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_device_names_and_driver_are_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:
-    digest = workshop.build_digest.__wrapped__
+    digest = render_context.build_digest.__wrapped__
     found = {digest("rod_hang")}
     for driver, names in (("550", ["one"]), ("570", ["one"]), ("570", ["another"])):
         gpu = {"device": "optix", "names": names, "driver": driver}
-        monkeypatch.setattr(workshop, "described", lambda gpu=gpu: gpu)
+        monkeypatch.setattr(render_context, "described", lambda gpu=gpu: gpu)
         found.add(digest("rod_hang"))
     assert len(found) == 4
 

@@ -40,7 +40,7 @@ def _soup(
 
 
 def _places(window: Window, grid: int) -> npt.NDArray[np.float64]:
-    """Return where the samples are, (grid height, grid width, 2) [px]: raster.hpp has the formula."""
+    """Return the samples, (grid height, grid width, 2) [px]: raster.hpp has the formula."""
     rows, columns = (window.bottom - window.top) * grid, (window.right - window.left) * grid
     shift = (5 * np.arange(grid) % grid + 0.5) / grid
     j, i = np.mgrid[:rows, :columns]

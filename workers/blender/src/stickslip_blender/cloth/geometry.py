@@ -1,5 +1,6 @@
-"""The triangles of a scene of cloth: the refined cloth, and props, which may be further sheets of
-cloth.
+"""The triangles of a scene of cloth: the refined cloth, and props.
+
+Props may be further sheets of cloth.
 
 The scene in Blender and the rasteriser are built from the same triangles. Cycles sees all props
 grey, so that the light of the cloth stays a function of its albedo alone; the composer lays their
@@ -62,7 +63,8 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
     faces: Faces = []
     for ring in range(rings - 1):
         for place in range(around):
-            left, right = ring * around + place, ring * around + (place + 1) % around
+            left = ring * around + place
+            right = ring * around + (place + 1) % around
             faces.append((left, left + around, right + around, right))
     corners = [side * (ARC + 1) for side in range(4)]
     return vertices, [
@@ -73,8 +75,9 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
 
 
 def gores(color: Array, count: int) -> Array:
-    """Return a colour for each of the faces of a round body, (count, 3): gores are bright and dark
-    by turns.
+    """Return a colour for each face of a round body, (count, 3).
+
+    Gores are bright and dark by turns.
     """
     around = 4 * (ARC + 1)
     place = np.arange(count) % around
@@ -86,6 +89,7 @@ def gores(color: Array, count: int) -> Array:
 def box(
     size: tuple[float, float, float], center: tuple[float, float, float]
 ) -> tuple[Array, Faces]:
+    """Return the vertices (8, 3) and faces of a box, with sides parallel to the axes [m]."""
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces: Faces = [
         (0, 1, 3, 2),
@@ -205,8 +209,9 @@ class Surroundings(Protocol):
     """Code of the cloth in the segmentation."""
 
     def placed(self, instant: int, vertices: Array) -> list[Array]:
-        """Return the vertices of each prop (n, 3) [m] at an instant, with the cloth at vertices (V,
-        3) [m].
+        """Return the vertices of each prop (n, 3) [m] at an instant.
+
+        The cloth is at vertices (V, 3) [m].
         """
 
 
@@ -293,9 +298,7 @@ class Geometry:
         )
 
     def points(self, positions: npt.ArrayLike, instant: int) -> Array:
-        """Return all vertices, shape (V, 3) [m], of the solver's positions (V', 3) [m] at an
-        instant.
-        """
+        """Return all vertices (V, 3) [m] for the solver's positions (V', 3) [m] at an instant."""
         given = np.asarray(positions, dtype=np.float64)
         return np.concatenate([self.surface(given), *self.surroundings.placed(instant, given)])
 
@@ -307,20 +310,20 @@ class Geometry:
         return [points[begin:end] for begin, end in pairwise(ends)]
 
     def checked(self, positions: npt.ArrayLike) -> Array:
-        """Return positions (frames, V', 3) [m], or raise a ValueError where they do not fit this
-        cloth.
-        """
+        """Return positions (frames, V', 3) [m]; raise ValueError if they do not fit this cloth."""
         track = np.asarray(positions, dtype=np.float64)
         if track.ndim != 3 or track.shape[1:] != (self.vertices, 3) or not np.isfinite(track).all():
             raise ValueError(
-                f"positions must be finite, of shape (frames, {self.vertices}, 3); got shape {track.shape}"
+                f"positions must be finite, of shape (frames, {self.vertices}, 3); got shape "
+                f"{track.shape}"
             )
         return track
 
 
 def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
-    """Split the vertices (V, 3) of triangles (T, 3) where edges are sharper than `SHARP`, as
-    Blender shades them.
+    """Split the vertices (V, 3) of triangles (T, 3) at edges sharper than `SHARP`.
+
+    Blender shades them so.
 
     Returns the vertices (S,), once for each smooth skin that meets there, and the triangles (T, 3)
     of those.
@@ -329,12 +332,15 @@ def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     corners = triangles.ravel()
-    label, order = np.arange(corners.size), np.argsort(corners, kind="stable")
+    label = np.arange(corners.size)
+    order = np.argsort(corners, kind="stable")
     for _ in range(most := int(np.bincount(corners).max())):  # a chain of corners has no more links
         for shift in range(1, most):
-            one, other = order[:-shift], order[shift:]
+            one = order[:-shift]
+            other = order[shift:]
             alike = (corners[one] == corners[other]) & (label[one] != label[other])
-            one, other = one[alike], other[alike]
+            one = one[alike]
+            other = other[alike]
             alike = (normals[one // 3] * normals[other // 3]).sum(axis=1) > np.cos(SHARP)
             pair = np.concatenate([one[alike], other[alike]])
             np.minimum.at(label, pair, np.tile(np.minimum(label[one], label[other])[alike], 2))
@@ -355,19 +361,22 @@ HOLDER = (
     0.01,
 )  # of the clip at a corner [m]: across the cloth, and in its plane as in the simulation
 ROD = (0.003, 0.003, 0.5)  # of what the clip hangs on [m]
-HOLDER_COLOR, HOLDER_ROUGHNESS = np.array([[0.05, 0.05, 0.05]]), 0.45
+HOLDER_COLOR = np.array([[0.05, 0.05, 0.05]])
+HOLDER_ROUGHNESS = 0.45
 
 
 class Holders:
     """The two holders of a dragged cloth, at its upper corners [thesis, 4.2.3]."""
 
     floor: float | None = FLOOR
-    ground, segment = GROUND, CLOTH
+    ground = GROUND
+    segment = CLOTH
 
     def __init__(self, rest: npt.ArrayLike) -> None:
-        """Find the corners of a cloth whose held edge is the last one of its rest shape (V, 2) [m]."""
+        """Find the corners of a cloth, whose held edge is the last of its rest shape (V, 2) [m]."""
         flat = np.asarray(rest, dtype=np.float64)
-        low, high = flat.min(axis=0), flat.max(axis=0)
+        low = flat.min(axis=0)
+        high = flat.max(axis=0)
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2

@@ -18,8 +18,9 @@ from stickslip_blender.raster import Window, _raster, decoded, projected, see
 
 
 def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
-    """Return what a camera shows of a video (frames, height, width, 3) that its `pinhole` took,
-    8-bit sRGB.
+    """Return a video (frames, height, width, 3) as its camera shows it, 8-bit sRGB.
+
+    The video was taken by the camera's `pinhole`.
 
     A pixel is interpolated between four, in linear light.
     """
@@ -28,22 +29,27 @@ def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     _, _, places = traced(camera)
     corner = np.floor(places).astype(int)
     share = (places - corner)[..., None].astype(np.float32)
-    column, row = corner[..., 0], corner[..., 1]
-    across, down = share[:, :, 0], share[:, :, 1]
+    column = corner[..., 0]
+    row = corner[..., 1]
+    across = share[:, :, 0]
+    down = share[:, :, 1]
     result = np.empty((len(video), *column.shape, 3), dtype=np.uint8)
     for frame, picture in enumerate(video):
         a, b, c, d = (decoded(picture[row + y, column + x]) for y in range(2) for x in range(2))
-        upper, lower = a + across * (b - a), c + across * (d - c)
+        upper = a + across * (b - a)
+        lower = c + across * (d - c)
         result[frame] = encode(upper + down * (lower - upper))
     return result
 
 
 @lru_cache(maxsize=4)  # every frame and every texture asks
 def traced(camera: Camera) -> tuple[Camera, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return a camera's pinhole, its rays (height, width, 3), and where in the pinhole's frame they
-    land [px].
+    """Return a camera's pinhole, its rays (height, width, 3), and their pixels.
+
+    The pixels are positions in the pinhole's frame [px].
     """
-    pinhole, rays = camera.pinhole(), camera.rays()
+    pinhole = camera.pinhole()
+    rays = camera.rays()
     return pinhole, rays, rays[..., :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
@@ -53,8 +59,9 @@ def ground_truth(
     following: npt.NDArray[np.float64],
     camera: Camera,
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the ground truth of an instant by name: all vertices (V, 3) [m] then, and at the next
-    frame.
+    """Return the ground truth of an instant by name.
+
+    It needs all vertices (V, 3) [m] at the instant and at the next frame.
 
     - `depth` (height, width): along the optical axis [m], infinite where there is nothing
     - `segmentation` (height, width): codes

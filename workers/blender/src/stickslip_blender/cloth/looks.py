@@ -1,5 +1,6 @@
-"""Looks of fabrics (shader, hem and grain of each material), of lamps and of floors, drawn from a
-seed.
+"""Looks of fabrics, lamps and floors, drawn from a seed.
+
+A fabric has a shader, a hem and the grain of its material.
 """
 
 from __future__ import annotations
@@ -74,8 +75,9 @@ def look_of(material: str) -> Look:
 
 
 def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
-    """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet, with the grain of its
-    fabric and a hem.
+    """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet.
+
+    The sheet has the grain of its fabric and a hem.
 
     Row 0 is the lower edge of the sheet; the picture covers the longer side. White has at most the
     albedo WHITE.
@@ -92,10 +94,12 @@ def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt
 
 
 def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
-    """Return 1 on the stitches of the hem, 4.5 mm from the edge and 3 mm long, at (u, v) [mm]; 0
-    elsewhere.
+    """Return 1 on the stitches of the hem at (u, v) [mm], 0 elsewhere.
+
+    Stitches are 4.5 mm from the edge and 3 mm long.
     """
-    from_side, from_end = np.minimum(u, wide - u), np.minimum(v, high - v)
+    from_side = np.minimum(u, wide - u)
+    from_end = np.minimum(v, high - v)
     seam = np.abs(np.minimum(from_side, from_end) - 4.5) < 0.45
     along = np.where(from_side < from_end, v, u)
     return (seam & (np.mod(along, 4.0) < 3.0)).astype(np.float64)
@@ -256,8 +260,7 @@ def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) ->
 def floor_factor(
     substrate: Substrate, camera: Camera, height: float | None
 ) -> npt.NDArray[np.float32]:
-    """Return what the floor's marks and colour do to its light in each pixel, shape (height, width,
-    3).
+    """Return the factor of the floor's marks and colour on its light, (height, width, 3).
 
     Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is
     at a height [m]; None: there is none, and the factor is 1.
@@ -300,7 +303,8 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
 
 def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
     """Return smooth noise of unit deviation that repeats; `extent` of its spots [texels]."""
-    down, along = np.fft.fftfreq(GRAIN_SIZE)[:, None], np.fft.rfftfreq(GRAIN_SIZE)
+    down = np.fft.fftfreq(GRAIN_SIZE)[:, None]
+    along = np.fft.rfftfreq(GRAIN_SIZE)
     decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (down**2 + along**2))
     spectrum = np.fft.rfft2(random.standard_normal((GRAIN_SIZE, GRAIN_SIZE)))
     noise = np.fft.irfft2(spectrum * decay, (GRAIN_SIZE, GRAIN_SIZE))

@@ -4,7 +4,8 @@ At seeded instants, Cycles renders the cloth directly, with several seeds and no
 pixel, let P be the clip's linear light, X and Y that of two renderings, and f the sRGB encoding in
 8-bit levels. The noises of X and Y are independent, so that in
 
-    e = f'(P)^2 (P - X) (P - Y)        E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
+    e = f'(P)^2 (P - X) (P - Y)
+    E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
 nothing of the noise of the references is left, however few samples they have; e is the mean over
 all pairs. Landed cloth in a penumbra has paths that rarely meet the lamp, and more renderings.
@@ -72,7 +73,8 @@ class Measured:
         """Say which regions are below their floors [dB] by more than chance; nothing if none is."""
         numbers = zip(REGIONS, self.psnr, self.deviations, floors, strict=True)
         return "; ".join(
-            f"psnr_{name} must be at least {floor:g} dB; got {psnr:.1f} dB (deviation {deviation:.1f} dB)"
+            f"psnr_{name} must be at least {floor:g} dB; got {psnr:.1f} dB (deviation "
+            f"{deviation:.1f} dB)"
             for name, psnr, deviation, floor in numbers
             if psnr + DEVIATIONS * deviation < floor
         )
@@ -100,8 +102,9 @@ def trio(texture: str) -> tuple[str, ...]:
 
 
 def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
-    """Draw which frames are measured, each from one of as many equal parts of the clip, at least
-    one.
+    """Draw the frames that are measured, each from an equal part of the clip.
+
+    At least one frame is measured.
 
     To measure eight textures costs a share of their shading, which has so many paths in each part
     of a pixel.
@@ -121,9 +124,7 @@ def landed_top(geometry: Geometry) -> float:
 
 
 def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[np.bool_]:
-    """Return where the cloth is, where landed cloth is, and the band along its edge, (3, height,
-    width).
-    """
+    """Return the cloth, landed cloth, and the band along its edge, (3, height, width)."""
     seen = see(
         projected(camera, points),
         geometry.triangles,
@@ -143,10 +144,12 @@ def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
 
 
 def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel: int) -> Floats:
-    """Return e: a picture's green against a channel of linear light (renderings, height, width, 3),
-    NaN if not seen.
+    """Return a picture's green minus a channel of linear light; NaN if not visible.
+
+    The light is (renderings, height, width, 3).
     """
-    levels, others = picture[..., 1], references[..., channel]
+    levels = picture[..., 1]
+    others = references[..., channel]
     light = decoded(levels).astype(np.float64)
     slope = 255.0 * np.where(
         light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0)
@@ -161,8 +164,9 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
 def pooled(
     measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3
 ) -> Measured:
-    """Return the PSNR from errors (height, width) of instants, and weights by region, (3, height,
-    width), 0 outside.
+    """Return the PSNR from errors (height, width) of instants and weights by region.
+
+    Weights are (3, height, width), and 0 outside of a region.
 
     `usual`: means of weights over the regions in all frames.
     """

@@ -55,18 +55,17 @@ class ClothScene:
             max_bounces=3, diffuse_bounces=2, light_tree=False
         )  # one lamp: nothing to choose
         cycles = self._scene.cycles  # what else meets gloss is soft: set_roughness
-        cycles.caustics_reflective, cycles.blur_glossy, cycles.sample_clamp_indirect = (
-            True,
-            0.0,
-            0.0,
-        )
+        cycles.caustics_reflective = True
+        cycles.blur_glossy = 0.0
+        cycles.sample_clamp_indirect = 0.0
         self._lamp = Lamp(self._scene)
         self._floor = None
         if geometry.surroundings.floor is not None:
             self._floor = add_material(
                 add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor"
             )
-        faces, uv = geometry.surface.triangles, geometry.surface.uv
+        faces = geometry.surface.triangles
+        uv = geometry.surface.uv
         flat = np.column_stack([uv, np.zeros(len(uv))])
         cloth = add_mesh(self._scene, "cloth", flat, faces.tolist())
         self._fabric = Fabric(cloth, uv, faces.ravel())
@@ -95,10 +94,12 @@ class ClothScene:
         (frames, V', 3) [m].
         """
         set_view(self._scene, camera)
-        self._camera, self.substrate = camera, substrate
+        self._camera = camera
+        self.substrate = substrate
         self._fabric.set_look(**_shader(look))
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
-        a, e = np.radians(light.azimuth), np.radians(light.elevation)
+        a = np.radians(light.azimuth)
+        e = np.radians(light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         self._lamp.aim(
             0.5 * (track.min(axis=(0, 1)) + track.max(axis=(0, 1))), outward, _LAMP_DISTANCE
@@ -114,8 +115,9 @@ class ClothScene:
     def shading(
         self, points: Points, sampling: ClothSampling, seed: int
     ) -> npt.NDArray[np.float16]:
-        """Render one instant for all textures: linear light at three albedos, shape (FINE height,
-        FINE width, 3).
+        """Render an instant for all textures: linear light at three albedos.
+
+        The shape is (FINE height, FINE width, 3).
 
         Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not
         flicker.
@@ -142,8 +144,9 @@ class ClothScene:
         window: Window | None = None,
         fine: int = 1,
     ) -> npt.NDArray[np.float16]:
-        """Render an instant, or a window of it, with a texture on the cloth: linear light (fine h,
-        fine w, 3).
+        """Render an instant, or a window of it, with a texture on the cloth.
+
+        The result is linear light (fine h, fine w, 3).
         """
         self._fabric.set_picture(image)
         self._place(points)
@@ -161,8 +164,9 @@ class ClothScene:
 
 
 def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
-    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels: smooth
-    at its ends.
+    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels.
+
+    It is smooth at its ends.
     """
     inside = low + (np.arange(FINE * (high - low)) + 0.5) / FINE
     ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside

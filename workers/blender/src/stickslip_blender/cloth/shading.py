@@ -4,7 +4,9 @@ The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and f
 red, green and blue are three samples of the light that a pixel sends to the camera, as a function
 of the cloth's albedo there, a, and elsewhere, m:
 
-    L(a, m) = S + (D + I m) a        S: gloss, also of light from other cloth; D: light scattered once; I: twice
+    L(a, m) = S + (D + I m) a
+
+with the gloss S, also of light from other cloth, D the light scattered once, and I twice.
 
 A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is L(A(p), m) with
 the mean albedo m of the cloth in sight, in linear light, for each of the texture's colours. The
@@ -41,7 +43,8 @@ from stickslip_blender.raster import (
     window_about,
 )
 
-SHOWN, ELSEWHERE = (0.0, 0.6, 0.6), (0.3, 0.3, 0.05)
+SHOWN = (0.0, 0.6, 0.6)
+ELSEWHERE = (0.3, 0.3, 0.05)
 """The cloth's base colours in a shading, where the camera sees it and where other rays meet it."""
 
 FINE = 2  # pixels of a shading across one of a picture, and down
@@ -76,19 +79,22 @@ class Composer:
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
     ) -> tuple[float, float]:
-        """Compose one frame's shading (FINE height, FINE width, 3) with all textures, into
-        `pictures`.
+        """Compose a frame's shading with all textures, into `pictures`.
+
+        The shading is (FINE height, FINE width, 3).
 
         Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor`
         returns it; pictures: those of the frame before, or zeros, 8-bit sRGB, shape (textures,
         height, width, 3). Returns the share of the frame that is cloth, and of the cloth that
         nothing hides, its area taken as it is turned to the camera.
         """
-        window, parts = self._window(points, camera).times(FINE), scaled(camera, FINE)
+        window = self._window(points, camera).times(FINE)
+        parts = scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
-        reflected, around = np.empty((0, 0, colors), dtype=np.float32), Window(0, 0, 0, 0)
+        reflected = np.empty((0, 0, colors), dtype=np.float32)
+        around = Window(0, 0, 0, 0)
         if substrate.mirrors and self._geometry.surroundings.floor is not None:
             reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
         _raster.compose(
@@ -110,10 +116,12 @@ class Composer:
     def floor_factor(
         self, points: npt.NDArray[np.float64], camera: Camera, floor: Floats, fine: int = 1
     ) -> Floats:
-        """Return the factor (fine height, fine width, 3) of marks and colours for a frame that is
-        rendered directly.
+        """Return the factor (fine height, fine width, 3) of marks and colours of a frame.
+
+        It is for frames that are rendered directly.
         """
-        window, parts = self._window(points, camera).times(fine), scaled(camera, fine)
+        window = self._window(points, camera).times(fine)
+        parts = scaled(camera, fine)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
@@ -123,8 +131,9 @@ class Composer:
         return np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
 
     def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
-        """Return the factor (height, width, 3) of all that is not the cloth: the floor's, or of the
-        prop before it.
+        """Return the factor (height, width, 3) of all but the cloth.
+
+        It is that of the floor, or of the prop before it.
         """
         geometry = self._geometry
         if not geometry.surroundings.props:
@@ -144,7 +153,8 @@ class Composer:
             (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
         ) / len(samples)
         for sheet in geometry.printed:  # see_albedo looks at the first triangles
-            count, first = sheet.triangles.stop - sheet.triangles.start, sheet.triangles.start
+            count = sheet.triangles.stop - sheet.triangles.start
+            first = sheet.triangles.start
             turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(
                 np.int32
             )
@@ -168,10 +178,9 @@ class Composer:
         substrate: Substrate,
         textures: Textures,
     ) -> tuple[Floats, Window]:
-        """Return the albedo that the floor shows of the cloth where it mirrors it, (height, width,
-        3 textures).
-        """
-        cloth, floor = self._geometry.cloth_triangles, self._geometry.surroundings.floor
+        """Return the albedo of the cloth that the floor mirrors, (height, width, 3 textures)."""
+        cloth = self._geometry.cloth_triangles
+        floor = self._geometry.surroundings.floor
         assert floor is not None
         below = projected(camera, mirrored(points, floor))
         window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
@@ -206,8 +215,9 @@ class Composer:
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
-    """Return how far behind the floor a mirrored thing appears, over its depth, (height, width); 0
-    where none is.
+    """Return how far behind the floor a mirrored thing appears, over its depth.
+
+    The shape is (height, width); 0 if nothing is mirrored.
     """
     depth = seen.at_centers(seen.points[:, 2:])[..., 0]
     window = seen.window

@@ -1,5 +1,6 @@
-"""What a scene shows besides one sheet: further sheets, bodies and holders, from its document and a
-record.
+"""The scene besides a sheet: further sheets, bodies and holders.
+
+They come from its document and a record.
 
 Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of
 its names.
@@ -84,7 +85,9 @@ class Stage:
             picture: Returns a texture by name.
         """
         codes = {name: code for code, name in enumerate(segments)}
-        self._record, self._sheet, self.segment = record, sheet, codes[sheet]
+        self._record = record
+        self._sheet = sheet
+        self.segment = codes[sheet]
         self.floor: float | None = None
         self.ground = BACKGROUND
         self._placers: list[Callable[[int], Array]] = []
@@ -98,7 +101,8 @@ class Stage:
                 )
         for number, (name, body) in enumerate(scene["bodies"].items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
-                self.floor, self.ground = body["origin"][2] + FLOOR, codes[name]
+                self.floor = body["origin"][2] + FLOOR
+                self.ground = codes[name]
                 continue
             look = scene["looks"]["bodies"].get(name) or {
                 "color": _USUAL_COLOR,
@@ -132,10 +136,12 @@ class Stage:
         return np.concatenate(parts)
 
     def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
-        """Return the camera that frames all that moves, turned about it until enough of the sheet
-        is in sight.
+        """Return the camera that frames all that moves.
+
+        It is turned until enough of the sheet is visible.
         """
-        points, track = self.moving(), self._record[f"{self._sheet}.positions"]
+        points = self.moving()
+        track = self._record[f"{self._sheet}.positions"]
         instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
         shown = [
@@ -180,14 +186,10 @@ class Stage:
     ) -> Prop:
         color = np.asarray(look["color"], dtype=np.float64).reshape(1, 3)
         if body["type"] == "mesh":
-            triangles, moved = (
-                self._record[f"{name}.triangles"],
-                self._record.get(f"{name}.vertices"),
-            )
-            vertices, faces = (
-                _sunk(self._record[f"{name}.rest"], triangles),
-                list(map(tuple, triangles.tolist())),
-            )
+            triangles = self._record[f"{name}.triangles"]
+            moved = self._record.get(f"{name}.vertices")
+            vertices = _sunk(self._record[f"{name}.rest"], triangles)
+            faces = list(map(tuple, triangles.tolist()))
             posed = self._posed("body_pose", number, vertices)
             self._placers.append(
                 posed if moved is None else lambda instant: _sunk(moved[instant], triangles)

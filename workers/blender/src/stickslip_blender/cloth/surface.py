@@ -138,10 +138,12 @@ _PROFILE = np.array(
 
 
 def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
-    """Return the surface of a mesh, see `Surface`: the last ones are kept, for making one takes a
-    second.
+    """Return the surface of a mesh, see `Surface`.
+
+    The last surfaces are cached, since making a surface takes a second.
     """
-    faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
+    faces = np.asarray(triangles, dtype=np.int32)
+    flat = np.asarray(rest, dtype=np.float64)
     return copy(_made(faces.tobytes(), flat.tobytes()))
 
 
@@ -159,8 +161,10 @@ class Surface:
 
     def __init__(self, triangles: npt.ArrayLike, rest: npt.ArrayLike) -> None:
         """Prepare a mesh of triangles (T, 3) with the rest shape (V, 2) [m]."""
-        faces, flat = np.asarray(triangles, dtype=np.int32), np.asarray(rest, dtype=np.float64)
-        low, high = flat.min(axis=0), flat.max(axis=0)
+        faces = np.asarray(triangles, dtype=np.int32)
+        flat = np.asarray(rest, dtype=np.float64)
+        low = flat.min(axis=0)
+        high = flat.max(axis=0)
         width, height = (high - low).tolist()
         self.size = width, height
         ab, ac = (flat[faces[:, k]] - flat[faces[:, 0]] for k in (1, 2))
@@ -169,7 +173,8 @@ class Surface:
         self._levels: list[Subdivision] = []
         while len(flat) < FINE_VERTICES:
             self._levels.append(subdivide(faces, flat))
-            faces, flat = self._levels[-1].triangles, self._levels[-1](flat)
+            faces = self._levels[-1].triangles
+            flat = self._levels[-1](flat)
         self._sheet = faces
         self._count = len(flat)
         rim = _rim(faces)
@@ -186,7 +191,7 @@ class Surface:
         self.dress(hem=0.0)
 
     def dress(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
-        """Set half the thickness of the hem [m], and the strength (0 to 1) and seed of the creases."""
+        """Set half the hem's thickness [m], and the strength (0 to 1) and seed of the creases."""
         self._hem = hem * self._profile
         self._height = (
             creases * CREASE * _creases(self.uv[: self._count], seed) if creases > 0.0 else None
@@ -217,14 +222,17 @@ def _made(triangles: bytes, rest: bytes) -> Surface:
 
 
 def _creases(uv: Array, seed: int) -> Array:
-    """Return the height of creases in [-1, 1] at (n, 2): straight ridges and furrows that fade
-    along their length.
+    """Return the height of creases in [-1, 1] at (n, 2).
+
+    They are straight ridges and furrows that fade along their length.
     """
     random = np.random.Generator(np.random.PCG64([seed, 2]))
     height = np.zeros(len(uv))
     for _ in range(_CREASES):
-        middle, angle = random.random(2), random.uniform(0.0, np.pi)
-        width, length = random.uniform(0.015, 0.03), random.uniform(0.1, 0.4)
+        middle = random.random(2)
+        angle = random.uniform(0.0, np.pi)
+        width = random.uniform(0.015, 0.03)
+        length = random.uniform(0.1, 0.4)
         along = (uv - middle) @ [np.cos(angle), np.sin(angle)]
         across = (uv - middle) @ [-np.sin(angle), np.cos(angle)]
         ridge = np.exp(-((across / width) ** 2) - (along / length) ** 2)
@@ -249,8 +257,9 @@ def _rim(faces: Indices) -> npt.NDArray[np.int64]:
 
 
 def _inward(rim: Array) -> Array:
-    """Return the way into the sheet at each vertex of its edge (n, 2), as long as moves both sides
-    there by 1.
+    """Return the direction into the sheet at each vertex of its edge (n, 2).
+
+    It is as long as moves both sides there by 1.
     """
 
     def unit(v: Array) -> Array:
@@ -259,25 +268,30 @@ def _inward(rim: Array) -> Array:
     def left(v: Array) -> Array:
         return np.stack([-v[:, 1], v[:, 0]], axis=1)
 
-    before, after = unit(rim - np.roll(rim, 1, axis=0)), unit(np.roll(rim, -1, axis=0) - rim)
+    before = unit(rim - np.roll(rim, 1, axis=0))
+    after = unit(np.roll(rim, -1, axis=0) - rim)
     mean = unit(left(before) + left(after))
     return np.asarray(mean / (mean * left(after)).sum(axis=1, keepdims=True))
 
 
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
-    """Return the corners (n, 3) and barycentric weights (n, 3) of flat points: of the triangle they
-    are most inside.
+    """Return the corners (n, 3) and barycentric weights (n, 3) of flat points.
+
+    They are those of the triangle that the point is most inside of.
     """
     a, b, c = (flat[faces[:, k]] for k in range(3))
     inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
-    middle, reach = (a + b + c) / 3.0, 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()
-    corners, weights = np.empty((len(points), 3), dtype=np.int32), np.empty((len(points), 3))
+    middle = (a + b + c) / 3.0
+    reach = 2.0 * np.abs(np.concatenate([b - a, c - a, c - b])).max()
+    corners = np.empty((len(points), 3), dtype=np.int32)
+    weights = np.empty((len(points), 3))
     for number, point in enumerate(points):
         near = np.flatnonzero((np.abs(middle - point) < reach).all(axis=1))
         bc = np.einsum("tij,tj->ti", inverse[near], point - a[near])
         all_three = np.column_stack([1.0 - bc.sum(axis=1), bc])
         best = int(all_three.min(axis=1).argmax())
-        corners[number], weights[number] = faces[near[best]], all_three[best]
+        corners[number] = faces[near[best]]
+        weights[number] = all_three[best]
     return corners, weights
 
 
@@ -287,7 +301,8 @@ def _ring_faces(around: int, first: int) -> npt.NDArray[Any]:
     following = np.roll(here, -1)
     faces = []
     for ring in range(len(_PROFILE) - 1):
-        outer, inner = first + ring * around, first + (ring + 1) * around
+        outer = first + ring * around
+        inner = first + (ring + 1) * around
         faces += [np.stack([outer + here, inner + here, outer + following], axis=1)]
         faces += [np.stack([outer + following, inner + here, inner + following], axis=1)]
     return np.concatenate(faces).astype(np.int32)

@@ -65,7 +65,8 @@ def _phase(x: Field, count: float) -> Field:
 
 def _dots(u: Field, v: Field) -> Field:
     odd = np.mod(np.floor(v * 8), 2) == 1
-    x, y = _phase(u + np.where(odd, 1 / 16, 0.0), 8) - 0.5, _phase(v, 8) - 0.5
+    x = _phase(u + np.where(odd, 1 / 16, 0.0), 8) - 0.5
+    y = _phase(v, 8) - 0.5
     return _mix(np.hypot(x, y) < 0.3, (240, 234, 220), (38, 62, 122))
 
 
@@ -92,7 +93,8 @@ def _herringbone(u: Field, v: Field) -> Field:
 
 def _houndstooth(u: Field, v: Field) -> Field:
     """Weave four dark and four light threads, over two and under two."""
-    warp, weft = np.floor(u * 48), np.floor(v * 48)
+    warp = np.floor(u * 48)
+    weft = np.floor(v * 48)
     warp_on_top = np.mod(warp + weft, 4) < 2
     return _mix(
         np.where(warp_on_top, np.mod(warp, 8) < 4, np.mod(weft, 8) < 4),
@@ -114,8 +116,10 @@ def _floral(u: Field, v: Field) -> Field:
         row, column = divmod(place, rows)
         x = (column + 0.5 * (row % 2) + 0.5 + random.uniform(-0.1, 0.1)) / rows
         y = (row + 0.5 + random.uniform(-0.1, 0.1)) / rows
-        du, dv = np.mod(u - x + 0.5, 1.0) - 0.5, np.mod(v - y + 0.5, 1.0) - 0.5
-        radius, angle = np.hypot(du, dv), np.arctan2(dv, du) + random.uniform(0.0, 2.0 * np.pi)
+        du = np.mod(u - x + 0.5, 1.0) - 0.5
+        dv = np.mod(v - y + 0.5, 1.0) - 0.5
+        radius = np.hypot(du, dv)
+        angle = np.arctan2(dv, du) + random.uniform(0.0, 2.0 * np.pi)
         size = random.uniform(0.068, 0.088)
         leaf = size * 1.45 * np.maximum(np.cos(1.5 * angle), 0.0) ** 3
         petal = size * (0.62 + 0.38 * np.abs(np.cos(2.5 * angle)))
@@ -127,11 +131,13 @@ def _floral(u: Field, v: Field) -> Field:
 
 def _argyle(u: Field, v: Field) -> Field:
     """Draw diamonds of two colours, and fine lines across them."""
-    x, y = np.abs(_phase(u, 4) - 0.5), np.abs(_phase(v, 3) - 0.5)
+    x = np.abs(_phase(u, 4) - 0.5)
+    y = np.abs(_phase(v, 3) - 0.5)
     column = np.mod(np.floor(u * 4), 2) == 1
     diamond = _mix(column, (152, 60, 70), (40, 70, 80))
     picture = _mix(x + y < 0.5, diamond, (222, 214, 196))
-    rising, falling = np.abs(_phase(u * 4 - v * 3, 1) - 0.5), np.abs(_phase(u * 4 + v * 3, 1) - 0.5)
+    rising = np.abs(_phase(u * 4 - v * 3, 1) - 0.5)
+    falling = np.abs(_phase(u * 4 + v * 3, 1) - 0.5)
     return _mix(np.minimum(falling, rising) < 0.03, (250, 248, 240), picture)
 
 
@@ -163,14 +169,14 @@ def _terrazzo(u: Field, v: Field) -> Field:
         (150, 160, 130),
     )
     for number in range(90):
-        x, y, turn, size = (
-            random.random(),
-            random.random(),
-            random.uniform(0.0, np.pi),
-            random.uniform(0.02, 0.05),
-        )
-        du, dv = np.mod(u - x + 0.5, 1.0) - 0.5, np.mod(v - y + 0.5, 1.0) - 0.5
-        along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
+        x = random.random()
+        y = random.random()
+        turn = random.uniform(0.0, np.pi)
+        size = random.uniform(0.02, 0.05)
+        du = np.mod(u - x + 0.5, 1.0) - 0.5
+        dv = np.mod(v - y + 0.5, 1.0) - 0.5
+        along = du * np.cos(turn) + dv * np.sin(turn)
+        across = dv * np.cos(turn) - du * np.sin(turn)
         chip = np.abs(along) + 1.8 * np.abs(across + 0.3 * along) < size
         picture = _mix(chip, chips[number % len(chips)], picture)
     return picture

@@ -1,5 +1,4 @@
-"""Blender: its import, the device that Cycles computes on, and settings of the engine that all
-scenes share.
+"""Blender: its import, the device of Cycles, and settings that all scenes share.
 
 The environment variable STICKSLIP_RENDER_DEVICE names the device; the default is the CPU. Noise
 differs between the CPU and a GPU, and it may differ between GPUs and drivers. The device is
@@ -56,8 +55,9 @@ def import_bpy() -> Any:
 
 @contextmanager
 def _one_processor() -> Iterator[None]:
-    """Show one processor to Blender's task scheduler while it starts, so that it makes no worker
-    threads.
+    """Show one processor to Blender's task scheduler while it starts.
+
+    So it makes no worker threads.
 
     Each process renders with one thread. Idle TBB workers spin: each used half a core while nothing
     was rendered.
@@ -95,8 +95,9 @@ def use_device(scene: Any) -> None:
 
 
 def described() -> dict[str, Any]:
-    """Return what the pixels depend on: the device and, for GPUs, their names and the driver's
-    major version.
+    """Return what the pixels depend on: the device and, for GPUs, names and driver.
+
+    Only the driver's major version counts.
     """
     if device() == CPU:
         return {"device": CPU}
@@ -123,7 +124,8 @@ def _find_devices() -> list[Any]:
     found = [each for each in preferences.devices if each.type == sort]
     if not found:
         raise NoDeviceError(
-            f"{VARIABLE} is {device()!r}, and Cycles finds no such device here: install its driver, or unset {VARIABLE}"
+            f"{VARIABLE} is {device()!r}, and Cycles finds no such device here: install its "
+            f"driver, or unset {VARIABLE}"
         )
     return found
 
@@ -174,9 +176,7 @@ class ClothSampling:
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     def over(self, area: float) -> ClothSampling:
-        """Where the window has a smaller area than usual [px^2], trace more paths for the same
-        cost.
-        """
+        """Trace more paths for the same cost if the window has a smaller area [px^2]."""
         return replace(
             self,
             window=round(self.window * min(max(_USUAL_AREA / max(area, 1.0), 1.0), _MORE_PATHS)),
@@ -222,7 +222,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
             bpy.app.tempdir
         ).rmdir()  # never used, empty, and left behind by a process that is killed
     scene = bpy.context.scene
-    render, cycles = scene.render, scene.cycles
+    render = scene.render
+    cycles = scene.cycles
     render.engine = "CYCLES"
     render.threads_mode = "FIXED"
     render.threads = 1
@@ -255,10 +256,12 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
 
 
 def set_sampling(scene: Any, sampling: Sampling) -> None:
+    """Set the samples of the scene's pixels."""
     cycles = scene.cycles
     cycles.samples = sampling.skipped + sampling.samples
     cycles.use_sample_subset = sampling.skipped > 0
-    cycles.sample_offset, cycles.sample_subset_length = sampling.skipped, sampling.samples
+    cycles.sample_offset = sampling.skipped
+    cycles.sample_subset_length = sampling.samples
     cycles.seed = sampling.seed
     cycles.use_denoising = sampling.denoiser != "none"
     if sampling.denoiser != "none":

@@ -1,4 +1,4 @@
-"""Objects of a Blender scene: meshes, materials, the lamp, the camera, and light from all around."""
+"""Objects of a Blender scene: meshes, materials, the lamp, the camera, and ambient light."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,8 +29,9 @@ Array = npt.NDArray[np.float64]
 
 
 def add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]]) -> Any:
-    """Add a mesh of vertices (n, 3) and polygons, smooth but for edges above `SHARP`, and return
-    its data.
+    """Add a mesh of vertices (n, 3) and polygons, and return its data.
+
+    It is smooth but for edges above `SHARP`.
     """
     bpy = import_bpy()
     mesh = bpy.data.meshes.new(name)
@@ -50,8 +51,9 @@ def move_mesh(mesh: Any, points: npt.ArrayLike) -> None:
 
 
 def add_material(mesh: Any, name: str, **inputs: Any) -> Any:
-    """Give a mesh a material of the Principled shader with inputs, as for `set_inputs`, and return
-    the shader.
+    """Give a mesh a material of the Principled shader, and return the shader.
+
+    Its inputs are as for `set_inputs`.
     """
     material = import_bpy().data.materials.new(name)
     shader = material.node_tree.nodes["Principled BSDF"]
@@ -98,11 +100,13 @@ class Lamp:
 
     def set_source(self, watts: float, diameter: float) -> None:
         """Set the power [W] and the diameter [scene units]."""
-        self._lamp.data.energy, self._lamp.data.size = watts, diameter
+        self._lamp.data.energy = watts
+        self._lamp.data.size = diameter
 
     def aim(self, at: Array, outward: Array, distance: float) -> None:
-        """Place the lamp at a distance from a point, in the direction `outward`, and turn it to the
-        point.
+        """Place the lamp at a distance from a point, and turn it to the point.
+
+        `outward` is its direction from the point.
         """
         from mathutils import Vector
 
@@ -111,13 +115,15 @@ class Lamp:
 
 
 class Fabric:
-    """The material of a cloth, with one colour or a picture: the Principled shader, mixed with
-    translucency.
+    """The material of a cloth, with a colour or a picture.
+
+    It is the Principled shader, mixed with translucency.
     """
 
     def __init__(self, mesh: Any, uv: Array, corners: npt.NDArray[np.int32]) -> None:
-        """Give a mesh texture coordinates (V, 2), by its corners in the order of its faces, and the
-        material.
+        """Give a mesh texture coordinates (V, 2) and the material.
+
+        Coordinates are by its corners, in the order of its faces.
         """
         mesh.uv_layers.new(name="rest").uv.foreach_set(
             "vector", uv[corners].astype(np.float32).ravel()
@@ -150,18 +156,18 @@ class Fabric:
         set_inputs(self._both, Fac=translucency)
 
     def set_color(self, color: Sequence[float], other: Sequence[float] | None = None) -> None:
-        """Give the cloth one linear colour, or another one for all rays that do not come from the
-        camera.
+        """Give the cloth a linear colour.
+
+        Rays that do not come from the camera may have another one.
         """
-        self._shown.default_value, self._other.default_value = (
-            (*color, 1.0),
-            (*(other or color), 1.0),
-        )
+        self._shown.default_value = (*color, 1.0)
+        self._other.default_value = (*(other or color), 1.0)
         self._connect(self._even)
 
     def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
         """Print a picture on the cloth, (size, size, 3), 8-bit sRGB, row 0 at its lower edge."""
-        images, old = import_bpy().data.images, self._picture.image
+        images = import_bpy().data.images
+        old = self._picture.image
         image = images.new(
             "print", *picture.shape[:2]
         )  # a new one: Cycles does not read a changed image again
@@ -179,7 +185,7 @@ class Fabric:
 
 
 def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
-    """Return the socket of a colour that is `seen` for rays of the camera and `other` for the rest."""
+    """Return the socket of a colour: `seen` for rays of the camera, `other` for the rest."""
     mix = tree.nodes.new("ShaderNodeMix")
     mix.data_type = "RGBA"
     factor, a, b = (next(i for i in mix.inputs if i.identifier == n) for n in _MIX_INPUTS)
@@ -190,13 +196,14 @@ def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
 
 
 def set_pixels(image: Any, color: npt.NDArray[np.floating[Any]]) -> None:
-    """Set the pixels of an image from colours (height, width, 3), or (height, width, 1) for grey."""
+    """Set the pixels of an image from colours (height, width, 3 or 1 for grey)."""
     rgba = np.ones((*color.shape[:2], 4), dtype=np.float32)
     rgba[..., :3] = color
     image.pixels.foreach_set(rgba.ravel())
 
 
 def add_view(scene: Any) -> Any:
+    """Add a perspective camera to the scene, make it the scene's, and return it."""
     bpy = import_bpy()
     data = bpy.data.cameras.new("view")
     data.type = "PERSP"
@@ -217,8 +224,10 @@ def set_view(scene: Any, camera: Camera) -> None:
     """
     from mathutils import Matrix
 
-    render, view = scene.render, scene.camera
-    render.resolution_x, render.resolution_y = camera.width, camera.height
+    render = scene.render
+    view = scene.camera
+    render.resolution_x = camera.width
+    render.resolution_y = camera.height
     # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the
     # two.
     ratio = camera.fx / camera.fy  # a pixel's height over its width
@@ -237,8 +246,9 @@ HEIGHT = 64  # rows of the panorama: its light is smooth
 
 @dataclass(frozen=True)
 class SoftBox:
-    """A soft light at infinity, without an edge: its radiance falls off from its middle as
-    cos^sharpness of the angle.
+    """A soft light at infinity, without an edge.
+
+    Its radiance falls off from its middle as cos^sharpness of the angle.
 
     Area lights would cost more: Cycles picks one of them at random at each sample, and on a thin
     rod that was 6 dB noisier at equal samples.
@@ -255,8 +265,9 @@ class SoftBox:
 
 
 def panorama(boxes: Sequence[SoftBox], ambient: float) -> npt.NDArray[np.float32]:
-    """Return the radiance of soft boxes and an even ambient light, shape (HEIGHT, 2 HEIGHT), row 0
-    lowest.
+    """Return the radiance of soft boxes and an even ambient light.
+
+    The shape is (HEIGHT, 2 HEIGHT), with row 0 lowest.
 
     Column c of n looks to azimuth 180 - 360 (c + 1/2) / n degrees, as Blender's equirectangular
     mapping does.
@@ -265,7 +276,8 @@ def panorama(boxes: Sequence[SoftBox], ambient: float) -> npt.NDArray[np.float32
     azimuth = np.pi * (1.0 - (np.arange(2 * HEIGHT) + 0.5) / HEIGHT)[None, :]
     light = np.full((HEIGHT, 2 * HEIGHT), ambient)
     for box in boxes:
-        a, e = np.radians(box.azimuth), np.radians(box.elevation)
+        a = np.radians(box.azimuth)
+        e = np.radians(box.elevation)
         cosine = np.cos(elevation) * np.cos(e) * np.cos(azimuth - a) + np.sin(elevation) * np.sin(e)
         light += box.radiance * np.maximum(cosine, 0.0) ** box.sharpness
     return light.astype(np.float32)

@@ -27,8 +27,9 @@ _HALF = 1
 
 
 def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
-    """Return the wanted channels of a frame, linear light, shape (height, width, channels), row 0
-    on top.
+    """Return the wanted channels of a frame, linear light, (height, width, channels).
+
+    Row 0 is on top.
 
     It reads the one kind of OpenEXR file that we have Blender write: scan lines of half floats, not
     compressed. [OpenEXR, File Layout]: a magic number and version; attributes (name, type, size,
@@ -43,7 +44,8 @@ def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
     left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
     if header["compression"] != b"\0" or [name for name, kind in channels if kind != _HALF]:
         raise ValueError("the frame must be of half floats that are not compressed")
-    width, height = right - left + 1, bottom - top + 1
+    width = right - left + 1
+    height = bottom - top + 1
     line = np.dtype([("row", "<i4"), ("size", "<i4"), ("values", "<f2", (len(channels), width))])
     first = int(
         struct.unpack_from("<Q", data, at)[0]
@@ -110,7 +112,8 @@ class FrameReader:
         weakref.finalize(self, os.close, memory)
         self._path = Path(f"/proc/self/fd/{memory}")
         self._scene = scene
-        image, render = scene.render.image_settings, scene.render
+        image = scene.render.image_settings
+        render = scene.render
         image.color_management = "FOLLOW_SCENE"
         image.file_format = "OPEN_EXR"
         image.color_depth = "16"
@@ -118,11 +121,11 @@ class FrameReader:
         render.use_stamp = False
         render.use_file_extension = False
         render.filepath = str(self._path)
-        self._besides, self._path_seconds = FIRST_SECONDS, _PATH_SECONDS
+        self._besides = FIRST_SECONDS
+        self._path_seconds = _PATH_SECONDS
 
     def read_light(self, window: Window | None = None, fine: int = 1) -> npt.NDArray[np.float16]:
-        """Render the scene as it stands, or a window of it: linear light, not clipped, shape
-        (height, width, 3).
+        """Render the scene, or a window of it: linear light (height, width, 3), not clipped.
 
         A window has the very values that it would have in the whole frame. Each pixel is rendered
         as fine x fine ones.
@@ -130,8 +133,9 @@ class FrameReader:
         return read_exr(self._rendered("RGB", window, fine), "RGB")
 
     def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
-        """Render as `read_light` does, before nothing: light times coverage, and coverage, shape
-        (height, width, 4).
+        """Render as `read_light` does, before nothing: (height, width, 4).
+
+        The channels are light times coverage, and coverage.
         """
         return read_exr(self._rendered("RGBA", window), "RGBA")
 
@@ -152,7 +156,8 @@ class FrameReader:
         """End the process if a frame takes far longer than its paths took in the frames before."""
         render = self._scene.render
         here = window or Window(0, 0, render.resolution_x, render.resolution_y)
-        paths, start = fine**2 * max(here.area, 1) * self._scene.cycles.samples, time.monotonic()
+        paths = fine**2 * max(here.area, 1) * self._scene.cycles.samples
+        start = time.monotonic()
         limit = self._besides + _SLOWER * self._path_seconds * paths
         faulthandler.dump_traceback_later(
             limit, exit=True, file=sys.__stderr__ or 2
@@ -171,7 +176,8 @@ class FrameReader:
 def _set_window(render: Any, window: Window | None, fine: int) -> None:
     render.use_border = render.use_crop_to_border = window is not None
     if window is not None:
-        width, height = render.resolution_x, render.resolution_y
+        width = render.resolution_x
+        height = render.resolution_y
         # Blender truncates to whole pixels: half of one keeps rounding out of it. It counts rows
         # from below.
         half = 0.5 / fine
@@ -183,11 +189,13 @@ def _set_window(render: Any, window: Window | None, fine: int) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Send file descriptor 1 nowhere: Blender logs every saved frame there and, as a module, has no
-    switch for it.
+    """Send file descriptor 1 nowhere while Blender saves frames.
+
+    Blender logs every saved frame there and, as a module, has no switch for it.
     """
     sys.stdout.flush()
-    stdout, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    stdout = os.dup(1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 1)
         yield

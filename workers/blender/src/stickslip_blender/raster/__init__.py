@@ -75,26 +75,27 @@ class Seen:
     """
 
     def share_below(self, end: int) -> npt.NDArray[np.float32]:
-        """Return the share of each pixel's samples that see one of the first `end` triangles,
-        (height, width).
-        """
+        """Return the share of samples that see a triangle before `end`, (height, width)."""
         hit = (self.triangle >= 0) & (self.triangle < end)
-        rows, columns = self.triangle.shape[0] // self.grid, self.triangle.shape[1] // self.grid
+        rows = self.triangle.shape[0] // self.grid
+        columns = self.triangle.shape[1] // self.grid
         share: npt.NDArray[np.float32] = hit.reshape(rows, self.grid, columns, self.grid).mean(
             axis=(1, 3), dtype=np.float32
         )
         return share
 
     def looked_up(self, places: Points) -> "Seen":
-        """Return what places (height, width, 2) [px] of the frame see, by the nearest sample, with
-        a grid of 1.
+        """Return what positions (height, width, 2) [px] of the frame see, with a grid of 1.
+
+        The nearest sample answers.
         """
         near = np.rint(places).astype(int) - (self.window.left, self.window.top)
         return replace(self, triangle=self.triangle[near[..., 1], near[..., 0]], places=places)
 
     def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
-        """Interpolate values of vertices (V, k) in perspective at the samples, `fill` where nothing
-        is seen.
+        """Interpolate values of vertices (V, k) in perspective at the samples.
+
+        Samples that see nothing get `fill`.
 
         For a grid of one sample a pixel. Returns shape (height, width, k).
         """
@@ -115,13 +116,15 @@ class Seen:
 
 
 def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
-    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at places (n, 2), in the
-    image.
+    """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at positions (n, 2).
+
+    All are in the image.
     """
     a, b, c = (corners[:, k] for k in range(3))
 
     def area(p: npt.NDArray[Any], q: npt.NDArray[Any], r: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        first, second = q - p, r - p
+        first = q - p
+        second = r - p
         return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
 
     parts = np.stack([area(places, b, c), area(a, places, c), area(a, b, places)], axis=1)
@@ -135,8 +138,9 @@ def projected(camera: Camera, points: npt.ArrayLike) -> Points:
 
 
 def scaled(camera: Camera, factor: float) -> Camera:
-    """Return a camera whose frame has `factor` times as many pixels along each side, rounded to
-    whole ones.
+    """Return a camera whose frame has `factor` times as many pixels along each side.
+
+    The numbers are rounded to whole pixels.
     """
     size = {name: round(factor * getattr(camera, name)) for name in ("width", "height")}
     focal = {name: factor * getattr(camera, name) for name in ("fx", "fy")}
@@ -149,7 +153,8 @@ def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
     places = points[np.isfinite(points[:, 0]), :2]  # the others are behind the camera
     if not len(places):
         return Window(0, 0, 0, 0)
-    low, high = np.floor(places.min(axis=0)) - margin, np.ceil(places.max(axis=0)) + margin + 1
+    low = np.floor(places.min(axis=0)) - margin
+    high = np.ceil(places.max(axis=0)) + margin + 1
     left, top = np.maximum(low, 0).astype(int)
     right, bottom = np.minimum(high, (camera.width, camera.height)).astype(int)
     return Window(int(left), int(top), int(right), int(bottom))

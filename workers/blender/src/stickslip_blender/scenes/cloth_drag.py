@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.render_task import render_clips
-from stickslip_blender.workshop import Workshop
+from stickslip_blender.render_context import RenderContext
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 
 
-def render(look: ClothDragRender, task: RenderTask, workshop: Workshop) -> TaskResult:
-    return render_clips(look, task, workshop, Holders)
+def render(look: ClothDragRender, task: RenderTask, context: RenderContext) -> TaskResult:
+    """Render the clips of a drag."""
+    return render_clips(look, task, context, Holders)

@@ -10,17 +10,19 @@ from stickslip_schemas.spec.cameras import Camera
 from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.render_task import picture, render_clips, rig_camera
 from stickslip_blender.cloth.stage import Stage
-from stickslip_blender.workshop import Workshop
+from stickslip_blender.render_context import RenderContext
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask, TaskResult
     from stickslip_schemas.kinds.cloth_scene import ClothSceneRender
 
 
-def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> TaskResult:
+def render(look: ClothSceneRender, task: RenderTask, context: RenderContext) -> TaskResult:
+    """Render the clips of a scene."""
     sheet = look.scene.textured
-    scene, record = look.scene.model_dump(mode="json"), workshop.record(task.record)
-    stage = Stage(scene, sheet, look.segments, record, lambda name: picture(name, workshop))
+    scene = look.scene.model_dump(mode="json")
+    record = context.record(task.record)
+    stage = Stage(scene, sheet, look.segments, record, lambda name: picture(name, context))
 
     def frame(geometry: Geometry) -> Camera:
         return (
@@ -29,4 +31,4 @@ def render(look: ClothSceneRender, task: RenderTask, workshop: Workshop) -> Task
             else rig_camera(look)
         )
 
-    return render_clips(look, task, workshop, lambda _rest: stage, sheet=f"{sheet}.", frame=frame)
+    return render_clips(look, task, context, lambda _rest: stage, sheet=f"{sheet}.", frame=frame)

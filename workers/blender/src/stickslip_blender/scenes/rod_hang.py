@@ -31,7 +31,7 @@ from stickslip_blender.cycles.objects import (
 )
 from stickslip_blender.cycles.pixels import FrameReader, encode
 from stickslip_blender.raster import fans, projected, see, window_about
-from stickslip_blender.workshop import Workshop, why_unfit
+from stickslip_blender.render_context import RenderContext, why_unfit
 
 if TYPE_CHECKING:
     from stickslip_schemas.documents.tasks import RenderTask
@@ -56,7 +56,8 @@ def transport_frames(tangents: FloatArray) -> FloatArray:
     normal = axis - (axis @ tangents[0]) * tangents[0]
     normals[0] = normal / np.linalg.norm(normal)
     for i in range(1, len(tangents)):
-        before, here = tangents[i - 1], tangents[i]
+        before = tangents[i - 1]
+        here = tangents[i]
         normal = normals[i - 1] - (normals[i - 1] @ here) / (1.0 + before @ here) * (before + here)
         normal -= (normal @ here) * here  # rounding would add up
         normals[i] = normal / np.linalg.norm(normal)
@@ -64,8 +65,9 @@ def transport_frames(tangents: FloatArray) -> FloatArray:
 
 
 def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
-    """Return the vertices of the tube about a centreline (n, 3), shape (n SIDES + CAP_RINGS SIDES +
-    2, 3).
+    """Return the vertices of the tube about a centreline (n, 3).
+
+    The shape is (n SIDES + CAP_RINGS SIDES + 2, 3).
 
     In order: n rings, the rings of the round end, its pole, the middle of the flat end in the
     clamp.
@@ -85,18 +87,22 @@ def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
 
 
 def tube_faces(points: int) -> list[tuple[int, ...]]:
-    """Return the faces of the tube about a centreline of so many points, outward normals, as vertex
-    indices.
+    """Return the faces of the tube about a centreline, as vertex indices.
+
+    Their normals point outward.
     """
     rings = points + CAP_RINGS
-    pole, middle = rings * SIDES, rings * SIDES + 1
+    pole = rings * SIDES
+    middle = rings * SIDES + 1
     faces: list[tuple[int, ...]] = []
     for ring in range(rings - 1):
         for side in range(SIDES):
-            a, b = ring * SIDES + side, ring * SIDES + (side + 1) % SIDES
+            a = ring * SIDES + side
+            b = ring * SIDES + (side + 1) % SIDES
             faces.append((a, b, b + SIDES, a + SIDES))
     for side in range(SIDES):
-        a, b = side, (side + 1) % SIDES
+        a = side
+        b = (side + 1) % SIDES
         faces.append(((rings - 1) * SIDES + a, (rings - 1) * SIDES + b, pole))
         faces.append((b, a, middle))
     return faces
@@ -162,8 +168,9 @@ class RodRenderer:
         radius: float = RADIUS,
         seed: int = 0,
     ) -> npt.NDArray[np.uint8]:
-        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB, shape (cameras, height,
-        width, 3).
+        """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB.
+
+        The shape is (cameras, height, width, 3).
 
         Seed: added to that of the sampling, so that pictures of a dataset differ in their noise.
         """
@@ -197,8 +204,9 @@ class RodRenderer:
     def _before_ground(
         self, light: npt.NDArray[np.float32], coverage: npt.NDArray[np.float32]
     ) -> npt.NDArray[np.float32]:
-        """Put the light of the rod, (h, w, 4) with the share of samples that hit it, before the
-        ground.
+        """Put the light of the rod (h, w, 4) before the ground.
+
+        Its last channel is the share of samples that hit the rod.
 
         Most noise on a thin rod is in how many samples hit it. So the mean light of the hits,
         together with one sample's worth of the pixels around, gets the coverage (h, w) that the
@@ -216,20 +224,22 @@ class RodRenderer:
         return np.asarray(share * mean + (1.0 - share) * np.float32(GROUND), dtype=np.float32)
 
 
-def render(look: RodHangRender, task: RenderTask, workshop: Workshop) -> TaskResult:
+def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> TaskResult:
+    """Render the views of a rod."""
     cameras = load_rig(look.rig)
-    line = workshop.record(task.record)["centerline"]
+    line = context.record(task.record)["centerline"]
     if rejected := why_unfit("rod", line, look.radius, cameras):
         return rejected
     color = silicone_color(look.color_seed)
-    renderer = workshop.renderer(
+    renderer = context.renderer(
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality)
     )
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
     preview = (
-        workshop.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
+        context.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
     )
-    chunks, labels = {"views": workshop.chunk(views)}, {"color": list(to_linear(color))}
+    chunks = {"views": context.chunk(views)}
+    labels = {"color": list(to_linear(color))}
     return TaskResult(
         outcome="succeeded", output=RenderOutput(chunks=chunks, preview=preview, labels=labels)
     )

@@ -1,5 +1,6 @@
-"""Services for the scenes of all kinds: the build, records and pictures in the store, and one
-renderer at a time.
+"""Services for the scenes of all kinds.
+
+They are the build, records and pictures in the store, and a renderer at a time.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ from stickslip_blender.raster._raster import BUILD_HASH
 if TYPE_CHECKING:  # content keys hold whole documents; the modules that define them are in no build
     from stickslip_schemas.spec.jobs import Render
 
-    from stickslip_blender.cloth.clips import Light
+ShadingArray = npt.NDArray[np.float16]
+"""A shading: linear, (frames, FINE height, FINE width, 3), at the albedos of `shading.SHOWN` as
+channels.
+"""
 
 FRAME_MARGIN = 1.0
 """Least distance of a rod or a cloth from the edge of the frame [px]."""
@@ -42,6 +46,7 @@ Array = npt.NDArray[Any]
 
 
 def roots(kind: str) -> tuple[str, ...]:
+    """Return the modules that the build of a kind's renderer begins with."""
     return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
 
 
@@ -62,7 +67,7 @@ def build_digest(kind: str) -> str:
     return content_key("build/render", content)
 
 
-class Workshop:
+class RenderContext:
     """Reads records and publishes pictures.
 
     It keeps the last record and, because Blender holds one scene per process, one renderer: several
@@ -71,7 +76,7 @@ class Workshop:
 
     def __init__(self, store: str) -> None:
         self.store = open_store(store)
-        self.shadings: OrderedDict[str, Light] = OrderedDict()
+        self.shadings: OrderedDict[str, ShadingArray] = OrderedDict()
         """The last shadings of cloth, by key; clips that differ only in their texture share one."""
         self._renderer: tuple[object, Any] | None = None
         self._records: tuple[str, dict[str, Array]] = ("", {})
@@ -89,7 +94,8 @@ class Workshop:
             path.touch()  # the oldest are deleted first
         except OSError:
             return None
-        digest, body = data[:32], data[32:]
+        digest = data[:32]
+        body = data[32:]
         return body if hashlib.sha256(body).digest() == digest else None
 
     def keep_shading(self, key: str, data: bytes) -> None:
@@ -146,15 +152,17 @@ def check_rig(render: Render) -> None:
     """Raise a ValueError if the cameras of a render document are not those of this installation."""
     if render.rig is not None and render.rig_digest != rig_digest(render.rig):
         raise ValueError(
-            f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got {render.rig_digest}"
+            f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got "
+            f"{render.rig_digest}"
         )
 
 
 def why_unfit(
     what: str, points: Array, radius: float, cameras: tuple[Camera, ...]
 ) -> TaskResult | None:
-    """Return the rejection of points (..., 3) that are not finite or leave the frame of a camera,
-    or None.
+    """Return why points (..., 3) are rejected, or None.
+
+    They are not finite, or leave the frame of a camera.
     """
     if not np.isfinite(points).all():
         return rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
@@ -168,4 +176,5 @@ def why_unfit(
 
 
 def rejected(reason: Reason, message: str) -> TaskResult:
+    """Return the result of a sample that is rejected for a physical reason."""
     return TaskResult(outcome="rejected", reason=reason, message=message)
