@@ -20,6 +20,9 @@ from stickslip_services.errors import SettingsError
 R = TypeVar("R")
 
 
+_HOST = re.compile(r"[\w.-]+|\[[\da-fA-F:]+\]", re.ASCII)
+"""A name or an address of a host, without a port; an IPv6 address is in brackets."""
+
 _DATABASE_FORM = "a URL of the form postgresql://USER@HOST/NAME"
 
 
@@ -109,12 +112,14 @@ class Settings(BaseSettings):
     """Largest accepted request body [bytes]."""
 
     @classmethod
-    def chosen(cls, **values: Any) -> Self:
-        """Return settings with these values, those that are not given from the environment; raise
-        SettingsError.
+    def chosen(cls, **values: object) -> Self:
+        """Return settings with these values; raise SettingsError.
+
+        Settings that are not given are those of the environment.
         """
+        given = {name: value for name, value in values.items() if value not in (None, ())}
         try:
-            return cls(**{name: value for name, value in values.items() if value not in (None, ())})
+            return cls(**given)  # type: ignore[arg-type]  # pydantic checks the types
         except ValidationError as error:
             rules = (
                 item["msg"].removeprefix("Value error, ")
@@ -125,14 +130,11 @@ class Settings(BaseSettings):
     @field_validator("allowed_hosts")
     @classmethod
     def _are_names(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
-        if wrong := [
-            host
-            for host in hosts
-            if re.fullmatch(r"[\w.-]+|\[[\da-fA-F:]+\]", host, re.ASCII) is None
-        ]:
-            raise ValueError(
-                f"allowed_hosts must be names or addresses without a port; one is {wrong[0]!r}"
-            )
+        for host in hosts:
+            if _HOST.fullmatch(host) is None:
+                raise ValueError(
+                    f"allowed_hosts must be names or addresses without a port; one is {host!r}"
+                )
         return hosts
 
     @field_validator("store")
@@ -177,9 +179,10 @@ class Settings(BaseSettings):
                 raise ValueError(f"{name} must be a file; {path} is not")
         if not (is_loopback(self.host) or self.tls_certificate or self.behind_proxy):
             raise ValueError(
-                f"host must be a loopback address unless the coordinator speaks TLS or a proxy does it, because keys "
-                f"would be readable on the way; it is {self.host!r}. Give --tls-certificate and --tls-key, or "
-                "--behind-proxy, or use 127.0.0.1 and an SSH tunnel."
+                "host must be a loopback address unless the coordinator speaks TLS or a proxy "
+                f"does it, because keys would be readable on the way; it is {self.host!r}. Give "
+                "--tls-certificate and --tls-key, or --behind-proxy, or use 127.0.0.1 and an SSH "
+                "tunnel."
             )
         return self
 
@@ -235,36 +238,40 @@ class Settings(BaseSettings):
     @property
     def url(self) -> str:
         """URL of the coordinator on this machine."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(
-            self.host, self.host
-        )  # where this machine reaches it
+        # A coordinator that listens on all addresses is reached on loopback.
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        if ":" in host:
+            host = f"[{host}]"
         scheme = "http" if self.tls_certificate is None else "https"
-        return (
-            f"{scheme}://[{host}]:{self.port}" if ":" in host else f"{scheme}://{host}:{self.port}"
-        )
+        return f"{scheme}://{host}:{self.port}"
 
     @property
     def variables(self) -> dict[str, str]:
         """Environment variables that give another process these settings, secrets included."""
-        found = {}
+        variables = {}
         for name in sorted(self.model_fields_set):
             value = getattr(self, name)
-            text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
-            found[f"STICKSLIP_{name.upper()}"] = (
-                json.dumps(value) if isinstance(value, tuple) else text
-            )
-        return found
+            if isinstance(value, SecretStr):
+                text = value.get_secret_value()
+            elif isinstance(value, tuple):
+                text = json.dumps(value)
+            else:
+                text = str(value)
+            variables[f"STICKSLIP_{name.upper()}"] = text
+        return variables
 
 
 def options(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command options for some settings: it gets the settings first, those without an option
-    as by default.
+    """Give a command options for some settings.
+
+    It gets the settings first, with the defaults of those that have no option.
     """
 
     def decorate(command: Callable[..., R]) -> Callable[..., R]:
         @functools.wraps(command)
-        def run(**given: Any) -> R:
-            return command(Settings.chosen(**{name: given.pop(name) for name in names}), **given)
+        def run(**arguments: object) -> R:
+            values = {name: arguments.pop(name) for name in names}
+            return command(Settings.chosen(**values), **arguments)
 
         for name in reversed(names):
             field = Settings.model_fields[name]

@@ -39,7 +39,7 @@ def append(
             actor=current_principal().name,
             action=action,
             subject=subject,
-            details=json.dumps(details),
+            details=json.dumps(details, allow_nan=False),
         )
     )
 

@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 ANSWER_SECONDS = 15.0
 """Time that a receiver has for its answer, from the first attempt to connect to the status [s]."""
 
-MOST_AT_ONCE = 32
+MAX_DELIVERIES = 32
 """Webhooks that are delivered to at the same time."""
 
 WAIT_SECONDS = 1.0
@@ -48,7 +48,7 @@ WAITS = (5.0, 60.0, 300.0, 1800.0, 7200.0, 21600.0)
 GIVE_UP_SECONDS = 5 * 24 * 3600.0
 """A webhook that has failed for this long receives no further messages [s]."""
 
-TOLD = (EventName.job_state, EventName.dataset_published)
+DELIVERED = (EventName.job_state, EventName.dataset_published)
 """Events that are delivered."""
 
 
@@ -91,12 +91,8 @@ def list_webhooks(connection: Connection, now: float) -> Sequence[Row[Any]]:
 def retry_webhook(connection: Connection, webhook_id: str, now: float) -> None:
     """Retry a webhook at once, even if it was given up; raise NotFoundError."""
     values = {"next_at": now, "failures": 0, "failing_since": None}
-    if (
-        connection.execute(
-            update(webhooks).where(webhooks.c.id == webhook_id).values(values)
-        ).rowcount
-        == 0
-    ):
+    row_update = update(webhooks).where(webhooks.c.id == webhook_id).values(values)
+    if connection.execute(row_update).rowcount == 0:
         raise NotFoundError(f"there is no webhook {webhook_id[:100]!r}")
     audit_log.append(connection, "webhook.retry", webhook_id, now)
 
@@ -132,7 +128,7 @@ class WebhookDelivery:
             behind = [seq for seq in due if _next_message(connection, seq) is not None]
         threads = [
             threading.Thread(target=self._deliver, args=(seq,), daemon=True)
-            for seq in behind[:MOST_AT_ONCE]
+            for seq in behind[:MAX_DELIVERIES]
         ]
         for thread in threads:
             thread.start()
@@ -158,8 +154,8 @@ class WebhookDelivery:
                 wait = self._deliver_one(seq)
         finally:
             with self._database.write() as connection:
-                place = update(webhooks).where(webhooks.c.seq == seq)
-                connection.execute(place.values(next_at=self._clock() + (wait or 0.0)))
+                row_update = update(webhooks).where(webhooks.c.seq == seq)
+                connection.execute(row_update.values(next_at=self._clock() + (wait or 0.0)))
 
     def _deliver_one(self, seq: int) -> float | None:
         """Deliver the next message of a webhook.
@@ -171,18 +167,21 @@ class WebhookDelivery:
             message = None if row is None else _next_message(connection, seq)
         if row is None or message is None:
             return 0.0
-        place = update(webhooks).where(webhooks.c.seq == seq)
+        row_update = update(webhooks).where(webhooks.c.seq == seq)
         event, body = message
         try:
             secret = self._sealing.decrypt(row.secret.encode()).decode()
             fault = _send(row.url, secret, f"msg_{row.id}_{event}", body, self._clock())
         except InvalidToken:
-            fault = "its secret is damaged, or was sealed with another secrets key: make the webhook again"
+            fault = (
+                "its secret is damaged, or was sealed with another secrets key: "
+                "make the webhook again"
+            )
         now = self._clock()
         if not fault:
-            told = {"position": event, "failures": 0, "failing_since": None, "fault": ""}
+            delivered = {"position": event, "failures": 0, "failing_since": None, "fault": ""}
             with self._database.write() as connection:
-                connection.execute(place.values(told | {"next_at": now + CLAIM_SECONDS}))
+                connection.execute(row_update.values(delivered | {"next_at": now + CLAIM_SECONDS}))
             return None
         wait = WAITS[min(row.failures, len(WAITS) - 1)]
         logger.warning("webhook %s: %s; it is tried again in %g s", row.id, fault, wait)
@@ -191,7 +190,7 @@ class WebhookDelivery:
             "failing_since": func.coalesce(webhooks.c.failing_since, now),
         }
         with self._database.write() as connection:
-            connection.execute(place.values(failed | {"fault": fault}))
+            connection.execute(row_update.values(failed | {"fault": fault}))
         return wait
 
 
@@ -208,25 +207,27 @@ def _next_message(connection: Connection, seq: int) -> tuple[int, str] | None:
 
     None if it has received all.
     """
-    found = connection.execute(
+    row = connection.execute(
         select(
             events.c.id, events.c.name, events.c.data, events.c.created_at, jobs.c.id, jobs.c.name
         )
         .join(jobs, jobs.c.seq == events.c.job)
         .join(webhooks, webhooks.c.project == jobs.c.project)
-        .where(webhooks.c.seq == seq, events.c.id > webhooks.c.position, events.c.name.in_(TOLD))
+        .where(
+            webhooks.c.seq == seq, events.c.id > webhooks.c.position, events.c.name.in_(DELIVERED)
+        )
         .order_by(events.c.id)
         .limit(1)
     ).one_or_none()
-    if found is None:
+    if row is None:
         return None
-    event, sort, data, created_at, job, name = found
+    event, event_name, data, created_at, job, name = row
     document = {
-        "type": sort,
+        "type": event_name,
         "timestamp": as_datetime(created_at).isoformat(),
         "data": {"job": job, "name": name, **json.loads(data)},
     }
-    return event, json.dumps(document)
+    return event, json.dumps(document, allow_nan=False)
 
 
 def _send(url: str, secret: str, message_id: str, body: str, now: float) -> str:

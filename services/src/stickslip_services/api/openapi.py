@@ -99,13 +99,15 @@ def _tidy(operation: dict[str, Any]) -> None:
             parameter["schema"] |= {} if kind == {"type": "null"} else kind
 
 
-def _objects(node: Any) -> Iterator[dict[str, Any]]:
+def _objects(node: object) -> Iterator[dict[str, Any]]:
+    """Yield all objects of a JSON document."""
     if isinstance(node, dict):
         yield node
-    for value in (
-        node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    ):
-        yield from _objects(value)
+        for value in node.values():
+            yield from _objects(value)
+    elif isinstance(node, list):
+        for value in node:
+            yield from _objects(value)
 
 
 def _require_tags(document: dict[str, Any]) -> None:
@@ -121,8 +123,9 @@ def _require_tags(document: dict[str, Any]) -> None:
 
 
 def _name_by_title(document: dict[str, Any]) -> None:
-    """Rename components to their titles where pydantic derived a name from parameters:
-    `ListAxisMu`.
+    """Rename components whose names pydantic has derived from type parameters to their titles.
+
+    For example `ListAxisMu`.
     """
     components = document["components"]["schemas"]
     for name in list(components):

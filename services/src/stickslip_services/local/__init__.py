@@ -1,3 +1,1 @@
-"""Processes on this machine: `stickslip up`, the workers' program for certificates, locks, sockets
-and logs.
-"""
+"""Processes on this machine: `stickslip up`, the workers' program, locks, sockets and logs."""

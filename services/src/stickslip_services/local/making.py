@@ -1,5 +1,4 @@
-"""What the workers' program makes on this machine: certificates of its build, and single samples of
-scenes.
+"""Certificates and single samples of scenes, made by the workers' program on this machine.
 
 The core is not imported here: the program writes files.
 """
@@ -14,7 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from stickslip_schemas.documents.certificate import Certificate
@@ -26,12 +25,16 @@ from stickslip_schemas.store import Store, open_store
 
 from stickslip_services.errors import CommandError
 
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
 DOCUMENT_NAME = "certificate.json"
 RESULT_NAME = "scene.json"
 TRAJECTORY_NAME = "trajectory.npz"
 
 
-def _asked(arguments: list[str], refusal: str) -> str:
+def _run_workers(arguments: list[str], refusal: str) -> str:
     """Run the workers' program and return what it printed.
 
     Raise CommandError where it made nothing.
@@ -58,11 +61,12 @@ def measure(preset: str, out: Path, *, quick: bool) -> Certificate:
     Raises CommandError where the program failed, or `out` holds another certificate.
     """
     arguments = ["certify", "--preset", preset, "--out", str(out), *(["--quick"] if quick else [])]
-    digest = _asked(arguments, "no certificate was made").strip()
+    digest = _run_workers(arguments, "no certificate was made").strip()
     certificate = read_certificate(out)
     if certificate.digest != digest:
         raise CommandError(
-            f"{out} holds another certificate than the one just made; is somebody else writing there?"
+            f"{out} holds another certificate than the one just made; is somebody else writing "
+            "there?"
         )
     return certificate
 
@@ -102,41 +106,46 @@ def simulate(
     if out.exists():
         raise CommandError(f"out: must not exist, and {out} does")
     build = _workers(["describe"])["builds"][spec.kind]["sim_core"]
-    why = why_uncertified(spec, certificate, build)
-    if why and spec.needs_certificate:
-        raise CommandError(f"{why}; `stickslip certify --preset {spec.certified_preset}` makes one")
-    task = SimulateTask(simulation=spec.simulation(next(iter(spec.grid()))))
-    with _handed_over(task, files) as (given, store):
-        result = TaskResult.model_validate(_workers(["replay", *given]))
+    reason = why_uncertified(spec, certificate, build)
+    if reason and spec.needs_certificate:
+        hint = f"`stickslip certify --preset {spec.certified_preset}` makes one"
+        raise CommandError(f"{reason}; {hint}")
+    first_point = next(iter(spec.grid()))
+    task = SimulateTask(simulation=spec.simulation(first_point))
+    with _written(task, files) as (arguments, store):
+        result = TaskResult.model_validate(_workers(["replay", *arguments]))
         if result.outcome == "failed":
             raise CommandError(f"the scene was not simulated: {result.message}")
+        # A rejected sample has no output.
+        labels: dict[str, Any] = {}
         arrays: dict[str, Any] = {}
         if isinstance(result.output, SimulateOutput):
-            with np.load(
-                io.BytesIO(store.read(result.output.record.digest)), allow_pickle=False
-            ) as record:
-                arrays = {name: values[result.output.record.row] for name, values in record.items()}
-    said = {
+            labels = dict(result.output.labels)
+            record = result.output.record
+            with np.load(io.BytesIO(store.read(record.digest)), allow_pickle=False) as columns:
+                arrays = {name: values[record.row] for name, values in columns.items()}
+    summary = {
         "scene": spec.stage.model_dump(mode="json"),
         "digest": spec.stage.digest,
         "solver": build,
-        "certified": not why,
-        "certificate": None if why or certificate is None else certificate.digest,
-        "why_not_certified": why,
+        "certified": not reason,
+        "certificate": None if reason or certificate is None else certificate.digest,
+        "why_not_certified": reason,
         "valid": result.outcome == "succeeded",
         "reason": result.message,
-        "labels": result.output.labels if isinstance(result.output, SimulateOutput) else {},
+        "labels": labels,
     }
+    # The directory appears when it is complete.
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
-        _write(partial, spec, arrays, said, obj=obj)
+        _write(partial, spec, arrays, summary, obj=obj)
         partial.chmod(0o755)
         partial.rename(out)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    return said
+    return summary
 
 
 def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
@@ -144,15 +153,14 @@ def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
 
     Return names of pictures, or raise CommandError.
     """
-    with _handed_over(scene, files) as (given, _):
-        pictures: list[str] = _workers(["preview", *given, "--out", str(out)])["pictures"]
+    with _written(scene, files) as (arguments, _):
+        answer = _workers(["preview", *arguments, "--out", str(out)])
+    pictures: list[str] = answer["pictures"]
     return pictures
 
 
 @contextmanager
-def _handed_over(
-    document: BaseModel, files: Mapping[str, bytes]
-) -> Iterator[tuple[list[str], Store]]:
+def _written(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tuple[list[str], Store]]:
     """Write a document and the files that it names.
 
     Yield the arguments that name them, and their store.
@@ -161,26 +169,25 @@ def _handed_over(
         store = open_store(temporary)
         for data in (*files.values(), *built_in_files().values()):
             store.publish(data)
-        given = Path(temporary, "document.json")
-        given.write_text(document.model_dump_json(), encoding="utf-8")
-        yield [str(given), "--store", temporary], store
+        path = Path(temporary, "document.json")
+        path.write_text(document.model_dump_json(), encoding="utf-8")
+        yield [str(path), "--store", temporary], store
 
 
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
-    """Return why no certificate vouches for the samples of a spec with a build of the solver, or an
-    empty text.
+    """Return why no certificate vouches for the samples of a spec, or an empty text.
+
+    `build` is that of the solver.
     """
     preset = spec.certified_preset
     if certificate is None:
         return f"there is no certificate of preset {preset}"
     if certificate.preset != preset:
         return f"the certificate is of preset {certificate.preset}, and the scene has {preset}"
+    if not certificate.passed:
+        return "the preset did not pass its protocols"
     if not certificate.certifies:
-        return (
-            "the certificate is a quick one"
-            if certificate.passed
-            else "the preset did not pass its protocols"
-        )
+        return "the certificate is a quick one"
     if certificate.sim_core != build:
         return "the certificate is of another build of the solver"
     measured = {report.protocol for report in certificate.protocols}
@@ -190,27 +197,34 @@ def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build
 
 def _workers(arguments: list[str]) -> dict[str, Any]:
     """Run the workers' program and return its answer, which is JSON."""
-    answer: dict[str, Any] = json.loads(_asked(arguments, "nothing was made of the scene"))
+    answer: dict[str, Any] = json.loads(_run_workers(arguments, "nothing was made of the scene"))
     return answer
 
 
 def _write(
-    out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], said: dict[str, Any], *, obj: bool
+    out: Path, spec: ClothSceneSpec, arrays: dict[str, Any], summary: dict[str, Any], *, obj: bool
 ) -> None:
+    """Write the summary, the arrays and, with `obj`, a folder of OBJ files for each sheet."""
     import numpy as np
 
     # pydantic writes null for numbers that are not finite, as JSON asks.
-    result = TypeAdapter(dict[str, Any]).dump_json(said, indent=2)
-    (out / RESULT_NAME).write_bytes(result + b"\n")
+    document = TypeAdapter(dict[str, Any]).dump_json(summary, indent=2)
+    (out / RESULT_NAME).write_bytes(document + b"\n")
     if not arrays:
         return
     times = np.arange(spec.instants) / spec.instants_per_second
     np.savez_compressed(out / TRAJECTORY_NAME, times=times, **arrays)
-    for sheet in spec.stage.sheets if obj else ():
-        (out / sheet).mkdir()
-        faces = "".join(
-            f"f {a} {b} {c}\n" for a, b, c in (arrays[f"{sheet}.triangles"] + 1).tolist()
-        )
-        for frame, vertices in enumerate(arrays[f"{sheet}.positions"].tolist()):
-            moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
-            (out / sheet / f"{frame:04d}.obj").write_text(moved + faces, encoding="ascii")
+    if obj:
+        for sheet in spec.stage.sheets:
+            _write_obj(out / sheet, arrays[f"{sheet}.triangles"], arrays[f"{sheet}.positions"])
+
+
+def _write_obj(
+    folder: Path, triangles: "npt.NDArray[np.int64]", positions: "npt.NDArray[np.float64]"
+) -> None:
+    """Write an OBJ file for each instant of a sheet. OBJ counts vertices from 1."""
+    folder.mkdir()
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in (triangles + 1).tolist())
+    for frame, vertices in enumerate(positions.tolist()):
+        moved = "".join(f"v {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in vertices)
+        (folder / f"{frame:04d}.obj").write_text(moved + faces, encoding="ascii")

@@ -198,8 +198,9 @@ async def post_texture(request: Request) -> responses.TextureEntry:
     openapi_extra=_FILE_BODY,
 )
 async def post_file(request: Request) -> responses.FileUpload:
-    """Upload a file that a scene names: a mesh (OBJ, NPZ), a start (OBJ, NPZ) or a path (CSV, NPZ),
-    of at most 16 MiB.
+    """Upload a file that a scene names, of at most 16 MiB: a mesh, a start or a path.
+
+    Meshes are OBJ, PLY, STL or NPZ files, starts OBJ, PLY or NPZ files, paths CSV or NPZ files.
 
     A file that no job names is deleted by `stickslip gc` after a day.
     """
