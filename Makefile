@@ -114,6 +114,7 @@ check: setup-dev
 	$(PY) -m codespell_lib
 	$(PY) tools/prose.py
 	PYTHONPATH=workers/blender/src .venv/bin/lint-imports --no-logo
+	$(PY) tools/include_circles.py
 	@for distribution in $(DISTRIBUTIONS); do (cd $$distribution && $(CURDIR)/$(PY) -m deptry --no-ansi .) || exit 1; done
 	@$(MAKE) --no-print-directory size density
 	$(PY) tools/names.py

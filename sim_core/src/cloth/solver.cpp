@@ -218,7 +218,7 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
   std::vector<const Pair*> some;
   if (impl_->newton.pairs) {
     for (const Pair& pair : impl_->newton.pairs->list()) {
-      if (!pair.at.force.isZero(0.0)) some.push_back(&pair);
+      if (!pair.contact.force.isZero(0.0)) some.push_back(&pair);
     }
   }
   const auto count = static_cast<Eigen::Index>(some.size());
@@ -228,8 +228,8 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
   for (Eigen::Index p = 0; p < count; ++p) {
     for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->who.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
-    out.forces.row(p) = some[p]->at.force.transpose();
-    out.distance[p] = some[p]->at.gap + some[p]->thickness;
+    out.forces.row(p) = some[p]->contact.force.transpose();
+    out.distance[p] = some[p]->contact.gap + some[p]->thickness;
     out.sliding[p] = some[p]->row.mode == contact_slip;
     const Bone* bone = impl_->newton.pairs->bone_of(some[p]->who);
     out.body[p] = bone ? bone->body : -1;

@@ -193,7 +193,7 @@ void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& ou
         if (pair.who.node[c] < numbering.nodes - numbering.bones)
           way += pair.weights[c] * way_of(pair.who.node[c]);
       }
-      add(way.dot(pair.at.force));
+      add(way.dot(pair.contact.force));
     }
   }
   const double energy = kinetic + assembly_.membrane_energy + assembly_.bending_energy;

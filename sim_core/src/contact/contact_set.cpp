@@ -21,12 +21,12 @@ using Eigen::Vector4d;
 void turn(Pair& pair, const Buffer<double>& x) {
   pair.sliding.setZero();
   pair.turning.setZero();
-  if (!pair.active() || pair.at.force.isZero(0.0)) return;
+  if (!pair.active() || pair.contact.force.isZero(0.0)) return;
   const FourPoints at = points_of(pair.who, x);
   const int count =
       (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
-  const double distance = pair.at.gap + pair.thickness;
-  const Vector3d n = pair.at.normal, rho = distance * n;
+  const double distance = pair.contact.gap + pair.thickness;
+  const Vector3d n = pair.contact.normal, rho = distance * n;
   Eigen::Matrix<double, 3, 2> a;
   a << between_closest(pair.along_first, at), between_closest(pair.along_second, at);
   Eigen::Matrix<double, 2, 9> asked = Eigen::Matrix<double, 2, 9>::Zero();
@@ -51,13 +51,13 @@ PairPast::PairPast(const Pair& pair)
     : who(pair.who),
       feature(pair.feature),
       mode(pair.row.mode),
-      force(pair.at.force),
+      force(pair.contact.force),
       change(pair.change),
-      normal(pair.at.normal),
+      normal(pair.contact.normal),
       middle(pair.middle),
       scale(pair.scale),
       penalty_scale(pair.penalty_scale),
-      missed(violation(pair.at, pair.row.mode)) {}
+      missed(violation(pair.contact, pair.row.mode)) {}
 
 PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
   PairMotions out = given;
@@ -75,8 +75,8 @@ Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
   Eigen::Matrix<double, 9, 9> out;
   out.topRows<3>() = -turning;
   out.topLeftCorner<3, 3>() += row.stiffness;
-  out.middleRows<3>(3) = -at.force * sliding.row(0);
-  out.bottomRows<3>() = -at.force * sliding.row(1);
+  out.middleRows<3>(3) = -contact.force * sliding.row(0);
+  out.bottomRows<3>() = -contact.force * sliding.row(1);
   return out;
 }
 
@@ -93,8 +93,12 @@ Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
   return row.force - row.stiffness * way.head<3>() + turning * way;
 }
 
-double violation(const PairKinematics& at, int mode) {
-  return std::hypot(at.gap, mode == contact_stick ? at.slip.norm() : 0.0);
+LawResponse Pair::law() const {
+  return smoothing_energy > 0.0 ? smoothed_law(contact, smoothing_energy) : coulomb_law(contact);
+}
+
+double violation(const Contact& contact, int mode) {
+  return std::hypot(contact.gap, mode == contact_stick ? contact.slip.norm() : 0.0);
 }
 
 void ContactSet::restart() {
@@ -105,7 +109,7 @@ void ContactSet::restart() {
 void ContactSet::keep() {
   kept_.clear();
   for (const Pair& pair : pairs_) {
-    if (pair.at.force.isZero(0.0)) continue;
+    if (pair.contact.force.isZero(0.0)) continue;
     kept_.emplace_back(pair);
     kept_.back().change.setZero();
     kept_.back().penalty_scale = 1.0;
@@ -118,9 +122,9 @@ void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& r
   merge();
   linearize_at(x);
   for (const Pair& pair : pairs_) {
-    if (pair.at.force.isZero(0.0)) continue;
+    if (pair.contact.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c)
-      at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.at.force;
+      at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.contact.force;
   }
 }
 
@@ -137,9 +141,9 @@ void ContactSet::add_stiffness(double share, std::vector<double>& stiffness) con
 
 void ContactSet::count_errors(double stiffness, Norms& norms) const {
   for (const Pair& pair : pairs_) {
-    PairKinematics at = pair.at;
-    at.stiffness = stiffness;
-    const double error = pair_error_squared(at);
+    Contact contact = pair.contact;
+    contact.stiffness = stiffness;
+    const double error = missed_squared(contact, pair.smoothing_energy);
     if (error != 0.0) norms.count(error);
   }
 }
@@ -162,13 +166,14 @@ double ContactSet::sharpest() const {
 }
 
 bool ContactSet::active() const {
-  return std::any_of(pairs_.begin(), pairs_.end(),
-                     [](const Pair& pair) { return pair.active() || !pair.at.force.isZero(0.0); });
+  return std::any_of(pairs_.begin(), pairs_.end(), [](const Pair& pair) {
+    return pair.active() || !pair.contact.force.isZero(0.0);
+  });
 }
 
 double ContactSet::smoothed_force() const {
   double sum = 0.0;
-  for (const Pair& pair : pairs_) sum += pair.at.stiffness;
+  for (const Pair& pair : pairs_) sum += pair.contact.stiffness;
   return pairs_.empty() ? 0.0 : smoothing * sum / static_cast<double>(pairs_.size());
 }
 
@@ -188,15 +193,15 @@ void ContactSet::return_to_best() {
 bool ContactSet::resume() {
   bool any = false;
   for (Pair& pair : pairs_) {
-    if (pair.active() || pair.at.force.isZero(0.0) ||
-        pair.at.gap > settings_.closing_gap * pair.scale)
+    if (pair.active() || pair.contact.force.isZero(0.0) ||
+        pair.contact.gap > settings_.closing_gap * pair.scale)
       continue;
-    PairKinematics touching = pair.at;
+    Contact touching = pair.contact;
     touching.gap = 0.0;
-    const PairLinearization row = linearize(touching);
-    if (row.mode == contact_open) continue;
-    pair.row = row;
-    pair.row.force -= row.stiffness * pair.at.gap * pair.at.normal;
+    const LawResponse law = coulomb_law(touching);
+    if (law.mode == contact_open) continue;
+    pair.row = pair_row(touching, law, pair.proximal);
+    pair.row.force -= pair.row.stiffness * pair.contact.gap * pair.contact.normal;
     any = true;
   }
   return any;
@@ -206,9 +211,9 @@ bool ContactSet::activate(const Buffer<float>& change) {
   bool changed = false;
   for (Pair& pair : pairs_) {
     if (!pair.added) continue;
-    const Vector3d force = pair.at.force + pair.force_change(change, free_nodes_);
-    if (force.dot(pair.at.normal) >= 0.0) continue;
-    pair.row = {contact_open, Matrix3d::Zero(), Matrix3d::Zero(), -pair.at.force};
+    const Vector3d force = pair.contact.force + pair.force_change(change, free_nodes_);
+    if (force.dot(pair.contact.normal) >= 0.0) continue;
+    pair.row = pair_row(pair.contact, {}, pair.proximal);  // open
     pair.turning.setZero();
     pair.sliding.setZero();
     pair.added = false;
@@ -219,9 +224,10 @@ bool ContactSet::activate(const Buffer<float>& change) {
     for (Pair& pair : pairs_) {
       if (pair.who.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
-      if (!(pair.at.gap + pair.at.normal.dot(motion) < -settings_.closing_gap * pair.scale))
+      if (!(pair.contact.gap + pair.contact.normal.dot(motion) <
+            -settings_.closing_gap * pair.scale))
         continue;
-      pair.row = linearize_closing(pair.at, motion);
+      pair.row = pair_row(pair.contact, closing(pair.contact, motion), pair.proximal);
       pair.added = any = true;
     }
     if (any) return true;
@@ -231,7 +237,7 @@ bool ContactSet::activate(const Buffer<float>& change) {
 
 void ContactSet::linearize_at(const Buffer<double>& x) {
   for (Pair& pair : pairs_) {
-    pair.row = linearize(pair.at);
+    pair.row = pair_row(pair.contact, pair.law(), pair.proximal);
     turn(pair, x);
   }
 }

@@ -6,7 +6,7 @@
 #include <Eigen/Core>
 #include <vector>
 
-#include "contact/law.hpp"
+#include "contact/linearized_contact.hpp"
 #include "contact/path.hpp"
 #include "contact/rows.hpp"
 #include "contact/settings.hpp"
@@ -25,10 +25,12 @@ struct Pair {
   int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node
                 // (after the edges); or the second edge
   Eigen::Vector4d weights;
-  PairKinematics at;
-  Eigen::Vector3d middle;  // of the two points, or with a skeleton that of the cloth, m
-  double thickness;        // m: that it keeps apart
-  double scale;            // m: that of the cloth, which is less with a skeleton
+  Contact contact;
+  ProximalStiffness proximal;
+  double smoothing_energy;  // epsilon, J: 0 under the exact law
+  Eigen::Vector3d middle;   // of the two points, or with a skeleton that of the cloth, m
+  double thickness;         // m: that it keeps apart
+  double scale;             // m: that of the cloth, which is less with a skeleton
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
@@ -38,11 +40,13 @@ struct Pair {
   Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
   Eigen::Matrix<double, 3, 9> turning = Eigen::Matrix<double, 3, 9>::Zero();
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force in the last linear problem, N
-  PairLinearization row{};
+  PairRow row{};
   double penalty_scale = 1.0;            // growth of its proximal stiffness in this attempt
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
   bool active() const { return row.mode != contact_open; }
+  // The law that holds for it now.
+  LawResponse law() const;
   // Motion of its first point over its second, m; all of its motions; and the change of its force
   // by them, N.
   Eigen::Vector3d motion(const Buffer<float>& change, int free_nodes) const;
@@ -64,7 +68,7 @@ struct PairPast {
 };
 
 // Length by which an active pair violates its row: gap and, where it sticks, slip, m.
-double violation(const PairKinematics& at, int mode);
+double violation(const Contact& contact, int mode);
 
 class ContactSet {
  public:

@@ -30,18 +30,18 @@ void ContactSet::transfer(double share) {
   for (std::size_t i = 0; i < pairs_.size(); ++i) {
     for (; o < base_.size() && key(base_[o]) < key(pairs_[i]); ++o) orphans.push_back(&base_[o]);
     if (o < base_.size() && key(base_[o]) == key(pairs_[i])) {
-      pairs_[i].at.force = base_[o].force + share * base_[o].change;
+      pairs_[i].contact.force = base_[o].force + share * base_[o].change;
       pairs_[i].penalty_scale = base_[o].penalty_scale;
       const int mode = base_[o].mode;
-      const double last = base_[o].missed, now = violation(pairs_[i].at, mode);
+      const double last = base_[o].missed, now = violation(pairs_[i].contact, mode);
       if (smoothing == 0.0 && share == 1.0 && mode != contact_open &&
           last > settings_.length_tolerance && last < settings_.stall_up_to * pairs_[i].scale &&
           now > settings_.stall_ratio * last) {
         pairs_[i].penalty_scale =
             std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
       }
-      pairs_[i].at.along *= pairs_[i].penalty_scale;
-      pairs_[i].at.across *= pairs_[i].penalty_scale;
+      pairs_[i].proximal.normal *= pairs_[i].penalty_scale;
+      pairs_[i].proximal.tangential *= pairs_[i].penalty_scale;
       ++o;
     } else {
       fresh.push_back(i);
@@ -61,22 +61,22 @@ void ContactSet::transfer(double share) {
                               : a.first == b.first || a.second == b.second || a.first == b.second ||
                                     a.second == b.first;
       if (!common) continue;
-      const double alike = pairs_[i].at.normal.dot(orphan->normal);
+      const double alike = pairs_[i].contact.normal.dot(orphan->normal);
       if (alike > best) best = alike, match = i;
     }
     if (match < pairs_.size()) {
-      pairs_[match].at.force += force;
+      pairs_[match].contact.force += force;
       continue;
     }
     best = settings_.transfer_radius * orphan->scale;
     for (std::size_t i = 0; i < pairs_.size(); ++i) {
       const double far = (pairs_[i].middle - orphan->middle).norm();
-      const double alike = pairs_[i].at.normal.dot(orphan->normal);
+      const double alike = pairs_[i].contact.normal.dot(orphan->normal);
       if (far < best && std::abs(alike) > settings_.match_cosine) best = far, match = i;
     }
     if (match < pairs_.size()) {
-      pairs_[match].at.force +=
-          pairs_[match].at.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
+      pairs_[match].contact.force +=
+          pairs_[match].contact.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
     }
   }
 }
@@ -98,7 +98,7 @@ void ContactSet::merge() {
   for (std::size_t i = 0; i < count; ++i) {
     const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
     rank[i] = {pairs_[i].thickness < materials.apart(sheet(0), sheet(3)),
-               pairs_[i].at.force.isZero(0.0), pairs_[i].at.gap};
+               pairs_[i].contact.force.isZero(0.0), pairs_[i].contact.gap};
   }
   std::stable_sort(order.begin(), order.end(),
                    [&](std::size_t a, std::size_t b) { return rank[a] < rank[b]; });
@@ -110,9 +110,9 @@ void ContactSet::merge() {
       if (gone[j] || bone_of(pairs_[j].who) != bone_of(pairs_[i].who) ||
           (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
         return;
-      const Vector3d& force = pairs_[j].at.force;
-      pairs_[i].at.force +=
-          pairs_[i].at.normal.dot(pairs_[j].at.normal) > 0.0 ? force : Vector3d(-force);
+      const Vector3d& force = pairs_[j].contact.force;
+      pairs_[i].contact.force +=
+          pairs_[i].contact.normal.dot(pairs_[j].contact.normal) > 0.0 ? force : Vector3d(-force);
       gone[j] = 1;
     };
     const double reach = 1.01 * radius;

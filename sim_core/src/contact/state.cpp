@@ -259,22 +259,22 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start,
     }
     if (!bears()) {
       touched[i] = -1;
-      const ContactLinearization row = open_row(r);
       mode[i] = contact_open;
-      at_node(force, i) = row.force.cast<float>();
+      at_node(force, i) = -r.cast<float>();
       at_node(correction, i).setZero();
-      norms.count(row.error_squared);
+      norms.count(r.squaredNorm());
       continue;
     }
     const bool slipped = mode[i] == contact_slip && touched[i] == on.body;
     touched[i] = on.body;
-    const ContactKinematics seen = kinematics(i, on, x, start, residual, at_start, at_end);
-    const ContactLinearization row = closed_row(seen, turning_max_);
-    const bool reversed = slipped && row.mode == contact_slip &&
-                          at_node(direction, i).cast<double>().dot(row.direction) < 0.0;
+    const Contact contact = contact_at(i, on, x, start, residual, at_start, at_end);
+    const LawResponse law = coulomb_law(contact);
+    const bool reversed = slipped && law.mode == contact_slip &&
+                          at_node(direction, i).cast<double>().dot(law.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
-    write(i, hold_reversed && reversed ? sticking_row(seen) : row);
-    norms.count(row.error_squared);
+    const LawResponse& chosen = hold_reversed && reversed ? sticking(contact) : law;
+    write(i, node_row(contact, chosen, turning_max_));
+    norms.count(missed_squared(contact, law));
   }
   return norms;
 }
@@ -305,14 +305,17 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start,
       if (!one) continue;
       on = {{one->gap, one->normal}, body};
     }
-    const ContactKinematics seen = kinematics(node, on, x, start, residual, at_start, at_end);
+    const Contact contact = contact_at(node, on, x, start, residual, at_start, at_end);
     touched[i] = body;
     at_node(normal, node) = on.gap.normal.cast<float>();
     // Friction turns the more easily the further a node slips, and it slips in proportion to dt.
-    write(node, kept_.mode[i] == contact_stick
-                    ? sticking_row(seen)
-                    : slipping_row(seen, at_node(kept_.direction, node).cast<double>(),
-                                   static_cast<double>(kept_.turning[i]) * kept_.dt / dt));
+    const LawResponse law =
+        kept_.mode[i] == contact_stick
+            ? sticking(contact)
+            : slipping_along(contact, at_node(kept_.direction, node).cast<double>(),
+                             static_cast<double>(kept_.turning[i]) * kept_.dt / dt);
+    // The turning of the last step is not bounded again.
+    write(node, node_row(contact, law, std::numeric_limits<double>::infinity()));
   }
   return true;
 }
@@ -324,11 +327,10 @@ Vector3d ContactState::slip(const Bearing& on, const Vector3d& before, const Vec
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
-ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Buffer<double>& x,
-                                           const Buffer<double>& start,
-                                           const Buffer<double>& residual,
-                                           const std::vector<Body>& at_start,
-                                           const std::vector<Body>& at_end) const {
+Contact ContactState::contact_at(int node, const Bearing& on, const Buffer<double>& x,
+                                 const Buffer<double>& start, const Buffer<double>& residual,
+                                 const std::vector<Body>& at_start,
+                                 const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
   const Vector3d force = at_node(residual, node);
   if (on.body >= static_cast<int>(at_end.size())) {
@@ -340,7 +342,7 @@ ContactKinematics ContactState::kinematics(int node, const Bearing& on, const Bu
           force,           mu_here, stiffness[node]};
 }
 
-void ContactState::write(int node, const ContactLinearization& row) {
+void ContactState::write(int node, const NodeRow& row) {
   mode[node] = row.mode;
   at_node(direction, node) = row.direction.cast<float>();
   at_node(force, node) = row.force.cast<float>();

@@ -11,7 +11,7 @@
 
 #include "contact/bodies.hpp"
 #include "contact/closest.hpp"
-#include "contact/law.hpp"
+#include "contact/linearized_contact.hpp"
 #include "contact/pn_triangles.hpp"
 #include "contact/rows.hpp"
 #include "contact/settings.hpp"
@@ -166,11 +166,10 @@ class ContactState {
   void penalty(int node, double own, float* out) const;
 
  private:
-  ContactKinematics kinematics(int node, const Bearing& on, const Buffer<double>& x,
-                               const Buffer<double>& start, const Buffer<double>& residual,
-                               const std::vector<Body>& at_start,
-                               const std::vector<Body>& at_end) const;
-  void write(int node, const ContactLinearization& row);
+  Contact contact_at(int node, const Bearing& on, const Buffer<double>& x,
+                     const Buffer<double>& start, const Buffer<double>& residual,
+                     const std::vector<Body>& at_start, const std::vector<Body>& at_end) const;
+  void write(int node, const NodeRow& row);
 
   struct Kept {
     std::vector<int> mode, touched;

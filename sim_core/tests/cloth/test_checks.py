@@ -49,6 +49,15 @@ def moved(height: float, by: ArrayLike, bodies: list[Body], held: ArrayLike = HE
     return cloth
 
 
+@pytest.mark.parametrize(
+    ("part", "whole", "ratio"),
+    [(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 4.0, 0.25), (1.0, 0.0, math.inf)],
+)
+def test_a_part_of_nothing_is_beyond_every_limit(part: float, whole: float, ratio: float) -> None:
+    """A run that gains energy where none flows must not pass as one that gains none."""
+    assert checks._ratio(part, whole) == ratio
+
+
 def test_a_sheet_on_a_floor_passes_all() -> None:
     cloth, _ = sheet(1e-4)
     for _ in range(20):

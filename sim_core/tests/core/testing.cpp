@@ -12,7 +12,7 @@
 
 #include "cloth/assembly.hpp"
 #include "contact/closest.hpp"
-#include "contact/law.hpp"
+#include "contact/linearized_contact.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
 #include "kernel_levels.hpp"
@@ -188,16 +188,46 @@ NB_MODULE(_testing, m) {
       "height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
       "contact/pn_triangles.hpp.");
   m.def(
-      "pair_law",
+      "coulomb_law",
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,
+         const Eigen::Vector3d& force, double mu, double stiffness, double smoothing) {
+        const Contact contact{gap, normal, slip, force, mu, stiffness};
+        const LawResponse law =
+            smoothing > 0.0 ? smoothed_law(contact, smoothing) : coulomb_law(contact);
+        const LawDerivative& d = law.derivative;
+        return std::make_tuple(
+            static_cast<int>(law.mode), Eigen::Vector3d(law.normal_force * normal + law.friction),
+            law.direction, Eigen::Vector4d(d.normal, d.along, d.across, d.coupling));
+      },
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "smoothing"_a = 0.0,
+      "mode, the force that the law asks, the direction of friction and the four derivatives; see "
+      "contact/coulomb_law.hpp.");
+  m.def(
+      "pair_row",
       [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,
          const Eigen::Vector3d& force, double mu, double stiffness, double along, double across,
          double smoothing) {
-        const PairKinematics at{gap, normal, slip, force, mu, stiffness, along, across, smoothing};
-        const PairLinearization row = linearize(at);
-        return std::make_tuple(row.mode, row.stiffness, row.symmetric, row.force,
-                               pair_error_squared(at));
+        const Contact contact{gap, normal, slip, force, mu, stiffness};
+        const LawResponse law =
+            smoothing > 0.0 ? smoothed_law(contact, smoothing) : coulomb_law(contact);
+        const PairRow row = pair_row(contact, law, {along, across});
+        return std::make_tuple(static_cast<int>(row.mode), row.stiffness, row.symmetric, row.force,
+                               missed_squared(contact, smoothing));
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a,
       "smoothing"_a = 0.0,
-      "mode, stiffness, its symmetric part, force and squared error; see contact/law.hpp.");
+      "mode, stiffness, its symmetric part, force and squared error; see "
+      "contact/linearized_contact.hpp.");
+  m.def(
+      "node_row",
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,
+         const Eigen::Vector3d& force, double mu, double stiffness, double turning_max) {
+        const Contact contact{gap, normal, slip, force, mu, stiffness};
+        const NodeRow row = node_row(contact, coulomb_law(contact), turning_max);
+        return std::make_tuple(static_cast<int>(row.mode), row.direction, row.force, row.correction,
+                               row.coupling, row.turning);
+      },
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "turning_max"_a,
+      "mode, direction, force, correction, coupling and turning; see "
+      "contact/linearized_contact.hpp.");
 }
