@@ -43,10 +43,11 @@ from stickslip_schemas.documents.tasks import (
 from stickslip_schemas.format.codecs import encode_chunk, encode_shard
 from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.store import DirectoryStore
+from stickslip_services.queue.background import start
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import start
 from stickslip_services.queue.ids import row_digest
-from stickslip_services.queue.submit import Planner, submit_job
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import parsed
 from stickslip_testing.worker import DirectApi, PretendWorker

@@ -17,7 +17,8 @@ from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
 from stickslip_schemas.spec.names import FabricNumbers, Material
-from stickslip_services.queue.plan import Terms, expand, terms_for
+from stickslip_services.queue.plan import expand, plan_inputs_for
+from stickslip_services.queue.rows import PlanInputs
 from stickslip_sim_core._sim_core import kernels
 from stickslip_sim_core.cloth.contact import MU_MAX
 from stickslip_sim_core.cloth.contact import SELF_FRICTION as CORE_SELF_FRICTION
@@ -124,7 +125,7 @@ def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[J
         {"kind": name, "axes": cloth if issubclass(of, ClothDragSpec) else rods}
     )
     with pytest.raises(UnknownKindError, match="kind must be one of"):
-        expand(spec, Terms(BUILDS, None))
+        expand(spec, PlanInputs(BUILDS, None))
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         layout(spec)
     with pytest.raises(UnknownKindError, match="kind must be one of"):
@@ -132,4 +133,4 @@ def test_a_class_of_spec_that_nobody_registered_is_refused_everywhere(of: type[J
     with pytest.raises(UnknownKindError, match="kind must be one of"):
         next(iter(keyed_points(spec, BUILDS)))
     with pytest.raises(UnknownKindError, match="kind must be one of"):
-        terms_for(None, spec)  # type: ignore[arg-type]  # it is refused before anything is looked up
+        plan_inputs_for(None, spec)  # type: ignore[arg-type]  # it is refused before anything is looked up

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import pytest
 from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import connect, opened
+from stickslip_services.queue.background import start
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import start
-from stickslip_services.queue.submit import Planner
+from stickslip_services.queue.planner import Planner
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock
 from stickslip_testing.servers import RunningServer, served

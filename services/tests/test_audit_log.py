@@ -58,7 +58,7 @@ def test_what_is_refused_or_fails_leaves_no_line(
     job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     with pytest.raises(NotFoundError):
         pause_job(context, "job-0")
-    monkeypatch.setattr("stickslip_services.queue.control.release_tasks", lambda *_: 1 / 0)
+    monkeypatch.setattr("stickslip_services.queue.control.settle_job", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cancel_job(context, job)
     again = submit_job(context, parsed(rods()), "the same")

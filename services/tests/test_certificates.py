@@ -16,7 +16,8 @@ from stickslip_services.catalog.inputs import register_certificate
 from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.submit import submit_job, validate_spec
+from stickslip_services.queue.estimate import validate_spec
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving

@@ -10,8 +10,9 @@ from stickslip_schemas.documents.tasks import TaskResult
 from stickslip_schemas.documents.worker_api import Heartbeat, Lease, LeaseRequest, LeaseState
 from stickslip_services.database.tables import cost_groups
 from stickslip_services.errors import ConflictError
+from stickslip_services.queue.background import sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, prioritise_job, sweep
+from stickslip_services.queue.control import cancel_job, prioritise_job
 from stickslip_services.queue.eta import (
     KEPT_RUNS,
     MEASURED,
@@ -188,6 +189,7 @@ def test_a_task_that_ends_its_process_each_time_is_quarantined(
         worker.work() == 3 + 3 + 1
     )  # everything else: simulations, renders, and the shard that needs no poison
     assert poison not in worker.ran
+    sweep(context)
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.quarantined)
     assert "everything else is done, but 1 of its tasks were quarantined" in job.message
@@ -233,6 +235,7 @@ def test_a_job_that_shares_the_task_is_told_as_well(
     assert show_job(context, first).reason is Reason.quarantined
     assert show_job(context, second).reason is Reason.quarantined
     worker.work()
+    sweep(context)
     assert show_job(context, first).state is JobState.failed
     assert show_job(context, second).state is JobState.failed
     check(context)
@@ -256,6 +259,7 @@ def test_a_lost_worker_charges_no_task_until_it_is_no_accident(
             worker.register()
         else:
             worker.report((lease, failure(Reason.worker_lost, "its node has died")))
+    sweep(context)
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.quarantined)
     assert (

@@ -11,8 +11,8 @@ from fastapi import FastAPI
 from httpx_sse import ServerSentEvent, connect_sse
 from stickslip_services.api import sse
 from stickslip_services.app import make_app
+from stickslip_services.queue.background import sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import sweep
 from stickslip_services.queue.jobs import show_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, rods

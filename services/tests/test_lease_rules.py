@@ -14,12 +14,15 @@ from stickslip_schemas.documents.worker_api import Heartbeat, LeaseRequest, Leas
 from stickslip_services.access.principals import Principal, acting_as
 from stickslip_services.access.quotas import check_quota, find_project, set_quota
 from stickslip_services.api.routes.workers import Batcher
+from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import tasks
 from stickslip_services.errors import ConflictError, QuotaExceededError, UnknownWorkerError
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, start, sweep
+from stickslip_services.queue.control import cancel_job
 from stickslip_services.queue.heartbeat import reconcile_leases, renew_leases
 from stickslip_services.queue.ids import task_key
+from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
 from stickslip_services.queue.submit import submit_job
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
@@ -53,6 +56,7 @@ def test_cancelling_a_job_frees_its_quota(
         check_quota(connection, "lab", 1)
     cancel_job(context, job_id)
     worker.beat(*leases)
+    sweep(context)
     with context.database.read() as connection:
         project = find_project(connection, "lab")
         assert (project.samples, project.jobs) == (0, 0)
@@ -200,15 +204,21 @@ def test_cancelling_stops_waiting_tasks_at_once_and_running_ones_with_the_heartb
     worker.start(running)
     assert cancel_job(context, job_id).state is JobState.cancelling
     assert worker.lease() == ()
-    with context.database.read() as connection:
-        states = set(
-            connection.scalars(
-                select(tasks.c.state).where(tasks.c.key != task_key(running.task_id))
-            )
-        )
-    assert states == {TaskState.cancelled}
     assert worker.beat(running) == (running.task_id,)
-    assert show_job(context, job_id).state is JobState.cancelled
+    sweep(context)
+    shown = show_job(context, job_id)
+    assert shown.state is JobState.cancelled
+    assert shown.progress.done == shown.progress.total == 11
+    for stage in shown.progress.stages.values():
+        assert stage.counts.keys() == {TaskState.cancelled}
+    with context.database.read() as connection:
+        seq = find_job(connection, job_id).seq
+        page = PageRequest(100, None)
+        states = [sample.state for sample in list_samples(connection, seq, page, None).items]
+        assert states == [TaskState.cancelled] * 4
+        cancelled = list_samples(connection, seq, page, TaskState.cancelled).items
+        assert [sample.slot for sample in cancelled] == [0, 1, 2, 3]
+        assert list_samples(connection, seq, page, TaskState.pending).items == ()
 
 
 def test_a_superseded_session_gets_no_tasks_and_keeps_none(

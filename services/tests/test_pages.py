@@ -21,7 +21,7 @@ from stickslip_schemas.scene.library import load_scene
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app
 from stickslip_services.pages.rendering import _environment, plot, table
-from stickslip_services.queue.control import sweep
+from stickslip_services.queue.background import sweep
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import serving

@@ -14,11 +14,14 @@ from stickslip_services.cli import app
 from stickslip_services.cli.progress import planned_so_far
 from stickslip_services.client import Client
 from stickslip_services.database.tables import job_tasks, jobs, samples, task_dependencies, tasks
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, resume_job, start, sweep
-from stickslip_services.queue.plan import Terms, expand
-from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.submit import Planner, release_claims, submit_job
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.existing_datasets import check_existing_datasets
+from stickslip_services.queue.plan import expand
+from stickslip_services.queue.planner import Planner, release_claims
+from stickslip_services.queue.rows import PlanInputs
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
@@ -83,7 +86,7 @@ def written(context: Context, job_id: str) -> tuple[Any, ...]:
 
 def planned(document: dict[str, Any]) -> tuple[Any, ...]:
     """Return what `written` gives of a job of which nothing was done before."""
-    plan = expand(parsed(document), Terms(BUILDS, None), previews=24)
+    plan = expand(parsed(document), PlanInputs(BUILDS, None), previews=24)
     own = [
         (key, task.stage, task.build, task.preview, task.cost_group, len(task.depends_on))
         for key, task in plan.tasks.items()
@@ -179,7 +182,7 @@ def test_a_large_job_that_was_made_before_runs_nothing(
     again = submit(context)
     planner.run()
     assert worker.lease() == ()
-    check_made_datasets(context)
+    check_existing_datasets(context)
     shown = show_job(context, again)
     assert shown.state is JobState.succeeded
     assert shown.dataset == show_job(context, first).dataset
@@ -207,7 +210,8 @@ def test_rejections_of_earlier_pieces_reach_later_ones(
     check(context)
     worker.work()
     shown = show_job(context, job_id)
-    assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 12)
+    assert (shown.state, shown.rejected_count) == (JobState.failed, 12)
+    assert shown.reason is Reason.no_valid_samples
 
 
 def test_it_is_cancelled_half_planned_and_finished_by_another_job(
@@ -272,6 +276,7 @@ def test_quarantined_tasks_do_not_end_a_job_that_is_being_planned(
     assert show_job(context, job_id).state is JobState.planning
     planner.run()
     worker.work()
+    sweep(context)
     shown = show_job(context, job_id)
     assert (shown.state, shown.reason) == (JobState.failed, Reason.quarantined)
     check(context)
@@ -286,7 +291,7 @@ def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
     def broken(*_: Any, **__: Any) -> Any:
         raise ValueError("the axis bends")
 
-    monkeypatch.setattr("stickslip_services.queue.submit.pieces", broken)
+    monkeypatch.setattr("stickslip_services.queue.planner.pieces", broken)
     planner = Planner(context)
     with context.database.write() as connection:
         release_claims(connection)
@@ -379,7 +384,7 @@ def test_people_see_how_far_the_plan_is(
     settings: Settings, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "stickslip_services.app.PLAN_SECONDS", 1e6
+        "stickslip_services.queue.background.PLAN_SECONDS", 1e6
     )  # it plans when the test calls it
     made = make_app(settings, clock=clock)
     context: Context = made.state.context

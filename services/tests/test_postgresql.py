@@ -22,13 +22,15 @@ from stickslip_schemas.base import JobState
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.app import main
 from stickslip_services.cli import app
-from stickslip_services.database.database import Prepared, Role
+from stickslip_services.database.database import Role
 from stickslip_services.database.opening import check, connect, opened
+from stickslip_services.database.statements import RowQuery
 from stickslip_services.database.tables import dataset_versions, tasks
 from stickslip_services.errors import DatabaseRefusedError, SettingsError
+from stickslip_services.queue.background import start
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import start
-from stickslip_services.queue.submit import Planner, submit_job
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
@@ -240,13 +242,13 @@ def test_a_heartbeat_is_two_statements_and_waits_for_no_writer(
     leases = worker.lease(simulate=2)
     assert worker.beat(*leases) == ()  # from now on the worker is known
     sent: list[str] = []
-    run = Prepared.tuples
+    run = RowQuery.rows
 
-    def tuples(self: Prepared, *rest: Any) -> Any:
+    def rows(self: RowQuery[Any], *rest: Any) -> Any:
         sent.append("one")
         return run(self, *rest)
 
-    monkeypatch.setattr(Prepared, "tuples", tuples)
+    monkeypatch.setattr(RowQuery, "rows", rows)
     with context.database.write():  # it has the lock of the writer until its end
         thread = threading.Thread(target=lambda: sent.extend(worker.beat(*leases)))
         thread.start()

@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from sqlalchemy import event, select
+from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason, Stage, TaskState
 from stickslip_schemas.documents.responses import Dataset
 from stickslip_schemas.documents.tasks import (
@@ -12,35 +12,31 @@ from stickslip_schemas.documents.tasks import (
     PublishSection,
     PublishTask,
     RenderTask,
+    TaskResult,
 )
 from stickslip_schemas.documents.worker_api import LeaseRequest
 from stickslip_schemas.plan.builds import Builds
 from stickslip_services.catalog.versions import find_dataset
 from stickslip_services.database.database import PageRequest
-from stickslip_services.database.tables import jobs, tasks
+from stickslip_services.database.tables import tasks
 from stickslip_services.errors import (
     ConflictError,
     KindNotAvailableError,
     NotFoundError,
     UnknownWorkerError,
 )
-from stickslip_services.queue.compose import find_task
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import (
-    cancel_job,
-    pause_job,
-    release_ended_jobs,
-    resume_job,
-    start,
-    sweep,
-)
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.documents import find_task
+from stickslip_services.queue.job_states import has_exclusive_lease
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
+from stickslip_services.queue.rows import ACTIVE
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.transaction import LIVE, has_exclusive_lease
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
-from stickslip_testing.jobs import ManualClock, list_jobs, parsed, rods, show_job
+from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, failure, rejection
 
 pytestmark = pytest.mark.databases
@@ -168,20 +164,37 @@ def test_a_rejected_simulation_rejects_its_renders(context: Context, worker: Pre
     check(context)
 
 
-def test_all_samples_rejected_is_a_dataset_too(context: Context, worker: PretendWorker) -> None:
-    worker.judge = lambda task: rejection() if task.stage == "simulate" else None
-    job_id = submit(context)
-    worker.work()
-    job = show_job(context, job_id)
-    assert (job.state, job.rejected_count) == (JobState.succeeded_with_rejects, 4)
-    assert job.dataset is not None
-    assert show_dataset(context, job.dataset.dataset).versions[0].valid_count == 0
+def test_a_job_without_a_valid_sample_fails_and_publishes_nothing(
+    context: Context, worker: PretendWorker
+) -> None:
+    def judge(task: Any) -> TaskResult | None:
+        if task.stage != "simulate":
+            return None
+        if task.simulation.gamma == 2.0 and task.simulation.phi1 == 3.0:
+            return rejection(reason=Reason.unconverged)
+        return rejection()
+
+    worker.judge = judge
+    for _ in range(2):  # a second submission does not succeed either
+        job_id = submit(context)
+        worker.work()
+        job = show_job(context, job_id)
+        assert (job.state, job.reason) == (JobState.failed, Reason.no_valid_samples)
+        assert job.message.startswith("0 of 4 samples are valid, so no dataset is published")
+        assert "most often as solver_diverged (3 of 4)" in job.message
+        assert (job.rejected_count, job.dataset) == (4, None)
+        check(context)
+    assert list_datasets(context) == ()
+    assert list(context.store.versions("manifest.json")) == []
 
 
 def test_the_same_grid_again_runs_nothing(context: Context, worker: PretendWorker) -> None:
     submit(context)
     worker.work()
-    again = show_job(context, submit(context, name="again"))
+    job_id = submit(context, name="again")
+    assert show_job(context, job_id).state is JobState.queued  # its files are checked first
+    sweep(context)
+    again = show_job(context, job_id)
     assert again.state is JobState.succeeded
     assert again.dataset is not None
     assert again.dataset.version == 1
@@ -317,6 +330,7 @@ def test_submitting_a_failed_job_again_tries_again(
     for _ in range(4):
         worker.work()
         clock.advance(10)
+        sweep(context)
     assert show_job(context, first).state is JobState.failed
     worker.judge = lambda _task: None
     second = submit(context)
@@ -403,6 +417,7 @@ def test_cancelling_drops_what_runs(context: Context, worker: PretendWorker) -> 
     check(context)
     assert worker.lease() == ()
     assert set(worker.beat(started, idle)) == {started.task_id, idle.task_id}
+    sweep(context)
     assert show_job(context, job_id).state is JobState.cancelled
     assert worker.finish(started) == ["stale"]
     assert cancel_job(context, job_id).state is JobState.cancelled
@@ -416,6 +431,7 @@ def test_a_result_that_comes_before_the_drop_is_kept(
     (task,) = worker.lease(simulate=1)
     cancel_job(context, job_id)
     assert worker.finish(task) == ["accepted"]
+    sweep(context)
     assert show_job(context, job_id).state is JobState.cancelled
     again = show_job(context, submit(context))
     assert again.progress.stages[Stage.simulate].cached == 1
@@ -531,7 +547,7 @@ def test_many_renders_share_one_simulation(context: Context) -> None:
     assert worker.lease(render=10) == ()
     worker.work()
     shown = show_job(context, job.id)  # type: ignore[union-attr]
-    assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 2)
+    assert (shown.state, shown.rejected_count) == (JobState.failed, 2)
     check(context)
 
 
@@ -695,6 +711,7 @@ class TestPausing:
         assert worker.beat(waiting) == (waiting.task_id,)  # it had not been started: given back
         assert counts(context, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
         assert worker.finish(running) == ["accepted"]
+        sweep(context)
         shown = show_job(context, job)
         assert (shown.state, shown.progress.eta) == (JobState.paused, None)
         assert worker.lease() == ()
@@ -783,39 +800,37 @@ class TestPausing:
         check(context)
 
 
-def test_a_cancelled_job_gives_up_its_tasks_in_pieces(
-    context: Context, worker: PretendWorker, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("stickslip_services.queue.transaction.RELEASE_BATCH", 3)
+def test_cancelling_a_job_writes_none_of_its_tasks(context: Context, worker: PretendWorker) -> None:
     job = submit(context, gamma=(1.0, 2.0, 3.0))
-    kept = submit(context, gamma=(3.0, 4.0))
+    other = submit(context, gamma=(3.0, 4.0))
     leases = worker.lease(simulate=1)
+    with context.database.read() as connection:
+        before = connection.execute(select(tasks).order_by(tasks.c.seq)).all()
     assert cancel_job(context, job).state is JobState.cancelling
     with context.database.read() as connection:
-        waiting = connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job))
-    assert waiting is not None  # of a job with more tasks than one transaction takes
-    release_ended_jobs(context)
-    with context.database.read() as connection:
-        assert connection.scalar(select(jobs.c.given_up).where(jobs.c.id == job)) is None
-        assert violations(connection) == []
+        assert connection.execute(select(tasks).order_by(tasks.c.seq)).all() == before
     assert worker.beat(*leases) == (leases[0].task_id,)
-    assert show_job(context, job).state is JobState.cancelled
+    sweep(context)
+    shown = show_job(context, job)
+    assert shown.state is JobState.cancelled
+    assert shown.progress.stages[Stage.simulate].counts == {TaskState.cancelled: 6}
+    check(context)
     worker.work()
-    assert show_job(context, kept).state is JobState.succeeded
+    assert show_job(context, other).state is JobState.succeeded
 
 
 def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings) -> None:
     """Each report would read it while the job is being paused or cancelled."""
     context = Context.open(settings)
     start(context)
-    asked: list[tuple[str, Any]] = []
+    statements: list[str] = []
     with context.database.read() as connection:
         if connection.dialect.name == "sqlite":
-            event.listen(
-                connection, "before_cursor_execute", lambda *told: asked.append((told[2], told[3]))
-            )
-            assert not has_exclusive_lease(connection, 1, LIVE)
-            statement, values = asked[0]
-            plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values).all()
-            assert "INDEX ix_tasks_leased" in str(plan)
+            driver: Any = connection.connection.dbapi_connection
+            driver.set_trace_callback(statements.append)
+            assert not has_exclusive_lease(connection, 1, ACTIVE)
+            driver.set_trace_callback(None)
+            plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statements[0]}").all()
+            assert "tasks USING COVERING INDEX ix_tasks_owner" in str(plan)
+            assert "SEARCH job_tasks USING PRIMARY KEY (job=? AND task=?)" in str(plan)
     context.close()

@@ -1,4 +1,4 @@
-"""The queue against a small model of it, in any order of events, with an audit of the ledger after
+"""The queue against a small model of it, in any order of events, with an audit of the tables after
 each.
 """
 
@@ -23,21 +23,16 @@ from hypothesis.stateful import (
 from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.worker_api import Lease
-from stickslip_services.database.tables import tasks
+from stickslip_services.database.tables import job_tasks, jobs, tasks
 from stickslip_services.errors import ConflictError
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import (
-    cancel_job,
-    pause_job,
-    prioritise_job,
-    resume_job,
-    start,
-    sweep,
-)
-from stickslip_services.queue.submit import Planner, submit_job
-from stickslip_services.queue.transaction import RUNNABLE, live_jobs
+from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.rows import SCHEDULABLE
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
-from stickslip_testing.invariants import violations
+from stickslip_testing.invariants import unsettled, violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
 from stickslip_testing.worker import DirectApi, PretendWorker, failure, rejection
 
@@ -71,7 +66,7 @@ class QueueMachine(RuleBasedStateMachine):
     server: ClassVar["PostgresqlServer | None"] = None
     """Where the database is; None: SQLite."""
 
-    jobs = Bundle("jobs")
+    submitted = Bundle("submitted")
     leases = Bundle("leases")
     reported = Bundle("reported")
 
@@ -100,7 +95,7 @@ class QueueMachine(RuleBasedStateMachine):
     # --- what happens
     # --------------------------------------------------------------------------------------------
 
-    @rule(target=jobs, which=st.integers(0, len(SPECS) - 1))
+    @rule(target=submitted, which=st.integers(0, len(SPECS) - 1))
     def submit(self, which: int) -> str:
         job = submit_job(self.context, parsed(SPECS[which]), None)
         return job.id  # type: ignore[union-attr]
@@ -206,7 +201,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.seen[worker.id] = self.clock()
         assert self.holders == before
 
-    @rule(job=jobs)
+    @rule(job=submitted)
     def cancel(self, job: str) -> None:
         try:
             shown = cancel_job(self.context, job)
@@ -215,7 +210,7 @@ class QueueMachine(RuleBasedStateMachine):
         else:
             assert shown.state in (JobState.cancelling, JobState.cancelled)
 
-    @rule(job=jobs)
+    @rule(job=submitted)
     def pause(self, job: str) -> None:
         try:
             shown = pause_job(self.context, job)
@@ -224,7 +219,7 @@ class QueueMachine(RuleBasedStateMachine):
         else:
             assert shown.state in (JobState.pausing, JobState.paused)
 
-    @rule(job=jobs)
+    @rule(job=submitted)
     def resume(self, job: str) -> None:
         try:
             shown = resume_job(self.context, job)
@@ -233,7 +228,7 @@ class QueueMachine(RuleBasedStateMachine):
         else:
             assert shown.state in (JobState.planning, JobState.queued, JobState.running)
 
-    @rule(job=jobs, priority=st.integers(-2, 2))
+    @rule(job=submitted, priority=st.integers(-2, 2))
     def prioritise(self, job: str, priority: int) -> None:
         try:
             assert prioritise_job(self.context, job, priority).priority == priority
@@ -248,6 +243,8 @@ class QueueMachine(RuleBasedStateMachine):
     def sweep(self) -> None:
         sweep(self.context)
         self._forget_expired()
+        with self.context.database.read() as connection:
+            assert unsettled(connection) == []
 
     @rule()
     def restart(self) -> None:
@@ -266,7 +263,7 @@ class QueueMachine(RuleBasedStateMachine):
     # ------------------------------------------------------------------------------------------
 
     @invariant()
-    def ledger_is_right(self) -> None:
+    def tables_agree(self) -> None:
         with self.context.database.read() as connection:
             assert violations(connection) == []
 
@@ -297,19 +294,27 @@ class QueueMachine(RuleBasedStateMachine):
             self.clock.advance(60)
             self.planner.run()
             worker.work()
+            sweep(self.context)
         for job in list_jobs(self.context):
             assert not job.state.is_open, f"{job.id} is {job.state}"
-        self.ledger_is_right()
+        self.tables_agree()
         self.context.close()
         self.directory.cleanup()
 
     def _is_asked_for(self, task: str) -> bool:
         """Return whether a job that may run needs the task."""
         with self.context.database.read() as connection:
-            seq = connection.scalar(
-                select(tasks.c.seq).where(tasks.c.key == bytes.fromhex(task.partition("-")[2]))
+            job = connection.scalar(
+                select(jobs.c.seq)
+                .join(job_tasks, job_tasks.c.job == jobs.c.seq)
+                .join(tasks, tasks.c.seq == job_tasks.c.task)
+                .where(
+                    tasks.c.key == bytes.fromhex(task.partition("-")[2]),
+                    jobs.c.state.in_(SCHEDULABLE),
+                )
+                .limit(1)
             )
-            return seq is not None and bool(live_jobs(connection, [seq], RUNNABLE))
+        return job is not None
 
     def _holds(self, worker: PretendWorker, lease: Lease) -> bool:
         """Return whether nobody has taken the task back: a late sign of life is welcome."""

@@ -17,9 +17,9 @@ from stickslip_schemas.documents.tasks import (
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.client.verifying import verify
 from stickslip_services.database.tables import dataset_versions, tasks
+from stickslip_services.queue.background import sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import sweep
-from stickslip_services.queue.recompute import CHECKED_AT_ONCE, check_made_datasets
+from stickslip_services.queue.existing_datasets import SMALL_DATASET, check_existing_datasets
 from stickslip_services.queue.submit import submit_job
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
@@ -102,6 +102,7 @@ def test_only_what_is_damaged_is_made_again(
     )
     worker.ran.clear()
     job = submit(context)
+    sweep(context)
     assert "1 of its files were damaged or lost" in show_job(context, job).message
     finish(context, worker, clock, job)
     assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
@@ -169,7 +170,7 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
 ) -> None:
     finish(context, worker, clock, submit(context))
     with context.database.write() as connection:
-        connection.execute(update(dataset_versions).values(bytes=CHECKED_AT_ONCE + 1))
+        connection.execute(update(dataset_versions).values(bytes=SMALL_DATASET + 1))
     job = submit(context)
     shown = show_job(context, job)
     assert (shown.state, shown.message) == (
@@ -178,7 +179,7 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
     )
     sweep(context)
     assert show_job(context, job).state is JobState.queued
-    check_made_datasets(context)
+    check_existing_datasets(context)
     assert show_job(context, job).state is JobState.succeeded
     check(context)
 

@@ -17,10 +17,10 @@ from stickslip_services.database.database import Role, SqliteDatabase
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import DatabaseRefusedError
 from stickslip_services.local.supervisor import locked
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import start
+from stickslip_services.queue.maintenance import reindex
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.upkeep import reindex
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import list_datasets, list_jobs, parsed, rods, show_job
@@ -117,6 +117,7 @@ def test_a_spec_that_is_submitted_again_finds_its_dataset(
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
     job = submit_job(context, parsed(rods(name="first")), None)
+    sweep(context)
     shown = show_job(context, job.id)  # type: ignore[union-attr]
     assert shown.state is JobState.succeeded
     assert worker.work() == 0
@@ -144,6 +145,7 @@ def test_a_dataset_that_rots_afterwards_is_made_again(
     )
     spec = rods(gamma=(9.0, 1.0)) if path.parts[-6] == next(iter(made)) else rods(name="first")
     job = submit_job(context, parsed(spec), None)
+    sweep(context)
     assert worker.work() > 0
     assert not show_job(context, job.id).state.is_open  # type: ignore[union-attr]
     assert show_job(context, job.id).dataset is not None  # type: ignore[union-attr]

@@ -18,10 +18,10 @@ from stickslip_services.client.errors import ForeignFilesError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
+from stickslip_services.queue.background import start
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import start
+from stickslip_services.queue.maintenance import reindex, unused
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.upkeep import reindex, unused
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods

@@ -15,8 +15,8 @@ from stickslip_services.app import make_app
 from stickslip_services.catalog.versions import damaged_files
 from stickslip_services.cli import app
 from stickslip_services.errors import SettingsError
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import PROBE_SECONDS, Context
-from stickslip_services.queue.control import start, sweep
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, list_datasets, parsed, rods, show_job

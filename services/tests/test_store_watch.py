@@ -15,8 +15,9 @@ import httpx
 import pytest
 from stickslip_schemas.base import JobState, Reason
 from stickslip_services.errors import ConflictError
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import HOLD_SECONDS, Context
-from stickslip_services.queue.control import pause_job, resume_job, start, sweep
+from stickslip_services.queue.control import pause_job, resume_job
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job

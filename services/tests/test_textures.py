@@ -18,8 +18,8 @@ from stickslip_services.client import Client
 from stickslip_services.client.errors import ProblemError
 from stickslip_services.errors import UnknownFileError
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.maintenance import unused
 from stickslip_services.queue.submit import submit_job
-from stickslip_services.queue.upkeep import unused
 from stickslip_testing.jobs import parsed
 from stickslip_testing.servers import RunningServer
 from stickslip_testing.worker import DirectApi, PretendWorker

@@ -19,11 +19,13 @@ from stickslip_services.database.database import Role
 from stickslip_services.database.opening import opened
 from stickslip_services.database.tables import dataset_versions
 from stickslip_services.local.supervisor import locked
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import EVERY_SECONDS, scrub, scrub_when_idle, start, sweep
-from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.submit import Planner, submit_job
-from stickslip_services.queue.upkeep import reindex, unused
+from stickslip_services.queue.existing_datasets import check_existing_datasets
+from stickslip_services.queue.maintenance import reindex, unused
+from stickslip_services.queue.planner import Planner
+from stickslip_services.queue.scrub import EVERY_SECONDS, scrub, scrub_when_idle
+from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import ManualClock, list_datasets, list_jobs, parsed, rods, show_job
@@ -235,7 +237,7 @@ def mend(context: Context) -> None:
     worker = PretendWorker(DirectApi(context), context.store).register()
     for _ in range(12):
         Planner(context).run()
-        check_made_datasets(context)
+        check_existing_datasets(context)
         worker.work()
         assert isinstance(context.clock, ManualClock)
         context.clock.advance(10)

@@ -231,6 +231,8 @@ class Reason(StrEnum):
     quarantined = "quarantined"
     waiting_for_worker = "waiting_for_worker"
     preset_not_certified = "preset_not_certified"
+    damaged_row = "damaged_row"
+    no_valid_samples = "no_valid_samples"
 
     @property
     def ends_a_process(self) -> bool:
@@ -263,6 +265,8 @@ _OF_JOBS = {
     Reason.quarantined,
     Reason.waiting_for_worker,
     Reason.preset_not_certified,
+    Reason.damaged_row,
+    Reason.no_valid_samples,
 }
 
 

@@ -44,17 +44,12 @@ from stickslip_services.database.opening import opened
 from stickslip_services.errors import CommandError
 from stickslip_services.local.supervisor import configure_logging, limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
+from stickslip_services.queue import background
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import release_ended_jobs, scrub_when_idle, start, sweep
 from stickslip_services.queue.heartbeat import renew_leases
-from stickslip_services.queue.recompute import check_made_datasets
-from stickslip_services.queue.submit import Planner
 from stickslip_services.settings import SERVER, Settings, options
 
 logger = logging.getLogger(__name__)
-
-PLAN_SECONDS = 0.2
-"""Polling interval for jobs to plan [s]."""
 
 CTRL_C_STATUS = 130
 """Exit status after Ctrl-C, as of a shell: 128 + SIGINT."""
@@ -84,17 +79,10 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(start, context)
-        every = settings.sweep_seconds
+        await run_in_threadpool(background.start, context)
         delivery = WebhookDelivery(context.database, context.clock, sealing)
-        services: list[tuple[Callable[[], object], float]] = [
-            (partial(sweep, context), every),
-            (partial(check_made_datasets, context), every),
-            (partial(scrub_when_idle, context), every),
-            (Planner(context).run, PLAN_SECONDS),
-            (partial(release_ended_jobs, context), every),
-            (delivery.run, every),
-        ]
+        services = background.services(context)
+        services.append(background.Service(delivery.run, settings.sweep_seconds))
         running = [asyncio.create_task(_repeat(*service)) for service in services]
         running.append(asyncio.create_task(context.database.listen(context.notifier.notify)))
         yield

@@ -75,13 +75,18 @@ class UnknownWorkerError(StickslipError):
     """No worker has registered under this id."""
 
 
-class DamagedRowsError(StickslipError):
-    """Rows of the database have other values than were written; tasks can make `results` again."""
+class DamagedRowError(StickslipError):
+    """A row of the database has other values than were written.
 
-    def __init__(self, results: Sequence[int] = ()) -> None:
+    `results` are the tasks whose results are damaged, by `seq`.
+    """
+
+    def __init__(self, row: str, results: Sequence[int] = ()) -> None:
+        self.row = row
         self.results = results
         super().__init__(
-            "rows of the job are damaged in the database. If it cannot go on, submit its spec again"
+            f"{row} is damaged in the database. Restore a backup of the database, or submit the "
+            "spec again: results that are whole are kept"
         )
 
 

@@ -1,28 +1,32 @@
-"""Invariants of the queue: conditions that hold in the database between any two transactions."""
+"""Invariants of the queue: conditions that hold in the database between any two transactions.
+
+1. A task has an owner exactly while it is `leased` or `running`, and a retry time exactly while it
+   is `soft_failed`.
+2. A task waits for as many others as it has dependencies without results.
+3. `ready_tasks` has a row for each active job that needs a pending task that waits for nothing.
+4. The totals of each open job say what the rows of its tasks say.
+5. A rejected simulation has rejected its renders.
+"""
 
 from collections import Counter
+from collections.abc import Iterator, Mapping
 
 from sqlalchemy import Connection, case, func, select
 from stickslip_schemas.base import JobState, Stage, TaskState
+from stickslip_schemas.documents.responses import StageProgress
 from stickslip_services.database.tables import (
     dataset_versions,
-    job_counts,
-    job_groups,
     job_tasks,
+    job_totals,
     jobs,
+    ready_tasks,
     samples,
-    task_counts,
     task_dependencies,
     tasks,
 )
-from stickslip_services.queue.transaction import (
-    FINISHED,
-    IS_READY,
-    LIVE,
-    ON_LEASE,
-    RUNNABLE,
-    has_exclusive_lease,
-)
+from stickslip_services.queue.job_states import has_exclusive_lease, has_unsettled_job
+from stickslip_services.queue.progress import read_progress
+from stickslip_services.queue.rows import ACTIVE, ON_LEASE, SCHEDULABLE
 
 
 def violations(connection: Connection) -> list[str]:
@@ -30,47 +34,60 @@ def violations(connection: Connection) -> list[str]:
     return [
         *_task_faults(connection),
         *_dependency_faults(connection),
-        *_counter_faults(connection),
+        *_ready_faults(connection),
+        *_total_faults(connection),
+        *_progress_faults(connection),
         *_job_faults(connection),
         *_row_faults(connection),
     ]
 
 
+def unsettled(connection: Connection) -> list[str]:
+    """Return the transitions of jobs that a sweep should have made."""
+    faults: list[str] = []
+    if has_unsettled_job(connection):
+        for row in connection.execute(select(jobs.c.seq, jobs.c.state)):
+            if row.state == JobState.pausing and not has_exclusive_lease(
+                connection, row.seq, SCHEDULABLE
+            ):
+                faults.append(f"job {row.seq} is pausing and nothing runs for it alone")
+            if row.state == JobState.cancelling and not has_exclusive_lease(
+                connection, row.seq, ACTIVE
+            ):
+                faults.append(f"job {row.seq} is cancelling and nothing runs for it alone")
+    for row in connection.execute(select(jobs.c.seq, jobs.c.state)):
+        if row.state not in (JobState.queued, JobState.running):
+            continue
+        states = set(
+            connection.scalars(
+                select(tasks.c.state)
+                .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+                .where(job_tasks.c.job == row.seq)
+            )
+        )
+        if row.state == JobState.queued and states & {*ON_LEASE}:
+            faults.append(f"job {row.seq} is queued and a task of it is on lease")
+        is_ready = select(ready_tasks.c.task).where(ready_tasks.c.job == row.seq).limit(1)
+        is_blocked = TaskState.failed in states and not states & {*ON_LEASE, TaskState.soft_failed}
+        if is_blocked and connection.scalar(is_ready) is None:
+            faults.append(f"job {row.seq} is {row.state} and only quarantined tasks of it are left")
+    return faults
+
+
 def _task_faults(connection: Connection) -> list[str]:
     faults = []
-    live_tasks = set(
-        connection.scalars(
-            select(job_tasks.c.task)
-            .join(jobs, jobs.c.seq == job_tasks.c.job)
-            .where(jobs.c.state.in_(LIVE))
-        )
-    )
-    live_jobs = set(connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(LIVE))))
-    runnable_jobs = set(connection.scalars(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE))))
-    runnable_tasks = set(
-        connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(runnable_jobs)))
-    )
     for row in connection.execute(select(tasks)):
-        held = row.state in (TaskState.leased, TaskState.running)
-        if held != (row.owner is not None) or held != (row.expires_at is not None):
-            faults.append(f"task {row.seq} is {row.state} and its lease says otherwise")
-        if row.state in (TaskState.pending, TaskState.soft_failed) and row.seq not in live_tasks:
-            faults.append(f"task {row.seq} is {row.state} and no live job needs it")
-        if row.state in (TaskState.pending, TaskState.soft_failed) and row.job not in live_jobs:
-            faults.append(f"task {row.seq} is {row.state} and charged to a job that is not live")
-        if (
-            row.state == TaskState.pending
-            and row.seq in runnable_tasks
-            and row.job not in runnable_jobs
-        ):
-            faults.append(
-                f"task {row.seq} is pending for a job that may run and charged to one that may not"
-            )
+        is_leased = row.state in ON_LEASE
+        for column in ("owner", "expires_at", "leased_for"):
+            if is_leased != (getattr(row, column) is not None):
+                faults.append(f"task {row.seq} is {row.state} and its {column} says otherwise")
+        if row.state == TaskState.cancelled:
+            faults.append(f"task {row.seq} is cancelled, which is a state of the API only")
         if row.state == TaskState.succeeded and row.output is None:
             faults.append(f"task {row.seq} has succeeded and has no output")
         if (row.state == TaskState.soft_failed) != (row.retry_at is not None):
             faults.append(f"task {row.seq} is {row.state} and its retry says otherwise")
-        if held and row.waiting_on:
+        if is_leased and row.waiting_on:
             faults.append(f"task {row.seq} is {row.state} and waits for {row.waiting_on} others")
         if row.tries > row.attempts:
             faults.append(
@@ -82,17 +99,17 @@ def _task_faults(connection: Connection) -> list[str]:
 def _dependency_faults(connection: Connection) -> list[str]:
     needed = tasks.alias()
     settled = (TaskState.succeeded, TaskState.rejected)
-    unsettled = func.sum(case((needed.c.state.in_(settled), 0), else_=1))
+    unsettled_count = func.sum(case((needed.c.state.in_(settled), 0), else_=1))
     rows = connection.execute(
-        select(tasks.c.seq, tasks.c.waiting_on, unsettled)
+        select(tasks.c.seq, tasks.c.waiting_on, unsettled_count)
         .join(task_dependencies, task_dependencies.c.task == tasks.c.seq)
         .join(needed, needed.c.seq == task_dependencies.c.depends_on)
         .group_by(tasks.c.seq)
     )
     faults = [
-        f"task {seq} waits for {said} and should for {is_} others"
-        for seq, said, is_ in rows
-        if said != is_
+        f"task {seq} waits for {waiting_on} and should for {count} others"
+        for seq, waiting_on, count in rows
+        if waiting_on != count
     ]
     doomed = connection.scalars(
         select(tasks.c.seq)
@@ -107,52 +124,92 @@ def _dependency_faults(connection: Connection) -> list[str]:
     return faults + [f"render {seq} is not rejected, and its simulation is" for seq in doomed]
 
 
-def _counter_faults(connection: Connection) -> list[str]:
-    faults = []
-    rows = connection.execute(select(task_counts.c.stage, task_counts.c.state, task_counts.c.count))
-    counted = {(stage, state): count for stage, state, count in rows if count}
-    rows = connection.execute(
-        select(tasks.c.stage, tasks.c.state, func.count()).group_by(tasks.c.stage, tasks.c.state)
+def _ready_faults(connection: Connection) -> list[str]:
+    """Compare the queue with the tasks; rows of jobs that have ended may stay."""
+    is_active = jobs.c.state.in_(ACTIVE)
+    expected = connection.execute(
+        select(job_tasks.c.task, job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
+        .join(tasks, tasks.c.seq == job_tasks.c.task)
+        .join(jobs, jobs.c.seq == job_tasks.c.job)
+        .where(is_active, tasks.c.state == TaskState.pending, tasks.c.waiting_on == 0)
     )
-    there = {(stage, state): count for stage, state, count in rows}
-    if counted != there:
-        faults.append(f"task_counts says {counted}, and there are {there}")
-    open_jobs = list(
-        connection.scalars(
-            select(jobs.c.seq).where(
-                jobs.c.state.in_([state for state in JobState if state.is_open])
-            )
+    queued = connection.execute(
+        select(ready_tasks).join(jobs, jobs.c.seq == ready_tasks.c.job).where(is_active)
+    )
+    missing = {tuple(row) for row in expected}
+    surplus: set[tuple[object, ...]] = set()
+    for row in queued:
+        if tuple(row) in missing:
+            missing.remove(tuple(row))
+        else:
+            surplus.add(tuple(row))
+    faults = [f"{row} is ready, and not in the queue" for row in sorted(missing)]
+    return faults + [f"{row} is in the queue, and not ready" for row in sorted(map(str, surplus))]
+
+
+def _total_faults(connection: Connection) -> list[str]:
+    """Compare the totals of open jobs with the rows of their tasks."""
+    is_open = jobs.c.finished_at.is_(None)
+    counted: dict[tuple[int, str, str], Counter[str]] = {}
+    for job, stage, group, state, cached, count in connection.execute(
+        select(
+            job_tasks.c.job,
+            tasks.c.stage,
+            tasks.c.cost_group,
+            tasks.c.state,
+            job_tasks.c.cached,
+            func.count(),
         )
-    )
-    by_job: dict[int, Counter[tuple[str, str]]] = {job: Counter() for job in open_jobs}
-    for job, stage, state, count in connection.execute(
-        select(job_tasks.c.job, tasks.c.stage, tasks.c.state, func.count())
         .join(tasks, tasks.c.seq == job_tasks.c.task)
-        .where(job_tasks.c.job.in_(open_jobs))
-        .group_by(job_tasks.c.job, tasks.c.stage, tasks.c.state)
+        .join(jobs, jobs.c.seq == job_tasks.c.job)
+        .where(is_open)
+        .group_by(
+            job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, tasks.c.state, job_tasks.c.cached
+        )
     ):
-        by_job[job][stage, state] = count
-    columns = (job_counts.c.job, job_counts.c.stage, job_counts.c.state, job_counts.c.count)
-    for job, stage, state, count in connection.execute(
-        select(*columns).where(job_counts.c.job.in_(open_jobs))
-    ):
-        if by_job[job][stage, state] != count:
-            faults.append(
-                f"job {job} counts {count} {stage} {state}, and there are "
-                f"{by_job[job][stage, state]}"
-            )
-    grouped = connection.execute(
-        select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, func.count())
-        .join(tasks, tasks.c.seq == job_tasks.c.task)
-        .where(job_tasks.c.job.in_(open_jobs), tasks.c.state.not_in(FINISHED))
-        .group_by(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
+        counts = counted.setdefault((job, stage, group), Counter())
+        counts["total"] += count
+        counts["cached"] += count * bool(cached)
+        if state in (TaskState.succeeded, TaskState.rejected, TaskState.failed):
+            counts[state] += count
+    faults: list[str] = []
+    rows = connection.execute(
+        select(job_totals).join(jobs, jobs.c.seq == job_totals.c.job).where(is_open)
     )
-    there_left = {(job, stage, group): count for job, stage, group, count in grouped}
-    said = connection.execute(select(job_groups).where(job_groups.c.job.in_(open_jobs)))
-    said_left = {(job, stage, group): count for job, stage, group, count in said if count}
-    if said_left != there_left:
-        faults.append(f"job_groups says {said_left} are left, and there are {there_left}")
+    for row in rows:
+        counts = counted.pop((row.job, row.stage, row.cost_group), Counter())
+        for name in ("total", "cached", "succeeded", "rejected", "failed"):
+            if counts[name] != getattr(row, name):
+                faults.append(
+                    f"job {row.job} has {getattr(row, name)} {name} of {row.stage} "
+                    f"{row.cost_group}, and there are {counts[name]}"
+                )
+    return faults + [f"there are no totals of {key}" for key in counted]
+
+
+def _progress_faults(connection: Connection) -> list[str]:
+    """Compare the shown progress of open jobs with the rows of their tasks."""
+    rows = connection.execute(select(jobs).where(jobs.c.finished_at.is_(None))).all()
+    faults: list[str] = []
+    for row in rows:
+        progress = read_progress(connection, [row], {}, {})[row.seq]
+        counts = connection.execute(
+            select(tasks.c.stage, tasks.c.state, func.count())
+            .join(job_tasks, job_tasks.c.task == tasks.c.seq)
+            .where(job_tasks.c.job == row.seq)
+            .group_by(tasks.c.stage, tasks.c.state)
+        )
+        expected = {(stage, state): count for stage, state, count in counts}
+        actual = dict(_shown_counts(progress.stages))
+        if actual != expected:
+            faults.append(f"job {row.seq} shows {actual}, and there are {expected}")
     return faults
+
+
+def _shown_counts(stages: Mapping[Stage, StageProgress]) -> Iterator[tuple[tuple[str, str], int]]:
+    for stage, progress in stages.items():
+        for state, count in progress.counts.items():
+            yield (stage.value, state.value), count
 
 
 def _job_faults(connection: Connection) -> list[str]:
@@ -163,35 +220,16 @@ def _job_faults(connection: Connection) -> list[str]:
             faults.append(f"job {row.seq} is {row.state} and its dataset says otherwise")
         if JobState(row.state).is_open != (row.finished_at is None):
             faults.append(f"job {row.seq} is {row.state} and its end says otherwise")
-        own = (
-            select(tasks.c.state)
-            .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-            .where(job_tasks.c.job == row.seq)
-        )
-        there = set(connection.scalars(own))
-        if row.state == JobState.queued and there & {*ON_LEASE}:
-            faults.append(f"job {row.seq} is queued and a task of it is on lease")
-        if row.state == JobState.pausing and not has_exclusive_lease(connection, row.seq, RUNNABLE):
-            faults.append(f"job {row.seq} is pausing and nothing runs for it alone")
-        if (
-            row.state == JobState.cancelling
-            and row.given_up is None
-            and not has_exclusive_lease(connection, row.seq, LIVE)
-        ):
-            faults.append(f"job {row.seq} is cancelling and nothing runs for it alone")
-        is_blocked = TaskState.failed in there and not there & {*ON_LEASE, TaskState.soft_failed}
-        is_blocked &= connection.execute(own.where(IS_READY).limit(1)).first() is None
-        if row.state in (JobState.queued, JobState.running) and is_blocked:
-            faults.append(f"job {row.seq} is {row.state} and only quarantined tasks of it are left")
-    for row in connection.execute(
-        select(dataset_versions.c.manifest, tasks.c.state).join(
+    versions = connection.execute(
+        select(dataset_versions.c.manifest, dataset_versions.c.valid_count, tasks.c.state).join(
             tasks, tasks.c.seq == dataset_versions.c.publish_task
         )
-    ):
-        if row.manifest is None and row.state == TaskState.succeeded:
-            faults.append(
-                f"a version with the manifest {row.manifest} has a publish task that is {row.state}"
-            )
+    )
+    for version in versions:
+        if version.manifest is None and version.state == TaskState.succeeded:
+            faults.append("a version without a manifest has a publish task that has succeeded")
+        if version.manifest is not None and not version.valid_count:
+            faults.append("a version without a valid sample is published")
     return faults
 
 
@@ -200,6 +238,7 @@ def _row_faults(connection: Connection) -> list[str]:
     faults = []
     for name, column in (
         ("job_tasks", job_tasks.c.task),
+        ("ready_tasks", ready_tasks.c.task),
         ("task_dependencies.task", task_dependencies.c.task),
         ("task_dependencies.depends_on", task_dependencies.c.depends_on),
         ("samples.simulate_task", samples.c.simulate_task),

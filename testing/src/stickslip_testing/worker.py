@@ -63,7 +63,7 @@ from stickslip_schemas.store import Store
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.heartbeat import reconcile_leases, renew_leases
 from stickslip_services.queue.lease import lease_tasks, register_worker
-from stickslip_services.queue.report import report_results
+from stickslip_services.queue.results import report_results
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 
@@ -76,11 +76,9 @@ def failure(reason: Reason = Reason.renderer_crash, message: str = "it crashed")
     return TaskResult(outcome="failed", reason=reason, message=message, wall_seconds=1.0)
 
 
-def rejection(message: str = "it diverged") -> TaskResult:
+def rejection(message: str = "it diverged", reason: Reason = Reason.solver_diverged) -> TaskResult:
     """Return the result of a rejected sample."""
-    return TaskResult(
-        outcome="rejected", reason=Reason.solver_diverged, message=message, wall_seconds=1.0
-    )
+    return TaskResult(outcome="rejected", reason=reason, message=message, wall_seconds=1.0)
 
 
 def heartbeat(context: Context, message: Heartbeat) -> HeartbeatAnswer:

@@ -35,7 +35,7 @@ _STATUS: dict[type[errors.StickslipError], tuple[int, ProblemCode]] = {
     errors.KindNotAvailableError: (409, ProblemCode.kind_not_available),
     errors.PresetNotCertifiedError: (409, ProblemCode.preset_not_certified),
     errors.UnknownFileError: (422, ProblemCode.validation_failed),
-    errors.DamagedRowsError: (500, ProblemCode.storage_error),
+    errors.DamagedRowError: (500, ProblemCode.storage_error),
 }
 
 _RULES = {

@@ -17,9 +17,9 @@ from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.local.supervisor import locked
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import scrub as scrubbed
-from stickslip_services.queue.upkeep import reindex as reindexed
-from stickslip_services.queue.upkeep import remove, unused
+from stickslip_services.queue.maintenance import reindex as reindexed
+from stickslip_services.queue.maintenance import remove, unused
+from stickslip_services.queue.scrub import scrub as scrubbed
 from stickslip_services.settings import Settings, options
 
 BYTES_A_MEGABYTE = 1e6

@@ -92,12 +92,31 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
             f"{settings.data}`{same and f' with the same {same}'} to find them again"
         )
     known = {script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()}
+    if revision is not None and revision.startswith("0001") and revision not in known:
+        # The tables of 0.1.0 before its release: there is no migration from them.
+        raise DatabaseRefusedError(
+            f"{name} was made by an earlier state of this version of stickslip, whose tables were others (schema "
+            f"{revision}). Its datasets are in the store {settings.store_place}: {_remedy(settings)}"
+        )
     if revision is not None and revision not in known:
         raise DatabaseRefusedError(
             f"{name} has the schema {revision}, and this version of stickslip knows {max(known)}: install the version "
             f"that made it again, or name another {settings.database_option}"
         )
     return revision is not None
+
+
+def _remedy(settings: Settings) -> str:
+    """Return how to find the datasets of a store again with a new database."""
+    if settings.database_url is None:
+        return (
+            f"move {settings.database_path} away and run `stickslip reindex --data {settings.data}`, which lists them "
+            "again; results that no dataset has are computed again"
+        )
+    return (
+        "name an empty database with --database, and run `stickslip reindex` with it, which lists them again; "
+        "results that no dataset has are computed again"
+    )
 
 
 def _has_versions(settings: Settings) -> bool:
@@ -170,7 +189,7 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
                         "for example with `createdb --owner`"
                     )
                 return None
-            if "alembic_version" not in tables or "task_counts" not in tables:
+            if "alembic_version" not in tables or "job_tasks" not in tables:
                 raise DatabaseRefusedError(
                     f"{name} is not a database of stickslip: give it one of its own, which is empty, with --database"
                 )

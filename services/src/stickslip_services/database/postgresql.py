@@ -128,7 +128,9 @@ class PostgresqlDatabase(Database):
         Until then its plans are those for empty tables.
         """
         with self._toucher.connect() as connection:
-            connection.exec_driver_sql("ANALYZE tasks, job_tasks, task_dependencies, samples")
+            connection.exec_driver_sql(
+                "ANALYZE tasks, job_tasks, ready_tasks, task_dependencies, samples"
+            )
 
     def is_alone(self, connection: Connection) -> bool:
         return not connection.exec_driver_sql(_OTHERS).scalar_one()

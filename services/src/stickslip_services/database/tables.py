@@ -5,6 +5,7 @@ task is its `seq` (8 bytes in five indexes, where its name would be 73); outside
 `<stage>-<key>`. Times are seconds since 1970.
 """
 
+import hashlib
 from typing import Any
 
 import sqlalchemy as sa
@@ -66,17 +67,13 @@ jobs = _numbered(
     sa.Column("sample_count", sa.Integer, nullable=False),
     sa.Column("builds", sa.Text),  # JSON; null until its planning begins
     sa.Column("certificate", sa.String),  # digest of its certificate when planning began
-    sa.Column(
-        "digest", _Wide, nullable=False
-    ),  # of spec, builds and certificate (queue/recompute.py)
+    # Of spec, builds and certificate (queue/integrity.py).
+    sa.Column("digest", _Wide, nullable=False),
     sa.Column(
         "planned", sa.Integer, nullable=False, server_default="0"
     ),  # number of samples whose tasks are inserted
     sa.Column("planner", sa.String),  # the coordinator that plans it
     sa.Column("planner_until", sa.Float),  # when another coordinator may go on with that
-    sa.Column(
-        "given_up", _Wide
-    ),  # the last task that was given up, while a cancelled job has more that wait
     sa.Column("publish_task", _Wide, index=True),  # null until the job is planned
     sa.Column("state", sa.String, nullable=False),
     sa.Column("reason", sa.String),
@@ -89,11 +86,9 @@ jobs = _numbered(
     sa.Column("dataset", sa.String),
     sa.Column("version", sa.Integer),
     sa.Column("manifest", sa.String),
-    sa.Index(
-        "ix_jobs_open",
-        "seq",
-        **_partial("state IN ('planning', 'queued', 'running', 'pausing', 'paused', 'cancelling')"),
-    ),
+    # The state is in the index: which jobs may be served, planned or settled is asked all the time.
+    sa.Index("ix_jobs_open", "state", "seq", **_partial("finished_at IS NULL")),
+    sa.Index("ix_jobs_unplanned", "seq", **_partial("finished_at IS NULL AND builds IS NULL")),
 )
 
 idempotency_keys = _table(
@@ -109,63 +104,53 @@ idempotency_keys = _table(
 tasks = _table(
     "tasks",
     sa.Column("seq", _Wide, primary_key=True),
+    # The content key: equal work is one task, which belongs to no job (see `job_tasks`).
     sa.Column("key", sa.LargeBinary(32), nullable=False, unique=True),
     sa.Column("stage", sa.String, nullable=False),
     sa.Column("kind", sa.String, nullable=False),
-    sa.Column(
-        "build", sa.String, nullable=False
-    ),  # of its stage: what a worker must have to run it
-    sa.Column(
-        "payload", sa.Text, nullable=False
-    ),  # JSON; what the task is besides the results it waits for
+    # The build of its stage: a worker must have it to run the task.
+    sa.Column("build", sa.String, nullable=False),
+    # JSON: the task without the results of its dependencies.
+    sa.Column("payload", sa.Text, nullable=False),
+    # Of key, stage, build and payload (queue/integrity.py).
+    sa.Column("payload_digest", _Wide, nullable=False),
     sa.Column("preview", sa.Boolean, nullable=False),
-    sa.Column(
-        "cost_group", sa.String, nullable=False, server_default=""
-    ),  # tasks of one group cost about the same
-    sa.Column(
-        "job", _Wide, nullable=False
-    ),  # the oldest live job that needs it, while it is pending
+    # Tasks of one group cost about the same.
+    sa.Column("cost_group", sa.String, nullable=False, server_default=""),
     sa.Column("state", sa.String, nullable=False),
     sa.Column("reason", sa.String),
     sa.Column("message", sa.Text, nullable=False, server_default=""),
-    sa.Column("waiting_on", sa.Integer, nullable=False),  # dependencies that are not settled
-    sa.Column(
-        "token", sa.Integer, nullable=False, server_default="0"
-    ),  # fencing: increments at each lease
-    sa.Column("owner", sa.String),  # worker id, while leased or running
+    # Dependencies without a result.
+    sa.Column("waiting_on", sa.Integer, nullable=False),
+    # The fencing token: it increments at each lease.
+    sa.Column("token", sa.Integer, nullable=False, server_default="0"),
+    # The worker, while the task is leased or running.
+    sa.Column("owner", sa.String),
+    # The job whose share of the workers the lease uses.
+    sa.Column("leased_for", _Wide),
     sa.Column("expires_at", sa.Float),
-    sa.Column(
-        "attempts", sa.Integer, nullable=False, server_default="0"
-    ),  # times that it was started
-    sa.Column("tries", sa.Integer, nullable=False, server_default="0"),  # of these, the failed ones
-    sa.Column(
-        "losses", sa.Integer, nullable=False, server_default="0"
-    ),  # of these, the ones that a lost worker ended
+    # How often it was started, how many of these attempts failed, and how many a lost worker ended.
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("tries", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("losses", sa.Integer, nullable=False, server_default="0"),
     sa.Column("retry_at", sa.Float),
     sa.Column("reported_token", sa.Integer),
     sa.Column("reported_by", sa.String),
-    sa.Column("output", sa.Text),  # JSON
-    sa.Column("digest", _Wide),  # of what it made, while it is settled (queue/recompute.py)
+    # JSON: the result.
+    sa.Column("output", sa.Text),
+    # Of key, state, reason, message and output, while it has a result (queue/integrity.py).
+    sa.Column("digest", _Wide),
     sa.Column("cpu_seconds", sa.Float),
     sa.Column("wall_seconds", sa.Float),
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
-    sa.Index(
-        "ix_tasks_ready",
-        "stage",
-        "build",
-        "kind",
-        "job",
-        "seq",
-        "cost_group",
-        **_partial("state = 'pending' AND waiting_on = 0"),
-    ),
-    sa.Index("ix_tasks_leased", "owner", **_partial("owner IS NOT NULL")),
+    sa.Index("ix_tasks_owner", "owner", **_partial("owner IS NOT NULL")),
+    sa.Index("ix_tasks_leased", "stage", "leased_for", **_partial("owner IS NOT NULL")),
     sa.Index("ix_tasks_retry", "retry_at", **_partial("state = 'soft_failed'")),
 )
 
 # The bulk tables have no foreign keys: checking them would double the time of a plan, rows are only
-# ever written by plan.py, and the tests check that both ends exist.
+# ever written by insertion.py and ready.py, and the tests check that both ends exist.
 
 task_dependencies = _table(
     "task_dependencies",
@@ -178,7 +163,21 @@ job_tasks = _table(
     "job_tasks",
     _key("job"),
     sa.Column("task", _Wide, primary_key=True, autoincrement=False, index=True),
-    sa.Column("cached", sa.Boolean, nullable=False),  # it was settled before the job was submitted
+    # It had its result before the job was submitted.
+    sa.Column("cached", sa.Boolean, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+# The queue: a row for each active job that needs a task that can run now. The key begins with the
+# task, so that a lease deletes the rows of its tasks by the key. Rows of a job that has ended stay
+# until another job leases the task: nobody reads them.
+ready_tasks = _table(
+    "ready_tasks",
+    _key("task"),
+    _key("job"),
+    sa.Column("stage", sa.String, nullable=False),
+    sa.Column("cost_group", sa.String, nullable=False),
+    sa.Index("ix_ready_tasks_lease", "job", "stage", "task", "cost_group"),
     sqlite_with_rowid=False,
 )
 
@@ -199,41 +198,24 @@ previews = _table(
     "previews", _key("task"), sa.Column("digest", sa.String, nullable=False, index=True)
 )
 
-# Counters, updated by the ledger in the transaction that moves the tasks, so that showing progress
-# counts no rows.
-
-job_counts = _table(
-    "job_counts",
+# Totals of results, written once a task, when it gets its result. Tasks in flight are few, and are
+# counted when progress is shown.
+job_totals = _table(
+    "job_totals",
     sa.Column("job", _Wide, sa.ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
     sa.Column("stage", sa.String, primary_key=True),
-    sa.Column("state", sa.String, primary_key=True),
-    sa.Column("count", sa.Integer, nullable=False),
-)
-
-job_stages = _table(
-    "job_stages",
-    sa.Column("job", _Wide, sa.ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
-    sa.Column("stage", sa.String, primary_key=True),
-    sa.Column("cached", sa.Integer, nullable=False),
+    sa.Column("cost_group", sa.String, primary_key=True),
+    sa.Column("total", sa.Integer, nullable=False, server_default="0"),
+    # Tasks that had their result before the job was submitted; their cost is not the job's.
+    sa.Column("cached", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("succeeded", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("rejected", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("failed", sa.Integer, nullable=False, server_default="0"),
     sa.Column("cpu_seconds", sa.Float, nullable=False, server_default="0"),
     sa.Column("wall_count", sa.Integer, nullable=False, server_default="0"),
     sa.Column("wall_sum", sa.Float, nullable=False, server_default="0"),
     sa.Column("wall_squares", sa.Float, nullable=False, server_default="0"),
-)
-
-task_counts = _table(
-    "task_counts",
-    sa.Column("stage", sa.String, primary_key=True),
-    sa.Column("state", sa.String, primary_key=True),
-    sa.Column("count", sa.Integer, nullable=False),
-)
-
-job_groups = _table(
-    "job_groups",
-    sa.Column("job", _Wide, sa.ForeignKey("jobs.seq"), primary_key=True, autoincrement=False),
-    sa.Column("stage", sa.String, primary_key=True),
-    sa.Column("cost_group", sa.String, primary_key=True),
-    sa.Column("left", sa.Integer, nullable=False),  # tasks of the group that are not over
+    sa.Index("ix_job_totals_failed", "job", **_partial("failed > 0")),
 )
 
 cost_groups = _table(
@@ -353,3 +335,19 @@ events = _table(
     sa.Index("ix_events_job_id", "job", "id"),
     sqlite_autoincrement=True,
 )
+
+
+def schema_digest() -> str:
+    """Return 12 characters that change with any table, column or index."""
+    lines: list[str] = []
+    for table in metadata.sorted_tables:
+        for column in table.columns:
+            kind = type(column.type).__name__
+            lines.append(
+                f"{table.name}.{column.name} {kind} {column.nullable} {column.primary_key}"
+            )
+        for index in sorted(table.indexes, key=lambda index: str(index.name)):
+            columns = " ".join(column.name for column in index.columns)
+            condition = index.dialect_options["sqlite"]["where"]
+            lines.append(f"{index.name} on {columns} where {condition}")
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]

@@ -1,7 +1,7 @@
 """The context of one coordinator: what the verbs of the queue share, and its state in memory.
 
 The store is watched: while it takes no results, jobs are paused; afterwards they resume. Trouble is
-found by a look of the coordinator, or reported by a worker that could not write.
+found by a check of the coordinator, or reported by a worker that could not write.
 """
 
 import asyncio
@@ -16,7 +16,8 @@ from stickslip_schemas.store import DirectoryStore, Store, open_store
 
 from stickslip_services.database.database import Clock, Database, Role
 from stickslip_services.database.opening import connect
-from stickslip_services.queue.transaction import QueueTransaction, queue_transaction
+from stickslip_services.queue.job_builds import JobBuilds
+from stickslip_services.queue.transaction import QueueTransaction
 from stickslip_services.settings import Settings
 
 HOLD_SECONDS = 10.0
@@ -26,13 +27,31 @@ PROBE_SECONDS = 10.0
 """Time between two probes of a working bucket [s]: each probe costs requests."""
 
 
+class Turns:
+    """When each project got its last task, as a number that grows; lost with a restart."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+        self._turn = 0
+
+    def last(self, project: str) -> int:
+        """Return the last turn of a project; 0 before its first."""
+        return self._last.get(project, 0)
+
+    def take(self, project: str) -> int:
+        """Give a project the next turn, and return it."""
+        self._turn += 1
+        self._last[project] = self._turn
+        return self._turn
+
+
 class StoreWatch:
     """Monitors the store and the directory of the database."""
 
     def __init__(
         self, store: Store, data: Path, *, min_free_bytes: int, clock: Callable[[], float]
     ) -> None:
-        self._places: tuple[Store, ...] = (store, DirectoryStore(data))
+        self._stores: tuple[Store, ...] = (store, DirectoryStore(data))
         self._min_free_bytes = min_free_bytes
         self._clock = clock
         self._reported = ""
@@ -41,32 +60,41 @@ class StoreWatch:
         self.trouble = ""
         """Description of the fault; empty without one."""
 
-    def look(self) -> str:
+    def check(self) -> str:
         """Check again; return the fault."""
         reported = self._reported if self._clock() < self._reported_until else ""
         self.trouble = self._fault() or reported
         return self.trouble
 
-    def note(self, message: str) -> None:
-        """Note a worker's report that the store cannot be written."""
+    def report(self, message: str) -> None:
+        """Record a worker's report that the store cannot be written."""
         self._reported = message
         self._reported_until = self._clock() + HOLD_SECONDS
         self.trouble = self.trouble or message
 
     def _fault(self) -> str:
-        for looked_at in self._places:
+        for store in self._stores:
             try:
-                room = looked_at.disk_usage()
-                if room is not None and room.free < self._min_free_bytes:
-                    left, least = room.free / 2**20, self._min_free_bytes / 2**20
-                    return f"{looked_at.place} has {left:.3g} MiB left, and {least:.3g} MiB must stay free"
-                if room is None and not self.trouble:
-                    if self._clock() < self._next_probe:
-                        continue
-                    self._next_probe = self._clock() + PROBE_SECONDS
-                looked_at.probe()
+                fault = self._fault_of(store)
             except OSError as error:
-                return f"{looked_at.place} cannot be written: {error.strerror or error}"
+                return f"{store.place} cannot be written: {error.strerror or error}"
+            if fault:
+                return fault
+        return ""
+
+    def _fault_of(self, store: Store) -> str:
+        """Return the fault of one store; raise OSError where it cannot be written."""
+        room = store.disk_usage()
+        if room is not None and room.free < self._min_free_bytes:
+            free = room.free / 2**20
+            least = self._min_free_bytes / 2**20
+            return f"{store.place} has {free:.3g} MiB left, and {least:.3g} MiB must stay free"
+        if room is None and not self.trouble:
+            # A bucket: each probe costs requests.
+            if self._clock() < self._next_probe:
+                return ""
+            self._next_probe = self._clock() + PROBE_SECONDS
+        store.probe()
         return ""
 
 
@@ -124,6 +152,13 @@ class Context:
     """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an
     earlier process.
     """
+    job_builds: JobBuilds = field(default_factory=JobBuilds)
+    turns: Turns = field(default_factory=Turns)
+    next_job_check: float = float("-inf")
+    """When the rows of the active jobs are checked for damage again [s since 1970]."""
+    last_situation: tuple[int, tuple[tuple[str, str], ...]] | None = None
+    """Writes and workers when it was asked last which jobs no worker can run (`workers`)."""
+    next_situation_check: float = float("-inf")
     is_closing: bool = False
 
     @classmethod
@@ -147,9 +182,9 @@ class Context:
 
     @contextmanager
     def transaction(self) -> Iterator[QueueTransaction]:
-        """Open a write transaction with a ledger; notify watchers after the commit."""
-        with self.database.write() as connection, queue_transaction(connection, self.clock()) as tx:
-            yield tx
+        """Open a write transaction; notify watchers after the commit."""
+        with self.database.write() as connection:
+            yield QueueTransaction(connection, self.clock())
         self.notifier.notify()
 
     @property

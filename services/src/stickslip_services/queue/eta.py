@@ -1,5 +1,4 @@
-"""Progress of jobs, what tasks cost, and the time that is left, from measured durations, with its
-uncertainty.
+"""The time that a job still takes, from measured durations of tasks, with its uncertainty.
 
 With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over
 k_g measured tasks, and p slots to run them on,
@@ -18,26 +17,18 @@ The cost of a task is its share of the wall time of the call that made it; the c
 hang.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any, Self
+from typing import NamedTuple, Self
 
-from sqlalchemy import Connection, Row, select
-from stickslip_schemas.base import JobState, Stage, TaskState
-from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
+from sqlalchemy import Connection
+from stickslip_schemas.base import Stage
+from stickslip_schemas.documents.responses import Eta
 from stickslip_schemas.documents.tasks import TaskResult
 
-from stickslip_services.database.database import Prepared
-from stickslip_services.database.tables import (
-    cost_groups,
-    job_counts,
-    job_groups,
-    job_stages,
-    job_tasks,
-    tasks,
-)
-from stickslip_services.queue.ids import task_key
+from stickslip_services.database.statements import RowQuery, Statement
+from stickslip_services.queue.rows import LeasedTask
 
 QUANTILE_80 = 1.2816
 MODEL_ERROR = 0.15  # f
@@ -203,18 +194,34 @@ def timings_of(
     return pooled(costs, stage, kind)
 
 
-_ALL_COSTS = Prepared(select(cost_groups))
+class _CostRow(NamedTuple):
+    """A row of `cost_groups`."""
+
+    stage: str
+    kind: str
+    cost_group: str
+    number: int
+    wall_sum: float
+    wall_squares: float
+    call_sum: float
+    call_squares: float
+
+
+_COSTS = RowQuery(
+    _CostRow,
+    "SELECT stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares "
+    "FROM cost_groups",
+)
 
 
 def read_costs(connection: Connection) -> dict[Group, Cost]:
-    return {
-        (Stage(stage), kind, group): Cost(
-            StageTimings(count, wall_sum, wall_squares), StageTimings(count, call_sum, call_squares)
-        )
-        for stage, kind, group, count, wall_sum, wall_squares, call_sum, call_squares in _ALL_COSTS.tuples(
-            connection
-        )
-    }
+    """Return the measured durations of all cost groups."""
+    costs: dict[Group, Cost] = {}
+    for row in _COSTS.rows(connection):
+        share = StageTimings(row.number, row.wall_sum, row.wall_squares)
+        call = StageTimings(row.number, row.call_sum, row.call_squares)
+        costs[Stage(row.stage), row.kind, row.cost_group] = Cost(share, call)
+    return costs
 
 
 def limit_seconds(cost: Cost | None, tries: int, *, floor: float) -> float | None:
@@ -240,150 +247,46 @@ def long_groups(
     ]
 
 
-def add_costs(connection: Connection, runs: Sequence[tuple[Any, TaskResult]]) -> None:
+class Run(NamedTuple):
+    """An attempt of a task that ended with a result."""
+
+    task: LeasedTask
+    result: TaskResult
+
+
+def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
     """Add the costs of tasks that have a representative call; rejections often come early."""
-    by_group: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for task, run in runs:
-        if run.call_seconds is not None and run.outcome == "succeeded":
-            group = by_group.setdefault((task.stage, task.kind, task.cost_group), [])
-            group.append((run.wall_seconds, run.call_seconds))
-    for (stage, kind, cost_group), costs in by_group.items():
-        wall, call = (StageTimings.of(seconds) for seconds in zip(*costs, strict=True))
-        sums = {
-            "n": wall.count,
-            "wall": wall.total,
-            "wall2": wall.squares,
-            "call": call.total,
-            "call2": call.squares,
-        }
-        _ADD_TO_COST_GROUPS.run(
-            connection, {"stage": stage, "kind": kind, "cost_group": cost_group, **sums}
+    runs_by_group: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for task, result in runs:
+        if result.call_seconds is not None and result.outcome == "succeeded":
+            group = runs_by_group.setdefault((task.stage, task.kind, task.cost_group), [])
+            group.append((result.wall_seconds, result.call_seconds))
+    rows: list[dict[str, object]] = []
+    for (stage, kind, cost_group), seconds in runs_by_group.items():
+        wall = StageTimings.of([wall_seconds for wall_seconds, _ in seconds])
+        call = StageTimings.of([call_seconds for _, call_seconds in seconds])
+        rows.append(
+            {
+                "stage": stage,
+                "kind": kind,
+                "cost_group": cost_group,
+                "n": wall.count,
+                "wall": wall.total,
+                "wall2": wall.squares,
+                "call": call.total,
+                "call2": call.squares,
+            }
         )
+    _ADD_TO_COST_GROUPS.run_all(connection, rows)
 
 
+_SUMS = ("count", "wall_sum", "wall_squares", "call_sum", "call_squares")
 _DIVISOR = f"CASE WHEN cost_groups.count > {KEPT_RUNS} THEN 2 ELSE 1 END"
-_ADD_TO_COST_GROUPS = Prepared(
-    "INSERT INTO cost_groups (stage, kind, cost_group, count, wall_sum, wall_squares, call_sum, call_squares) "
+_FADED_SUMS = [
+    f"{column} = cost_groups.{column} / ({_DIVISOR}) + excluded.{column}" for column in _SUMS
+]
+_ADD_TO_COST_GROUPS = Statement(
+    f"INSERT INTO cost_groups (stage, kind, cost_group, {', '.join(_SUMS)}) "
     "VALUES (:stage, :kind, :cost_group, :n, :wall, :wall2, :call, :call2) "
-    "ON CONFLICT (stage, kind, cost_group) DO UPDATE SET "
-    + ", ".join(
-        f"{column} = cost_groups.{column} / ({_DIVISOR}) + excluded.{column}"
-        for column in ("count", "wall_sum", "wall_squares", "call_sum", "call_squares")
-    )
+    f"ON CONFLICT (stage, kind, cost_group) DO UPDATE SET {', '.join(_FADED_SUMS)}"
 )
-
-
-Frames = Mapping[str, tuple[int, int]]
-"""Progress of running simulations by task: (frames done, frames total)."""
-
-
-def read_progress(
-    connection: Connection,
-    rows: Collection[Row[tuple[object, ...]]],
-    slots: Mapping[int, int],
-    frames: Frames,
-) -> dict[int, Progress]:
-    """Return the progress of jobs (rows of `jobs`) by `seq`.
-
-    `slots` is the number of tasks that can run at once.
-    """
-    seqs, costs = [row.seq for row in rows], read_costs(connection)
-    counts: dict[tuple[int, str], dict[TaskState, int]] = {}
-    for job, stage, state, count in connection.execute(
-        select(job_counts).where(job_counts.c.job.in_(seqs))
-    ):
-        counts.setdefault((job, stage), {})[TaskState(state)] = count
-    stages = {
-        (row.job, row.stage): row
-        for row in connection.execute(select(job_stages).where(job_stages.c.job.in_(seqs)))
-    }
-    running = [row.seq for row in rows if row.state in (JobState.queued, JobState.running)]
-    groups: dict[tuple[int, str], list[tuple[str, int]]] = {}
-    if running:
-        for job, stage, group, left in connection.execute(
-            select(job_groups).where(job_groups.c.job.in_(running))
-        ):
-            groups.setdefault((job, stage), []).append((group, left))
-    told = _frames(connection, seqs, frames)
-
-    def progress_of(row: Row[tuple[object, ...]]) -> Progress:
-        shown: dict[Stage, StageProgress] = {}
-        work: dict[Stage, list[StageWork]] = {}
-        for stage in Stage:
-            kept = stages.get((row.seq, stage))
-            if kept is None:  # not planned yet
-                continue
-            mine = [
-                each
-                for key, of_group in told.items()
-                if key[:2] == (row.seq, stage)
-                for each in of_group
-            ]
-            shown[stage] = StageProgress(
-                counts={state: count for state, count in counts[row.seq, stage].items() if count},
-                cached=kept.cached,
-                cpu_seconds=kept.cpu_seconds,
-                frames=(sum(done for done, _ in mine), sum(total for _, total in mine))
-                if mine
-                else None,
-            )
-            work[stage] = []
-            for group, left in groups.get((row.seq, stage), ()):
-                finished = sum(
-                    done / max(total, 1) for done, total in told.get((row.seq, stage, group), ())
-                )
-                work[stage].append(
-                    StageWork(left - finished, timings_of(costs, stage, row.kind, group))
-                )
-        eta = None
-        if (
-            row.state in (JobState.queued, JobState.running) and row.builds is not None
-        ):  # else the work is not known
-            eta = estimate(work, slots=slots.get(row.seq, 0))
-        return Progress(
-            done=sum(
-                count
-                for stage in shown.values()
-                for state, count in stage.counts.items()
-                if state.is_over
-            ),
-            total=sum(count for stage in shown.values() for count in stage.counts.values()),
-            planned=row.planned,
-            stages=shown,
-            eta=eta,
-        )
-
-    return {row.seq: progress_of(row) for row in rows}
-
-
-def _frames(
-    connection: Connection, seqs: list[int], frames: Frames
-) -> dict[tuple[int, str, str], list[tuple[int, int]]]:
-    """Return what running simulations report, (frames done, frames total), by job, stage and cost
-    group.
-    """
-    found: dict[tuple[int, str, str], list[tuple[int, int]]] = {}
-    by_key = {key: frames[name] for name in frames if (key := task_key(name)) is not None}
-    if not by_key:
-        return found
-    rows = connection.execute(
-        select(job_tasks.c.job, tasks.c.stage, tasks.c.cost_group, tasks.c.key)
-        .join(tasks, tasks.c.seq == job_tasks.c.task)
-        .where(
-            tasks.c.key.in_(by_key), tasks.c.state == TaskState.running, job_tasks.c.job.in_(seqs)
-        )
-    )
-    for job, stage, group, key in rows:
-        found.setdefault((job, stage, group), []).append(by_key[key])
-    return found
-
-
-def rejected_samples(progress: Progress) -> int:
-    """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
-    rendered = progress.stages.get(Stage.render)
-    last = (
-        rendered
-        if rendered is not None and rendered.counts
-        else progress.stages.get(Stage.simulate)
-    )
-    return 0 if last is None else last.counts.get(TaskState.rejected, 0)

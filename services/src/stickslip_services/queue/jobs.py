@@ -4,10 +4,10 @@ import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
-from sqlalchemy import Connection, Row, func, or_, select
-from stickslip_schemas.base import JobState, Reason, Stage, TaskState
+from sqlalchemy import Connection, Row, bindparam, func, or_, select
+from stickslip_schemas.base import JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetRef,
     EventName,
@@ -20,36 +20,42 @@ from stickslip_schemas.documents.responses import (
 )
 
 from stickslip_services.access.principals import is_visible_project, is_visible_task
-from stickslip_services.database.database import PageRequest, Prepared, document_of, read_page
-from stickslip_services.database.tables import (
-    events,
-    job_stages,
-    job_tasks,
-    jobs,
-    previews,
-    samples,
-    tasks,
-)
-from stickslip_services.errors import NotFoundError
+from stickslip_services.database.database import PageRequest, document_of, read_page
+from stickslip_services.database.statements import RowQuery, ValueQuery
+from stickslip_services.database.tables import events, job_tasks, jobs, previews, samples, tasks
+from stickslip_services.errors import DamagedRowError, NotFoundError
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.eta import Frames, StageTimings, read_progress, rejected_samples
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.recompute import check_results, check_samples, terms_of
-from stickslip_services.queue.transaction import RUNNABLE
+from stickslip_services.queue.integrity import check_results, check_samples, plan_inputs_of, spec_of
+from stickslip_services.queue.progress import Frames, read_progress, rejected_samples
+from stickslip_services.queue.rows import (
+    FINISHED,
+    SCHEDULABLE,
+    SampleRow,
+    TaskResultRow,
+    task_columns,
+)
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
 
-_UNSETTLED = [state for state in TaskState if not state.is_settled]
-_RUNNABLE_JOB = Prepared(select(jobs.c.seq).where(jobs.c.state.in_(RUNNABLE)).limit(1))
+_WITHOUT_RESULT = [state.value for state in TaskState if not state.is_settled]
+
+_SCHEDULABLE_JOB: ValueQuery[int] = ValueQuery(
+    "SELECT seq FROM jobs WHERE jobs.finished_at IS NULL "
+    "AND state IN ('planning', 'queued', 'running') LIMIT 1"
+)
 
 
-def has_runnable_job(connection: Connection) -> bool:
-    return _RUNNABLE_JOB.scalar(connection) is not None
+_RESULTS = RowQuery(
+    TaskResultRow,
+    select(*task_columns(TaskResultRow)).where(
+        tasks.c.seq.in_(bindparam("b_tasks", expanding=True))
+    ),
+)
 
 
-def unplanned_jobs(connection: Connection) -> Sequence[Row[Any, Any]]:
-    """Return the rows of the jobs that wait for the first worker."""
-    query = select(jobs).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_(None))
-    return connection.execute(query.order_by(jobs.c.seq)).all()
+def has_schedulable_job(connection: Connection) -> bool:
+    """Return whether tasks of any job may be leased, now or later."""
+    return _SCHEDULABLE_JOB.first(connection) is not None
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
@@ -65,11 +71,12 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
 def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
     """Return a job with its spec, as a transaction sees it."""
     row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
-    (shown,) = _shown(connection, [row], alive_workers(context, connection), context.frames)
-    detail = JobDetail(**dict(shown), spec=terms_of(row)[0])
-    if (
-        context.store_watch.trouble and detail.state in RUNNABLE
-    ):  # the database may not be writable either
+    spec = spec_of(row)
+    workers = alive_workers(context, connection)
+    (entry,) = _entries(connection, [row], workers, context.frames)
+    detail = JobDetail(**dict(entry), spec=spec)
+    # While the store takes no results, the database may not be writable either.
+    if context.store_watch.trouble and detail.state in SCHEDULABLE:
         return detail.model_copy(
             update={"reason": Reason.store_unavailable, "message": context.store_watch.trouble}
         )
@@ -92,15 +99,19 @@ def list_jobs(
     workers = alive_workers(context, connection)
     query = select(jobs).where(is_visible_project(jobs.c.project))
     if search:
-        places = (jobs.c.name, jobs.c.kind, jobs.c.id, jobs.c.dataset)
-        query = query.where(or_(*(place.icontains(search, autoescape=True) for place in places)))
-    query = query if state is None else query.where(jobs.c.state == state)
-    query = query.where(jobs.c.project == project) if project else query
-    shown = partial(_shown, connection, workers=workers, frames={})
-    return read_page(connection, query, page, jobs.c.seq, shown, newest_first=newest_first)
+        columns = (jobs.c.name, jobs.c.kind, jobs.c.id, jobs.c.dataset)
+        matches = [column.icontains(search, autoescape=True) for column in columns]
+        query = query.where(or_(*matches))
+    if state is not None:
+        query = query.where(jobs.c.state == state)
+    if project:
+        query = query.where(jobs.c.project == project)
+    entries = partial(_entries, connection, workers=workers, frames={})
+    return read_page(connection, query, page, jobs.c.seq, entries, newest_first=newest_first)
 
 
 def job_projects(connection: Connection) -> list[str]:
+    """Return the projects that have jobs, those that the principal sees."""
     query = select(jobs.c.project).where(is_visible_project(jobs.c.project)).distinct()
     return list(connection.scalars(query.order_by(jobs.c.project)))
 
@@ -108,29 +119,81 @@ def job_projects(connection: Connection) -> list[str]:
 def list_samples(
     connection: Connection, job: int, page: PageRequest, state: TaskState | None
 ) -> Page[SampleState]:
-    """Return a page of the samples of a job by slot, each with the state of its last task."""
+    """Return a page of the samples of a job by slot, each with the state of its last task.
+
+    Raises DamagedRowError.
+    """
     last = func.coalesce(samples.c.render_task, samples.c.simulate_task)
     query = (
         select(samples, tasks.c.seq, tasks.c.state, tasks.c.reason, tasks.c.message)
         .join(tasks, tasks.c.seq == last)
         .where(samples.c.job == job)
     )
+    row = connection.execute(
+        select(jobs.c.planned, jobs.c.finished_at).where(jobs.c.seq == job)
+    ).one()
+    shown_job = _JobOfSamples(job, row.planned, has_ended=row.finished_at is not None)
     if state is not None:
-        query = query.where(tasks.c.state == state)
+        query = query.where(tasks.c.state.in_(_stored_states(state, shown_job)))
+    return read_page(
+        connection,
+        query,
+        page,
+        samples.c.slot,
+        partial(_sample_states, connection, shown_job, page, state),
+        newest_first=False,
+    )
 
-    def checked(rows: Sequence[Row[Any]]) -> Iterable[SampleState]:
+
+class _JobOfSamples(NamedTuple):
+    seq: int
+    planned: int
+    has_ended: bool
+
+
+_UNFINISHED = [state.value for state in TaskState if state not in FINISHED]
+"""States of a task that a job does not get any more once it has ended: shown as `cancelled`."""
+
+
+def _stored_states(state: TaskState, job: _JobOfSamples) -> list[str]:
+    """Return the states in the database of the samples that are shown in a state."""
+    if not job.has_ended:
+        return [state.value]
+    if state is TaskState.cancelled:
+        return _UNFINISHED
+    return [] if state.value in _UNFINISHED else [state.value]
+
+
+def _sample_states(
+    connection: Connection,
+    job: _JobOfSamples,
+    page: PageRequest,
+    state: TaskState | None,
+    rows: Sequence[Row[tuple[object, ...]]],
+) -> Iterable[SampleState]:
+    """Check rows of samples with their last tasks, and return them as the API shows them."""
+    sample_rows = [SampleRow(*(getattr(row, name) for name in SampleRow._fields)) for row in rows]
+    if state is None:
         first = 0 if page.after is None else page.after + 1
-        planned = connection.execute(select(jobs.c.planned).where(jobs.c.seq == job)).scalar_one()
-        page_slots = range(first, min(first + page.size, planned))
-        check_samples(rows, page_slots if state is None else [row.slot for row in rows])
-        settled = [row.seq for row in rows if row.state not in _UNSETTLED]  # a damaged state, too
-        check_results(connection.execute(select(tasks).where(tasks.c.seq.in_(settled))).all())
-        return [
-            document_of(SampleState, row, sample_key=row.key.hex(), labels=json.loads(row.labels))
-            for row in rows
-        ]
+        slots = list(range(first, min(first + page.size, job.planned)))
+    else:
+        slots = [row.slot for row in sample_rows]
+    check_samples(sample_rows, job.seq, slots)
 
-    return read_page(connection, query, page, samples.c.slot, checked, newest_first=False)
+    # A state that is none of the others is damaged: its result is checked, too.
+    with_result = [row.seq for row in rows if row.state not in _WITHOUT_RESULT]
+    check_results(_RESULTS.batched_rows(connection, "b_tasks", with_result))
+
+    states: list[SampleState] = []
+    for row in rows:
+        labels = json.loads(row.labels)
+        is_cancelled = job.has_ended and row.state in _UNFINISHED
+        shown_state = TaskState.cancelled if is_cancelled else row.state
+        key = row.key.hex()
+        states.append(
+            document_of(SampleState, row, sample_key=key, labels=labels, state=shown_state)
+        )
+    return states
 
 
 def list_previews(
@@ -177,32 +240,33 @@ def read_events(connection: Connection, job: int, *, after: int, limit: int) -> 
     return [StoredEvent(row.id, EventName(row.name), row.data) for row in rows]
 
 
-def stage_durations(connection: Connection, job: int) -> dict[Stage, StageTimings]:
-    """Return the measured durations of the tasks that a job had to run, by stage."""
-    rows = connection.execute(select(job_stages).where(job_stages.c.job == job))
-    return {
-        Stage(row.stage): StageTimings(row.wall_count, row.wall_sum, row.wall_squares)
-        for row in rows
-    }
+class SlowTask(NamedTuple):
+    """A finished task with its durations [s]."""
+
+    task_id: str
+    stage: str
+    cost_group: str
+    cpu_seconds: float | None
+    wall_seconds: float
 
 
-def slowest_tasks(connection: Connection, job: int, count: int) -> list[dict[str, Any]]:
-    """Return the finished tasks of a job that took longest, with names, cost groups and durations
-    [s].
-    """
+def slowest_tasks(connection: Connection, job: int, count: int) -> list[SlowTask]:
+    """Return the finished tasks of a job that took longest."""
+    columns = tasks.c
     rows = connection.execute(
         select(
-            *(
-                tasks.c[name]
-                for name in ("key", "stage", "cost_group", "cpu_seconds", "wall_seconds")
-            )
+            columns.key,
+            columns.stage,
+            columns.cost_group,
+            columns.cpu_seconds,
+            columns.wall_seconds,
         )
-        .join(job_tasks, job_tasks.c.task == tasks.c.seq)
-        .where(job_tasks.c.job == job, tasks.c.wall_seconds.is_not(None))
-        .order_by(tasks.c.wall_seconds.desc())
+        .join(job_tasks, job_tasks.c.task == columns.seq)
+        .where(job_tasks.c.job == job, columns.wall_seconds.is_not(None))
+        .order_by(columns.wall_seconds.desc())
         .limit(count)
     )
-    return [{**row, "task_id": task_id(row.stage, row.key)} for row in rows.mappings()]
+    return [SlowTask(task_id(row.stage, row.key), *row[1:]) for row in rows]
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
@@ -215,24 +279,37 @@ def is_preview(connection: Connection, digest: str) -> bool:
     return connection.scalar(query.limit(1)) is not None
 
 
-def _shown(
+def _entries(
     connection: Connection,
     rows: Sequence[Row[tuple[object, ...]]],
     workers: Collection[RegisteredWorker],
     frames: Frames,
 ) -> list[Job]:
-    served = (JobState.queued, JobState.running)
-    slots = {
-        row.seq: count_slots(workers, row.kind, row.builds) for row in rows if row.state in served
-    }
+    """Return rows of `jobs` as the API shows them."""
+    slots: dict[int, int] = {}
+    for row in rows:
+        if row.state in (JobState.queued, JobState.running):
+            slots[row.seq] = _slots_of(row, workers)
     progress = read_progress(connection, rows, slots, frames)
-    return [
-        document_of(
-            Job,
-            row,
-            rejected_count=row.rejected_count or rejected_samples(progress[row.seq]),
-            progress=progress[row.seq],
-            dataset=None if row.manifest is None else document_of(DatasetRef, row),
+    entries: list[Job] = []
+    for row in rows:
+        progress_of_job = progress[row.seq]
+        entries.append(
+            document_of(
+                Job,
+                row,
+                rejected_count=row.rejected_count or rejected_samples(progress_of_job),
+                progress=progress_of_job,
+                dataset=None if row.manifest is None else document_of(DatasetRef, row),
+            )
         )
-        for row in rows
-    ]
+    return entries
+
+
+def _slots_of(row: Row[tuple[object, ...]], workers: Collection[RegisteredWorker]) -> int:
+    """Return the number of tasks of a job that can run at once."""
+    try:
+        inputs = plan_inputs_of(row)
+    except DamagedRowError:
+        return 0  # a list shows the other jobs; this one is about to fail
+    return 0 if inputs is None else count_slots(workers, row.kind, inputs.builds)

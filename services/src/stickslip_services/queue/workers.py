@@ -1,11 +1,11 @@
 """Workers: registered dispatchers, what they can run, and jobs that no connected worker can run."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import NamedTuple
 
 from sqlalchemy import Connection, bindparam, insert, select, update
 from stickslip_schemas.base import JobState, Reason, Stage
@@ -15,12 +15,14 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.costs import MachineSpeed
 
 from stickslip_services.access.principals import is_visible_project
-from stickslip_services.database.database import Prepared, as_datetime, document_of
+from stickslip_services.database.database import as_datetime, document_of
+from stickslip_services.database.statements import RowQuery
 from stickslip_services.database.tables import jobs, tasks, workers
 from stickslip_services.errors import KindNotAvailableError, UnknownWorkerError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import new_id, task_id
-from stickslip_services.queue.transaction import IS_LEASED, RUNNABLE
+from stickslip_services.queue.job_states import set_job_state
+from stickslip_services.queue.rows import IS_LEASED
 
 NO_WORKER = (
     "no worker has told its builds yet; the job is planned when one does (see the workers page)"
@@ -65,21 +67,36 @@ def insert_worker(
     return find_worker(connection, worker_id)
 
 
-_WORKER = Prepared(select(workers).where(workers.c.id == bindparam("b_id")))
+class _WorkerRow(NamedTuple):
+    """A row of `workers`."""
+
+    id: str
+    name: str
+    builds: str
+    condition: str
+    versions: str
+    registered_at: float
+    last_seen_at: float
+    superseded: bool
+
+
+_COLUMNS = [workers.c[name] for name in _WorkerRow._fields]
+_WORKER = RowQuery(_WorkerRow, select(*_COLUMNS).where(workers.c.id == bindparam("b_id")))
 
 
 def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
     """Return a worker, superseded or not; raise UnknownWorkerError."""
-    rows = _WORKER.rows(connection, {"b_id": worker_id})
-    if not rows:
+    row = _WORKER.first(connection, {"b_id": worker_id})
+    if row is None:
         raise UnknownWorkerError(f"no worker has the id {worker_id!r}: register again")
-    return _worker(rows[0])
+    return _worker(row)
 
 
-_PRESENT_WORKERS = Prepared(
-    select(workers)
+_PRESENT_WORKERS = RowQuery(
+    _WorkerRow,
+    select(*_COLUMNS)
     .where(~workers.c.superseded, workers.c.last_seen_at >= bindparam("b_since"))
-    .order_by(workers.c.seq.desc())
+    .order_by(workers.c.seq.desc()),
 )
 
 
@@ -112,7 +129,13 @@ def builds_for(connection: Connection, kind: str) -> Builds | None:
     )
 
 
-_HEARD = Prepared(
+class _TouchedWorker(NamedTuple):
+    id: str
+    condition: str
+
+
+_TOUCH = RowQuery(
+    _TouchedWorker,
     update(workers)
     .where(
         workers.c.id.in_(
@@ -122,24 +145,27 @@ _HEARD = Prepared(
         )
     )
     .values(last_seen_at=bindparam("b_now"))
-    .returning(workers.c.id, workers.c.condition)
+    .returning(workers.c.id, workers.c.condition),
 )
 
 
 def touch_workers(
-    connection: Connection, ids: Collection[str], now: float
+    connection: Connection, ids: Sequence[str], now: float
 ) -> dict[str, WorkerCondition]:
-    """Store when workers were heard.
+    """Store the time of messages of workers.
 
-    Return how they were, without those that a writer has locked or nobody knows.
+    Return their conditions, without those that a writer has locked or nobody knows.
     """
-    rows = _HEARD.tuples(connection, {"b_ids": ids, "b_now": now})
-    return {worker: WorkerCondition.model_validate_json(condition) for worker, condition in rows}
+    conditions: dict[str, WorkerCondition] = {}
+    for row in _TOUCH.rows(connection, {"b_ids": ids, "b_now": now}):
+        conditions[row.id] = WorkerCondition.model_validate_json(row.condition)
+    return conditions
 
 
 def record_condition(
     connection: Connection, worker_id: str, now: float, condition: WorkerCondition
 ) -> None:
+    """Store how a worker says that it is."""
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
@@ -154,15 +180,9 @@ def mean_speed(workers: Collection[RegisteredWorker]) -> MachineSpeed:
     return MachineSpeed(cpu_speed=cpu_speed / slots, cpu_available=cpu_available / slots)
 
 
-def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: str | None) -> int:
-    """Return the number of tasks of a job that can run at once.
-
-    `builds` is JSON, None for an unplanned job.
-    """
-    if builds is None:
-        return 0
-    needed = Builds.model_validate_json(builds)
-    return sum(worker.condition.slots for worker in workers if worker.builds.get(kind) == needed)
+def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: Builds) -> int:
+    """Return the number of tasks of a kind and of these builds that can run at once."""
+    return sum(worker.condition.slots for worker in workers if worker.builds.get(kind) == builds)
 
 
 def running_tasks(
@@ -176,7 +196,7 @@ def running_tasks(
         select(
             tasks.c.owner, tasks.c.key, tasks.c.stage, tasks.c.state, tasks.c.started_at, jobs.c.id
         )
-        .outerjoin(jobs, jobs.c.seq == tasks.c.job)
+        .outerjoin(jobs, jobs.c.seq == tasks.c.leased_for)
         .where(IS_LEASED, is_visible_project(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
@@ -202,17 +222,20 @@ def alive_workers(context: Context, connection: Connection) -> list[RegisteredWo
 
 def show_workers(context: Context, connection: Connection) -> list[responses.WorkerEntry]:
     """Return the newest session of every worker as the API shows it."""
-    alive_since, held = context.alive_since, running_tasks(connection, context.frames)
-    return [
-        document_of(
+    alive_since = context.alive_since
+    tasks_of_worker = running_tasks(connection, context.frames)
+    entries: list[responses.WorkerEntry] = []
+    for worker in present_workers(connection):
+        leased = tasks_of_worker.get(worker.id, [])
+        entry = document_of(
             responses.WorkerEntry,
             worker,
             alive=worker.last_seen_at >= alive_since,
-            leased=len(held.get(worker.id, ())),
-            running=tuple(task for task in held.get(worker.id, ()) if task.since is not None),
+            leased=len(leased),
+            running=tuple(task for task in leased if task.since is not None),
         )
-        for worker in present_workers(connection)
-    ]
+        entries.append(entry)
+    return entries
 
 
 @lru_cache(maxsize=64)
@@ -222,66 +245,123 @@ def _builds(document: str) -> Mapping[str, Builds]:
     )
 
 
-def _worker(row: Any) -> RegisteredWorker:
-    condition = WorkerCondition.model_validate_json(row.condition)
-    versions, superseded = json.loads(row.versions), bool(row.superseded)
-    times = row.registered_at, row.last_seen_at
+def _worker(row: _WorkerRow) -> RegisteredWorker:
     return RegisteredWorker(
-        row.id, row.name, _builds(row.builds), condition, versions, *times, superseded
+        id=row.id,
+        name=row.name,
+        builds=_builds(row.builds),
+        condition=WorkerCondition.model_validate_json(row.condition),
+        versions=json.loads(row.versions),
+        registered_at=row.registered_at,
+        last_seen_at=row.last_seen_at,
+        superseded=bool(row.superseded),
     )
 
 
-_PLANNED_JOBS = Prepared(
-    select(
-        jobs.c.seq, jobs.c.state, jobs.c.kind, jobs.c.builds, jobs.c.reason, jobs.c.message
-    ).where(jobs.c.state.in_(RUNNABLE), jobs.c.builds.is_not(None))
+# ---- Jobs that no worker can run -------------------------------------------------------------------
+
+CHECK_SECONDS = 10.0
+"""Interval in which it is asked which jobs can run although nothing is known to have changed [s]."""
+
+
+class _JobGroup(NamedTuple):
+    """Jobs that the same workers can run, and that say the same about it."""
+
+    kind: str
+    builds: str
+    reason: str | None
+    message: str
+
+
+class _PlannedJob(NamedTuple):
+    seq: int
+    state: str
+
+
+_IS_PLANNED = (
+    "FROM jobs WHERE jobs.finished_at IS NULL "
+    "AND jobs.state IN ('planning', 'queued', 'running') AND jobs.builds IS NOT NULL"
+)
+_JOB_GROUPS = RowQuery(_JobGroup, f"SELECT DISTINCT kind, builds, reason, message {_IS_PLANNED}")
+_JOBS_OF_GROUP = RowQuery(
+    _PlannedJob,
+    f"SELECT seq, state {_IS_PLANNED} AND kind = :b_kind AND builds = :b_builds "
+    "AND message = :b_message",
 )
 
 
 def update_unschedulable_jobs(context: Context) -> None:
-    """Set reason and message of the jobs that no connected worker can run, and clear those of the
-    others.
+    """Set reason and message of the jobs that no connected worker can run.
+
+    Those of the others are cleared.
     """
     with context.database.read() as connection:
-        if not _find_stranded(context, connection):
+        alive = alive_workers(context, connection)
+        if not _may_have_changed(context, alive):
+            return
+        if not _changed_messages(connection, alive):
             return
     with context.transaction() as tx:
-        for (job, state), message in _find_stranded(context, tx.connection).items():
-            reason = Reason.waiting_for_worker if message else None
-            tx.set_job_state(job, JobState(state), reason=reason, message=message)
+        for group, message in _changed_messages(tx.connection, alive):
+            values = {"b_kind": group.kind, "b_builds": group.builds, "b_message": group.message}
+            for job in _JOBS_OF_GROUP.rows(tx.connection, values):
+                reason = Reason.waiting_for_worker if message else None
+                set_job_state(tx, job.seq, JobState(job.state), reason=reason, message=message)
 
 
-def _find_stranded(context: Context, connection: Connection) -> dict[tuple[int, str], str]:
-    """Return the new messages of planned jobs by seq and state, where they change.
+def _may_have_changed(context: Context, alive: Sequence[RegisteredWorker]) -> bool:
+    """Return whether anything was written, or a worker came or went, since the last call."""
+    states = tuple((worker.id, worker.condition.state) for worker in alive)
+    situation = (context.notifier.count, states)
+    now = context.clock()
+    if situation == context.last_situation and now < context.next_situation_check:
+        return False
+    context.last_situation = situation
+    context.next_situation_check = now + CHECK_SECONDS
+    return True
 
-    Empty for jobs that are served.
+
+def _changed_messages(
+    connection: Connection, alive: Sequence[RegisteredWorker]
+) -> list[tuple[_JobGroup, str]]:
+    """Return the groups of jobs whose message changes, with the new one.
+
+    It is empty for jobs that a worker can run.
     """
-    alive = alive_workers(context, connection)
-    found = {}
-    for row in _PLANNED_JOBS.rows(connection):
-        message = _stranded_message(row.kind, Builds.model_validate_json(row.builds), alive)
-        if message != row.message and (message or row.reason == Reason.waiting_for_worker):
-            found[row.seq, row.state] = message
-    return found
+    changed: list[tuple[_JobGroup, str]] = []
+    for group in _JOB_GROUPS.rows(connection):
+        message = _unschedulable_message(group, alive)
+        if message == group.message:
+            continue
+        # Messages of other reasons stay while a worker can run the job.
+        if message or group.reason == Reason.waiting_for_worker:
+            changed.append((group, message))
+    return changed
 
 
-def _stranded_message(kind: str, builds: Builds, alive: list[RegisteredWorker]) -> str:
+def _unschedulable_message(group: _JobGroup, alive: Sequence[RegisteredWorker]) -> str:
     if not alive:
         return "no worker is connected; the job goes on when one is"
     if all(worker.condition.state == "starting" for worker in alive):
         names = ", ".join(worker.name for worker in alive)
         return f"the workers are not ready: {names}; `stickslip workers` says why"
-    made = [worker.builds[kind].by_stage for worker in alive if kind in worker.builds]
-    if not made:
-        return f"no connected worker makes {kind!r}; the job goes on when one does"
-    missing = [
-        stage
-        for stage, build in builds.by_stage.items()
-        if all(own[stage] != build for own in made)
-    ]
+    offered = [worker.builds[group.kind] for worker in alive if group.kind in worker.builds]
+    if not offered:
+        return f"no connected worker makes {group.kind!r}; the job goes on when one does"
+    # A job of which the row is damaged fails at the next check (background.fail_damaged_jobs).
+    needed = _parse_builds(group.builds)
+    missing: list[str] = []
+    for stage, build in needed.by_stage.items():
+        if all(builds.by_stage[stage] != build for builds in offered):
+            missing.append(stage)
     if missing:
         return (
             f"no connected worker has the builds that this job was planned for (stages: {', '.join(missing)}); it goes "
             "on when one has. To use the builds of today, cancel the job and submit it again."
         )
     return ""
+
+
+@lru_cache(maxsize=64)
+def _parse_builds(document: str) -> Builds:
+    return Builds.model_validate_json(document)

@@ -24,10 +24,11 @@ from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 from stickslip_services import __version__
 from stickslip_services.access.principals import refuse_projects
 from stickslip_services.api.routes.common import ContextDep, StrictRoute, problem_responses
-from stickslip_services.database.tables import dataset_versions, jobs, task_counts
+from stickslip_services.database.tables import dataset_versions, jobs
 from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.transaction import IS_LEASED
+from stickslip_services.queue.rows import IS_LEASED
+from stickslip_services.queue.totals import count_tasks
 from stickslip_services.queue.workers import alive_workers
 
 
@@ -40,7 +41,7 @@ class _QueueCollector(Collector):
         sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
         with self._context.database.read() as connection:
             alive = alive_workers(self._context, connection)
-            tasks = connection.execute(select(task_counts)).all()
+            tasks = [(*key, count) for key, count in count_tasks(connection).items()]
             by_state = connection.execute(
                 select(jobs.c.state, func.count()).group_by(jobs.c.state)
             ).all()
@@ -54,7 +55,7 @@ class _QueueCollector(Collector):
         )
         disk = () if room is None else (("free", room.free), ("used", room.used))
         return [
-            _gauge("tasks", "Tasks by stage and state", tasks, "stage", "state"),
+            _gauge("tasks", "Tasks of jobs by stage and state", tasks, "stage", "state"),
             _gauge("jobs", "Jobs by state", by_state, "state"),
             _gauge(
                 "leases",

@@ -29,8 +29,9 @@ from stickslip_services.api.routes.common import (
 from stickslip_services.api.sse import OPENAPI as STREAM
 from stickslip_services.api.sse import Feeds
 from stickslip_services.queue import control
+from stickslip_services.queue.estimate import validate_spec
 from stickslip_services.queue.jobs import find_job, list_jobs, list_previews, list_samples, show_job
-from stickslip_services.queue.submit import Replay, submit_job, validate_spec
+from stickslip_services.queue.submit import Replay, submit_job
 
 router = APIRouter(route_class=StrictRoute)
 

@@ -23,11 +23,11 @@ from stickslip_services.api.routes.common import (
     reads,
 )
 from stickslip_services.api.routes.health import Metrics
-from stickslip_services.queue.compose import find_task
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.documents import find_task
 from stickslip_services.queue.heartbeat import reconcile_leases
 from stickslip_services.queue.lease import lease_tasks, register_worker
-from stickslip_services.queue.report import report_results
+from stickslip_services.queue.results import report_results
 from stickslip_services.queue.workers import show_workers
 
 T = TypeVar("T")

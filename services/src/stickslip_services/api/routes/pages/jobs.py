@@ -26,6 +26,7 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.rendering import grid_maps, html_page, spec_text
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.failures import failed_tasks
 from stickslip_services.queue.jobs import (
     find_job,
     job_projects,
@@ -34,9 +35,8 @@ from stickslip_services.queue.jobs import (
     list_samples,
     show_job,
     slowest_tasks,
-    stage_durations,
 )
-from stickslip_services.queue.report import failed_tasks
+from stickslip_services.queue.progress import stage_durations
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.workers import alive_workers, show_workers
 

@@ -1,13 +1,15 @@
 """The tables of 0.1.0, and the triggers that keep the audit log append-only.
 
-Until 0.1.0 is released, the baseline makes the tables as `tables.py` has them. The release writes
-them out here: a migration must not change later (CONTRIBUTING.md, Release).
+Until 0.1.0 is released, the baseline makes the tables as `tables.py` has them, and its revision
+changes with them: `opening.check` refuses the data directory of an earlier state. The release
+writes the tables and the revision out here: a migration must not change later (CONTRIBUTING.md,
+Release).
 """
 
 from alembic import op
-from stickslip_services.database.tables import metadata
+from stickslip_services.database.tables import metadata, schema_digest
 
-revision = "0001"
+revision = f"0001_{schema_digest()}"
 down_revision = None
 
 _REFUSAL = "the audit log is append-only"

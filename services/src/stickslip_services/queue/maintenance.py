@@ -11,12 +11,11 @@ and renders, and certificates, are not restored.
 """
 
 import time
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, select, update
-from stickslip_schemas.base import JobState, Sha256, Stage, TaskState, is_sha256, sha256
+from stickslip_schemas.base import JobState, Sha256, TaskState, is_sha256, sha256
 from stickslip_schemas.documents.tasks import PublishOutput
 from stickslip_schemas.format.manifest import (
     GROUP_NAME,
@@ -37,7 +36,8 @@ from stickslip_services.catalog.versions import (
     sealed_digests,
     stored_contents,
 )
-from stickslip_services.database.database import Database, batches, rows_with
+from stickslip_services.database.database import Database
+from stickslip_services.database.statements import batches, rows_with
 from stickslip_services.database.tables import (
     certificates,
     dataset_versions,
@@ -50,10 +50,16 @@ from stickslip_services.database.tables import (
     tasks,
 )
 from stickslip_services.errors import ConflictError, NotFoundError
-from stickslip_services.queue.plan import Terms, begin_planning, insert_job, pieces, write_plan
-from stickslip_services.queue.recompute import DIGEST
-from stickslip_services.queue.rows import Task
-from stickslip_services.queue.transaction import TASK_COUNTS, queue_transaction
+from stickslip_services.queue.dependents import release_dependents
+from stickslip_services.queue.insertion import begin_planning, insert_job, insert_piece
+from stickslip_services.queue.integrity import result_digest
+from stickslip_services.queue.job_states import complete_job, open_jobs_of
+from stickslip_services.queue.plan import pieces
+from stickslip_services.queue.ready import remove_ready
+from stickslip_services.queue.rerun import DIGEST
+from stickslip_services.queue.rows import PlanInputs
+from stickslip_services.queue.totals import add_results
+from stickslip_services.queue.transaction import QueueTransaction
 
 PIECE = 10_000
 """Size of the pieces of a plan [samples]."""
@@ -102,28 +108,22 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
             raise ConflictError(
                 f"the job {row.id} is {row.state} and makes this version: cancel it first"
             )
-    own = [row.seq for row in rows]
-    held = set(connection.scalars(select(job_tasks.c.task).where(job_tasks.c.job.in_(own))))
+    removed_jobs = [row.seq for row in rows]
+    of_jobs = job_tasks.c.job.in_(removed_jobs)
+    candidates = set(connection.scalars(select(job_tasks.c.task).where(of_jobs)))
     for table in metadata.sorted_tables:
-        if "job" in table.c and table is not tasks:  # a task stays where another job needs it
-            connection.execute(delete(table).where(table.c.job.in_(own)))
-    connection.execute(delete(jobs).where(jobs.c.seq.in_(own)))
-    still = {
-        row.task for row in rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, held)
-    }
-    lost = held - still  # a job has all dependencies of its tasks, too
-    counts: Counter[tuple[str, str]] = Counter()
-    for batch in batches(lost):
-        of_batch = tasks.c.seq.in_(batch)
-        counts.update(
-            (row.stage, row.state)
-            for row in connection.execute(select(tasks.c.stage, tasks.c.state).where(of_batch))
-        )
+        if "job" in table.c:
+            connection.execute(delete(table).where(table.c.job.in_(removed_jobs)))
+    connection.execute(delete(jobs).where(jobs.c.seq.in_(removed_jobs)))
+
+    # A task stays where another job needs it. A job has all dependencies of its tasks, too.
+    links = rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, candidates)
+    removed_tasks = candidates - {link.task for link in links}
+    for batch in batches(removed_tasks):
         connection.execute(delete(task_dependencies).where(task_dependencies.c.task.in_(batch)))
         connection.execute(delete(previews).where(previews.c.task.in_(batch)))
-        connection.execute(delete(tasks).where(of_batch))
-    TASK_COUNTS.add(connection, {key: -count for key, count in counts.items()})
-    return len(own), len(lost)
+        connection.execute(delete(tasks).where(tasks.c.seq.in_(batch)))
+    return len(removed_jobs), len(removed_tasks)
 
 
 def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Stored]:
@@ -223,34 +223,44 @@ def _insert(
     database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float
 ) -> bool:
     """Insert a version as the result of an ended job; return False where it is known."""
-    terms = Terms(manifest.builds, manifest.certificate)
+    inputs = PlanInputs(manifest.builds, manifest.certificate)
     with database.write() as connection:
         known = select(dataset_versions).filter_by(
             dataset=manifest.dataset, version=manifest.version
         )
         if connection.execute(known).first() is not None:
             return False
-        with queue_transaction(connection, made_at) as tx:
-            job = insert_job(tx, manifest.spec)
-            begin_planning(tx, job, terms)
-            for piece in pieces(manifest.spec, terms, size=PIECE):
-                write_plan(tx, job, piece)
-            task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
-            assert task is not None
-            connection.execute(
-                update(tasks)
-                .where(tasks.c.seq == task)
-                .values(
-                    state=TaskState.succeeded, output=output.model_dump_json(), finished_at=made_at
-                )
-            )
-            tx.record_transition(
-                [Task(task, Stage.publish, TaskState.pending)], TaskState.succeeded
-            )
-            reserve_number(connection, manifest.dataset, manifest.version, task)
-            commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
-            for holder in tx.open_jobs_of(task):
-                tx.complete_job(
-                    holder, find_committed(connection, task), "found again in the store"
-                )
+        tx = QueueTransaction(connection, made_at)
+        job = insert_job(tx, manifest.spec)
+        begin_planning(tx, job, inputs)
+        for piece in pieces(manifest.spec, inputs, size=PIECE):
+            insert_piece(tx, job, piece)
+        task = connection.scalar(select(jobs.c.publish_task).where(jobs.c.seq == job))
+        assert task is not None, "a planned job has a publish task"
+        _store_publish_result(tx, task, output)
+        reserve_number(connection, manifest.dataset, manifest.version, task)
+        commit_version(connection, task, manifest, output, name=manifest.spec.name, now=made_at)
+        version = find_committed(connection, task)
+        for waiting in open_jobs_of(connection, task):
+            complete_job(tx, waiting, version, "found again in the store")
     return True
+
+
+def _store_publish_result(tx: QueueTransaction, task: int, output: PublishOutput) -> None:
+    """Store the result of a publish task whose dependencies have none."""
+    key = tx.connection.execute(select(tasks.c.key).where(tasks.c.seq == task)).scalar_one()
+    text = output.model_dump_json()
+    succeeded = TaskState.succeeded
+    tx.connection.execute(
+        update(tasks)
+        .where(tasks.c.seq == task)
+        .values(
+            state=succeeded,
+            output=text,
+            digest=result_digest(key, succeeded, None, "", text),
+            finished_at=tx.now,
+        )
+    )
+    remove_ready(tx.connection, [task])
+    add_results(tx.connection, [task])
+    release_dependents(tx, [task])
