@@ -18,7 +18,7 @@ from stickslip_services.client.errors import ForeignFilesError
 from stickslip_services.client.http import Client
 from stickslip_services.client.pulling import pull
 from stickslip_services.client.verifying import verify
-from stickslip_services.queue.background import start
+from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.maintenance import reindex, unused
 from stickslip_services.queue.submit import submit_job
@@ -161,6 +161,7 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
         entry = client.contents(dataset, 1).manifest.sections[2]
         context.store.path(entry.sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
         job = client.submit(rods(gamma=GAMMAS))
+        sweep(context)
         shown = client.job(job.id)
         assert "its manifest was damaged or lost" in shown.message
         worker.ran.clear()

@@ -23,7 +23,7 @@ from stickslip_services.client.errors import (
 )
 from stickslip_services.client.signing import sign
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.jobs import has_runnable_job
+from stickslip_services.queue.jobs import has_schedulable_job
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
 from stickslip_testing.servers import serving
@@ -224,7 +224,7 @@ def test_a_scrub_signs_again_what_has_no_good_signature(
     assert run(*command)[0] == 0
     assert (signature.read_bytes() == good) == (damage != "by another key")
     with origin.context.database.read() as connection:
-        assert not has_runnable_job(connection)
+        assert not has_schedulable_job(connection)
 
 
 def test_a_coordinator_does_not_start_with_a_key_that_cannot_sign(

@@ -177,7 +177,7 @@ def test_a_store_that_only_a_worker_cannot_use_costs_no_try(
 
 def test_who_pauses_a_waiting_job_keeps_it_paused(context: Context, worker: PretendWorker) -> None:
     job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
-    context.store_watch.note("it is full")
+    context.store_watch.report("it is full")
     sweep(context)
     assert show_job(context, job).reason is Reason.store_unavailable
     assert pause_job(context, job).reason is None
