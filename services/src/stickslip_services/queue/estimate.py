@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping
 from itertools import islice
 
-from sqlalchemy import Connection, bindparam, func, select, text
+from sqlalchemy import Connection, LargeBinary, bindparam, func, select, text
 from stickslip_schemas.base import Stage
 from stickslip_schemas.documents.responses import Validation
 from stickslip_schemas.format.manifest import bytes_estimate
@@ -111,7 +111,7 @@ def _cpu_ratio(connection: Connection, kind: str) -> Mapping[str, float]:
 _CACHED_COUNT: ValueQuery[int] = ValueQuery(
     text(
         "SELECT count(*) FROM tasks WHERE key IN :b_keys AND state IN ('succeeded', 'rejected')"
-    ).bindparams(bindparam("b_keys", expanding=True))
+    ).bindparams(bindparam("b_keys", type_=LargeBinary, expanding=True))
 )
 
 

@@ -9,7 +9,7 @@ quarantined tasks are left) are made by `settle_jobs`, which the sweep calls.
 from collections.abc import Collection, Sequence
 from typing import NamedTuple, Protocol
 
-from sqlalchemy import Connection, bindparam, func, insert, select, text, update
+from sqlalchemy import Connection, String, bindparam, func, insert, select, text, update
 from stickslip_schemas.base import Document, JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import (
     DatasetPublishedEvent,
@@ -184,7 +184,7 @@ _EXCLUSIVE_LEASE: ValueQuery[int] = ValueQuery(
         "AND job_tasks.task = tasks.seq) "
         "AND NOT EXISTS (SELECT 1 FROM job_tasks JOIN jobs ON jobs.seq = job_tasks.job "
         "WHERE job_tasks.task = tasks.seq AND jobs.state IN :b_states) LIMIT 1"
-    ).bindparams(bindparam("b_states", expanding=True))
+    ).bindparams(bindparam("b_states", type_=String, expanding=True))
 )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from sqlalchemy import Connection, bindparam, text
+from sqlalchemy import Connection, LargeBinary, bindparam, text
 from stickslip_schemas.base import JobState, Stage, TaskState
 from stickslip_schemas.documents.responses import Eta, Progress, StageProgress
 
@@ -180,7 +180,7 @@ _RUNNING_TASKS = RowQuery(
         "SELECT job_tasks.job, tasks.stage, tasks.cost_group, tasks.key "
         "FROM tasks CROSS JOIN job_tasks "
         "WHERE tasks.key IN :b_keys AND tasks.state = 'running' AND job_tasks.task = tasks.seq"
-    ).bindparams(bindparam("b_keys", expanding=True)),
+    ).bindparams(bindparam("b_keys", type_=LargeBinary, expanding=True)),
 )
 
 
