@@ -25,7 +25,7 @@ RELATIONS = (
     "axes that are zipped must have one length",
     "a job has at most",
     "frames must be at most",
-    "Input should be one of ",  # the names that are built in, or of the spec's own
+    "must be one of ",  # the names that are built in, or of the spec's own
     "must not redefine what is built in",
     "must be [low, high]",
     "distortion must be 0",

@@ -274,5 +274,5 @@ def test_nan_is_refused(service: Service) -> None:
     )
     assert response.status_code == 422
     assert response.json()["errors"] == [
-        {"pointer": "/axes/gamma/0", "rule": "Input should be a finite number", "value": "NaN"}
+        {"pointer": "/axes/gamma/0", "rule": "must be a finite number", "value": "NaN"}
     ]

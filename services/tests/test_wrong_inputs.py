@@ -209,7 +209,7 @@ FLAGS: list[tuple[str, int, str]] = [
     ("validate BOMB", 1, "aliases must stand for at most 100000 values"),
     ("scene check absent.yaml", 1, "there is no file absent.yaml"),
     ("scene check folder/absent", 1, "there is no file folder/absent"),
-    ("scene check TAGS", 1, "low: sets sheets.cloth.mesh.size.0: Input should be greater than 0"),
+    ("scene check TAGS", 1, "low: sets sheets.cloth.mesh.size.0: must be greater than 0"),
     ("scene check EMPTY", 1, "is empty: it must hold a mapping"),
     ("submit OK --priority 101", 2, "'--priority': 101 is not in the range -100<=x<=100"),
     ("submit OK --priority -101", 2, "'--priority': -101 is not in the range -100<=x<=100"),

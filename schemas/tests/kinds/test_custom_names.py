@@ -134,7 +134,7 @@ def lab(fx: float, cx: float) -> dict[str, Any]:
             "",
             "textures must not redefine what is built in, and 'dots' is",
         ),
-        ({"textures": {}}, "/axes/texture/1", "Input should be one of checker, .*, terrazzo"),
+        ({"textures": {}}, "/axes/texture/1", "must be one of checker, .*, terrazzo"),
         (
             {"viewpoints": {"lab": LAB | {"distortion": [0.0] * 5 + [0.1]}}},
             "/viewpoints/lab",
@@ -188,7 +188,11 @@ def lab(fx: float, cx: float) -> dict[str, Any]:
             "/lamps/bench",
             r"power must be \[low, high\]",
         ),
-        ({"substrates": {"baize": FLOOR | {"albedo": 0.2}}}, "/substrates/baize/albedo", "tuple"),
+        (
+            {"substrates": {"baize": FLOOR | {"albedo": 0.2}}},
+            "/substrates/baize/albedo",
+            "must be a list",
+        ),
         (
             {"substrates": {"baize": FLOOR | {"colour": 1}}},
             "/substrates/baize/colour",

@@ -301,14 +301,14 @@ def test_starts_ignore_texture_coordinates_and_keep_all_vertices() -> None:
         read_file(START, binary_stl())
 
 
-# ---- Frames ---------------------------------------------------------------------------------------
+# ---- Frames -----------------------------------------------------------------------------------
 
 
 def write_frames(folder: Path, names: list[str]) -> list[Path]:
     """Write the cube, a millimetre higher in each frame, and return the files by their names."""
     files = []
     for number, name in enumerate(names):
-        raised = CORNERS + [0, 0, 0.001 * number]
+        raised = CORNERS + np.array([0, 0, 0.001 * number])
         vertices = "\n".join(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in raised)
         faces = "\n".join("f " + " ".join(str(corner + 1) for corner in face) for face in FACES)
         file = folder / name
@@ -349,7 +349,9 @@ def test_frames_in_doubt_are_refused(names: list[str], rule: str, tmp_path: Path
 def test_frames_must_have_the_same_faces(tmp_path: Path) -> None:
     files = write_frames(tmp_path, ["f_1.obj", "f_2.obj"])
     files[1].write_text(files[1].read_text().replace("f 1 2 4 3", "f 2 4 3 1"))
-    with pytest.raises(UnfitFileError, match="f_2.obj must have the vertices and faces of f_1.obj"):
+    with pytest.raises(
+        UnfitFileError, match=r"f_2\.obj must have the vertices and faces of f_1\.obj"
+    ):
         frames_of(files, scene_with("frames", frame_rate=20.0), "frames")
 
 

@@ -16,8 +16,10 @@ SHAPES: dict[str, tuple[list[tuple[float, float]], float]] = {
     "hexagon": ([(2, 0), (3, 0), (4, 1), (3, 2), (2, 2), (1, 1)], 4.0),
     "letter C": ([(0, 0), (4, 0), (4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4)], 10.0),
     "comb": (
-        [(0, 0), (7, 0), (7, 3), (6, 3), (6, 1), (4, 1), (4, 3), (3, 3), (3, 1), (1, 1), (1, 3)]
-        + [(0, 3)],
+        [
+            *((0, 0), (7, 0), (7, 3), (6, 3), (6, 1), (4, 1)),
+            *((4, 3), (3, 3), (3, 1), (1, 1), (1, 3), (0, 3)),
+        ],
         13.0,
     ),
     "with a corner on an edge": ([(0, 0), (1, 0), (2, 0), (2, 2), (0, 2)], 4.0),
@@ -108,7 +110,7 @@ def test_sizes_of_faces_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         triangulate(points, np.arange(4), np.array([4]))
     monkeypatch.undo()
     monkeypatch.setattr(polygons, "MAX_CUTTING_WORK", 100)
-    with pytest.raises(UnfitFileError, match="must have triangles: .* not convex"):
+    with pytest.raises(UnfitFileError, match=r"must have triangles: .* not convex"):
         cut(np.array(SHAPES["comb"][0], dtype=float))
 
 

@@ -6,14 +6,8 @@ from typing import Annotated, Any, Never
 from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from stickslip_schemas.base import (
-    Document,
-    Float,
-    location_as_written,
-    replace_at,
-    unit_in,
-    unit_of,
-)
+from stickslip_schemas.base import Document, Float, location_as_written, replace_at, unit_in
+from stickslip_schemas.spec.explanations import explain
 from stickslip_schemas.spec.names import CustomName, did_you_mean
 
 Location = tuple[str | int, ...]
@@ -138,9 +132,11 @@ class Parameter(Document):
     @property
     def range(self) -> str:
         """What it may be, in words."""
+        # A pure number has no unit to show.
+        unit = "" if self.unit == "1" else f" [{self.unit}]"
         if self.values is not None:
-            return f"{', '.join(map(str, self.values))} [{self.unit}]"
-        return "all fabrics" if self.low is None else f"{self.low:g} to {self.high:g} [{self.unit}]"
+            return ", ".join(map(str, self.values)) + unit
+        return "all fabrics" if self.low is None else f"{self.low:g} to {self.high:g}{unit}"
 
     def allows(self, value: Value) -> bool:
         if self.values is not None:
@@ -224,6 +220,6 @@ def refuse_as(error: ValidationError, scene: Any, location: Location, value: Any
     The value stands at `location` of the spec; the message names the path in the scene.
     """
     first = error.errors(include_url=False)[0]
-    rule = first["msg"].removeprefix("Value error, ") + unit_of(first, type(scene))
-    written = location_as_written(first["loc"], scene.physics(), keep_last=True)
-    refuse(scene, location, f"sets {'.'.join(map(str, written))}: {rule}", value)
+    explanation = explain(first, type(scene))
+    written = location_as_written(explanation.location, scene.physics(), keep_last=True)
+    refuse(scene, location, f"sets {'.'.join(map(str, written))}: {explanation.rule}", value)

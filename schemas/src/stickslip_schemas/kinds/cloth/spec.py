@@ -303,7 +303,7 @@ class ClipSpec(JobSpec):
                 InitErrorDetails(
                     type=PydanticCustomError(
                         "unknown_name",
-                        "Input should be one of {known}{hint}",
+                        "must be one of {known}{hint}",
                         {"known": ", ".join(known), "hint": did_you_mean(name, known)},
                     ),
                     loc=("axes", axis, "list", "values", position),
