@@ -4,6 +4,8 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from stickslip_schemas.base import sha256
+from stickslip_schemas.format.selection import SELECTION_NAME, PartDocument, Selection
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.samples import Item, Samples, collate
 from torch.utils.data import DataLoader
@@ -31,6 +33,16 @@ def test_a_rod(rods):
         assert np.array_equal(
             item[name].numpy(), rods.arrays[name][slot].astype(item[name].numpy().dtype)
         )
+
+
+def test_a_split_without_samples_is_refused(seen_rods, tmp_path):
+    part = seen_rods.copy(tmp_path / "part")
+    manifest = sha256((part.root / "manifest.json").read_bytes())
+    document = PartDocument(manifest=manifest, selection=Selection(split="train"))
+    (part.root / SELECTION_NAME).write_text(document.model_dump_json())
+    assert len(Samples(part.root, "train")) == seen_rods.manifest.split_counts["train"]
+    with pytest.raises(ValueError, match=r"the split test of .*part has no valid sample"):
+        Samples(part.root, "test")
 
 
 def test_a_rod_with_views_and_frame(seen_rods):
