@@ -209,6 +209,7 @@ class Reason(StrEnum):
     store_unavailable = "store_unavailable"
     internal_error = "internal_error"
     # The sample itself. These are deterministic, so they are never retried.
+    impossible_start = "impossible_start"
     solver_diverged = "solver_diverged"
     out_of_frame = "out_of_frame"
     invalid_sample = "invalid_sample"

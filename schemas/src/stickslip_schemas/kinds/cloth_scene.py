@@ -62,7 +62,7 @@ from stickslip_schemas.spec.axes import (
     quantity,
 )
 from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_digest
-from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, SeedRule, Simulation
+from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, SeedRule, Simulation, StartFault
 from stickslip_schemas.spec.names import CustomName, FloorNumbers, LampNumbers, did_you_mean
 
 OF_SCENE = "scene"
@@ -124,9 +124,16 @@ class ClothSceneSimulation(Simulation):
         return sum(sheet.mesh.shape[0] for sheet in self.scene.sheets.values())
 
     def inputs(self, read: Callable[[str], bytes]) -> dict[str, Any]:
-        from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
+        """Return the scene with the arrays of its files, and the seed.
 
-        return {"scene": with_arrays(self.scene, read), "seed": self.seed}
+        Raises UnfitFileError, or UnfitStartError for a scene that can never work.
+        """
+        from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
+        from stickslip_schemas.scene.start import check_start
+
+        scene = with_arrays(self.scene, read)
+        check_start(scene)
+        return {"scene": scene, "seed": self.seed}
 
 
 class ClothSceneRender(ClipRender):
@@ -169,6 +176,8 @@ class ClothSceneSpec(ClipSpec):
     render_type = ClothSceneRender
     simulation_seeds = (SeedRule("seed", "bias", None),)
     render_seeds = (SeedRule("light_seed", "light", None), SeedRule("crease_seed", "creases", None))
+
+    has_scene = True
 
     kind: Literal["cloth_scene"]
     scene: Annotated[
@@ -425,6 +434,39 @@ class ClothSceneSpec(ClipSpec):
         from stickslip_schemas.scene.files import check_scene_file  # needs the extra `arrays`
 
         check_scene_file(self.stage, place, data)
+
+    def start_faults(self, read: Callable[[str], bytes]) -> list[StartFault]:
+        from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
+        from stickslip_schemas.scene.start import find_start_faults
+
+        # Files do not depend on parameters, so they are read once.
+        document = with_arrays(self.stage, read)
+        faults: list[StartFault] = []
+        for values in self._typical_values():
+            now = find_start_faults(with_values(document, values))
+            # One sample that may work is enough: the others are rejected one by one.
+            if not now:
+                return []
+            faults = faults or now
+        return [fault._replace(location=("scene", *fault.location)) for fault in faults]
+
+    def _typical_values(self) -> Iterator[dict[Location, Any]]:
+        """Yield values of the axes, by location in the scene: the first, the middle, the last.
+
+        A spec without an axis of the scene has one sample in this respect.
+        """
+        given = self.axes.__pydantic_extra__ or {}
+        values = {name: [value for _, value in extremes(axis)] for name, axis in given.items()}
+        for name, axis in given.items():
+            if not isinstance(axis, ListAxis):
+                low, high = values[name]
+                values[name] = [low, 0.5 * (low + high), high]
+        for fraction in (0.0, 0.5, 1.0) if values else (0.0,):
+            by_location: dict[Location, Any] = {}
+            for name, choices in values.items():
+                choice = choices[round(fraction * (len(choices) - 1))]
+                by_location |= dict.fromkeys(self.stage.locations(name), choice)
+            yield by_location
 
     def unresolved_files(self) -> dict[str, str]:
         return {

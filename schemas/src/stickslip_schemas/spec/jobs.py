@@ -33,6 +33,16 @@ from stickslip_schemas.spec.cameras import Camera
 D = TypeVar("D", bound=Document)
 
 
+class StartFault(NamedTuple):
+    """One value because of which a sample can never work."""
+
+    location: tuple[str | int, ...]
+    """Names, and positions in lists, into the document."""
+    rule: str
+    """The rule that it breaks, and the remedy."""
+    value: Any
+
+
 class Quality(StrEnum):
     """Named render settings; the renderer has their numbers, and the dataset records them."""
 
@@ -186,6 +196,8 @@ class JobSpec(Document):
     simulation_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     variant_axis: ClassVar[str | None] = None
+    has_scene: ClassVar[bool] = False
+    """True if samples start in a scene, which may be impossible: see `start_faults`."""
     """The axis whose values differ between renders that can be made together, if there is one."""
 
     kind: str
@@ -295,6 +307,14 @@ class JobSpec(Document):
     def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
         """Raise UnfitFileError if a file is not what the scene of the spec needs at a place."""
         raise NotImplementedError
+
+    def start_faults(self, read: Callable[[str], bytes]) -> list[StartFault]:
+        """Return why no sample of the spec can ever be valid; empty if one may be.
+
+        Locations are those in the spec. `read` returns the bytes of an artifact by its digest.
+        Raises UnfitFileError.
+        """
+        return []
 
     def unresolved_files(self) -> dict[str, str]:
         """Return files that the spec gives by name, and not by digest, by JSON pointers."""

@@ -114,8 +114,30 @@ def check_files(database: Database, store: Store, spec: JobSpec) -> None:
         FieldError(pointer=pointer, rule=_NOT_RESOLVED, value=f'"{name}"')
         for pointer, name in spec.unresolved_files().items()
     ]
+    if not wrong and spec.has_scene:
+        wrong = _start_faults(store, spec)
     if wrong:
         raise UnknownFileError(wrong)
+
+
+def _start_faults(store: Store, spec: JobSpec) -> list[FieldError]:
+    """Return why no sample of a spec can be valid, found by geometry before anything is queued.
+
+    The files of the scene must have been checked.
+    """
+    files: dict[Sha256, bytes] = {}
+    for pointer, digest in spec.artifacts.items():
+        if spec.scene_place(pointer) is not None:
+            files[digest] = store.read(digest)
+    sizes = [(digest, len(data)) for digest, data in files.items()]
+    question = {"inspection": "start", "spec": spec.model_dump_json(), "files": sizes}
+    try:
+        faults = INSPECTOR.inspect_bytes(b"".join(files.values()), question)
+    # The limits of the inspection are a rule, too: a scene that cannot be checked is refused.
+    except UnfitFileError as error:
+        rule = f"must be a scene whose start can be checked: {error}"
+        return [FieldError(pointer="/scene", rule=rule, value="")]
+    return [FieldError.model_validate(fault) for fault in faults]
 
 
 def _visible_uploads(database: Database, spec: JobSpec) -> set[Sha256]:

@@ -34,6 +34,9 @@ CPU_SECONDS = 10
 MEMORY_BYTES = 512 * 2**20
 """Memory that a process may allocate [bytes]. A picture of 4,096 x 4,096 pixels takes 250 MB."""
 
+VALUE_LETTERS = 200
+"""Most letters of a value that an answer repeats."""
+
 _STATM = Path("/proc/self/statm")
 
 Answer = dict[str, Any]
@@ -62,10 +65,33 @@ def _inspect_artifact(data: bytes, question: Answer) -> object:
     return None
 
 
+def _inspect_start(data: bytes, question: Answer) -> object:
+    """Return why no sample of a spec can work: pointer, rule and value of each fault.
+
+    `data` holds the files of the scene one after the other, as `files` lists them.
+    """
+    files: dict[str, bytes] = {}
+    begin = 0
+    for digest, size in question["files"]:
+        files[digest] = data[begin : begin + size]
+        begin += size
+    spec = job_spec_adapter.validate_json(question["spec"])
+    faults = spec.start_faults(files.__getitem__)
+    return [
+        {
+            "pointer": "".join(f"/{step}" for step in fault.location),
+            "rule": fault.rule,
+            "value": json.dumps(fault.value)[:VALUE_LETTERS],
+        }
+        for fault in faults
+    ]
+
+
 _INSPECTIONS: dict[str, Callable[[bytes, Answer], object]] = {
     "texture": _inspect_texture,
     "scene_file": _inspect_scene_file,
     "artifact": _inspect_artifact,
+    "start": _inspect_start,
 }
 
 

@@ -1,5 +1,6 @@
 """Commands for scenes: check, preview and simulate one."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,14 +8,17 @@ from typing import Any
 import click
 from click.exceptions import Exit
 from pydantic import JsonValue
+from stickslip_schemas.documents.problems import FieldError
 from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
-from stickslip_services.cli.common import FILE, CommandGroup, json_option, shows_errors
+from stickslip_services.cli.common import FILE, CommandGroup, field_line, json_option, shows_errors
 from stickslip_services.cli.documents import find_scene
 from stickslip_services.cli.output import print_json, print_table, say, tell
+from stickslip_services.errors import CommandError
 from stickslip_services.local import making
 from stickslip_services.units import size
 
@@ -68,6 +72,7 @@ def simulate(
     if certificate_folder is not None:
         certificate = making.read_certificate(certificate_folder)
     spec = spec_of(document, allow_uncertified=allow_uncertified)
+    refuse_impossible_start(scene, spec, files)
     result = making.simulate(spec, files, out, certificate=certificate, obj=obj)
     if as_json:
         print_json(result)
@@ -89,12 +94,13 @@ def scene() -> None:
 @json_option
 @shows_errors
 def check(scene: str, as_json: bool) -> None:
-    """Check a scene and the files that it names.
+    """Check a scene, its start and the files that it names.
 
     List its axes, the arrays of a dataset of it, and costs.
     """
     document, files = find_scene(scene)
     spec = spec_of(document)
+    refuse_impossible_start(scene, spec, files)
     if as_json:
         print_json(
             {
@@ -189,6 +195,20 @@ def preview(scene: str, out: Path, as_json: bool) -> None:
         print_json({"pictures": list(pictures)})
     else:
         say(f"{', '.join(pictures)} in {out}")
+
+
+def refuse_impossible_start(name: str, spec: ClothSceneSpec, files: Mapping[str, bytes]) -> None:
+    """Raise CommandError if a scene can never work; `files` are those that it names, by digest."""
+    faults = spec.start_faults(lambda digest: files.get(digest) or built_in_files()[digest])
+    if not faults:
+        return
+    lines = [f"{name} can never work"]
+    for fault in faults:
+        # The scene is the document of this command, and not a field of a spec.
+        pointer = "".join(f"/{step}" for step in fault.location[1:])
+        value = json.dumps(fault.value)
+        lines.append(field_line(FieldError(pointer=pointer, rule=fault.rule, value=value)))
+    raise CommandError("\n".join(lines))
 
 
 def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:

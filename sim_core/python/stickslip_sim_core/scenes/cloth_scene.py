@@ -13,7 +13,7 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import Body, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.scenes.kind import Kind, OnFrame, Outcome, Record
+from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
 
@@ -289,12 +289,14 @@ def _labels(
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
     """Return the outcome of a simulation.
 
-    Values that do not fit together are a reason to reject it.
+    Values that do not fit together are a reason to reject it before it starts. An error later on is
+    a bug, and is raised.
     """
     try:
-        return scene(scene_and_seed["scene"], seed=scene_and_seed["seed"]).outcome(on_frame)
+        made = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])
     except ValueError as error:
-        return Outcome(reason=str(error))
+        return Outcome(reason=str(error), code=IMPOSSIBLE_START)
+    return made.outcome(on_frame)
 
 
 KIND = Kind(

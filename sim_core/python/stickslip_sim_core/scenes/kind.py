@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Record = Mapping[str, Array]
 
+IMPOSSIBLE_START = "impossible_start"
+"""Code of the reason of a simulation that could not begin: nothing ran."""
+
 OnFrame = Callable[[int, int], None]
 """Takes (frames done, frames) after every frame."""
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.holders import Hands, Holder
-from stickslip_sim_core.scenes.kind import Array, Kind, OnFrame, Outcome, Record
+from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
 
 REST_SPEED = 1e-3
 """Largest mean speed of a vertex between two frames at which cloth is at rest [m/s]."""
@@ -72,6 +72,13 @@ class ClothRun:
     @property
     def valid(self) -> bool:
         return not self.code
+
+
+class Begun(NamedTuple):
+    """A scene at its start."""
+
+    hands: Hands
+    cloth: Cloth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,14 +150,11 @@ class Scene:
     reason: str = ""
     """Reason why no run of the scene is valid, or empty."""
 
-    def run(self, on_frame: OnFrame | None = None) -> ClothRun:
-        """Simulate the scene, until it ends or a position is not finite.
-
-        The solver's steps do not depend on the frames, whose positions are interpolated within
-        steps.
+    def begin(self) -> Begun:
+        """Return the cloth where the scene starts, and its holders.
 
         Raises:
-            ValueError: A sheet starts across itself, another or a surface.
+            ValueError: A sheet starts across itself, another or a surface, or in a body.
         """
         hands = Hands(self.holders, self.start)
         cloth = Cloth(
@@ -163,6 +167,18 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
+        return Begun(hands, cloth)
+
+    def run(self, on_frame: OnFrame | None = None, begun: Begun | None = None) -> ClothRun:
+        """Simulate the scene, until it ends or a position is not finite.
+
+        The solver's steps do not depend on the frames, whose positions are interpolated within
+        steps. `begun` is what `begin` returned, for callers that tell its errors from others.
+
+        Raises:
+            ValueError: The scene cannot begin.
+        """
+        hands, cloth = self.begin() if begun is None else begun
         paths = [cloth.positions]
         forces = [self.forces(cloth)]
         crossed = [self._crossings(cloth.positions)]
@@ -253,8 +269,15 @@ class Scene:
             )
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
-        """Run the scene and return the arrays and labels to store."""
-        run = self.run(on_frame)
+        """Run the scene and return the arrays and labels to store.
+
+        A scene that cannot begin is rejected. Errors of the run itself are bugs, and are raised.
+        """
+        try:
+            begun = self.begin()
+        except ValueError as error:
+            return Outcome(reason=str(error), code=IMPOSSIBLE_START)
+        run = self.run(on_frame, begun)
         if not run.valid:
             worst = ", ".join(
                 f"{check.name} {run.labels[check.name]:.4g}" for check in checks.CHECKS

@@ -4,6 +4,7 @@ Exceptions become results here, and time is measured here.
 """
 
 import io
+import logging
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -25,12 +26,15 @@ from stickslip_schemas.documents.tasks import (
 )
 from stickslip_schemas.format.codecs import CorruptChunkError
 from stickslip_schemas.kinds import KINDS
+from stickslip_schemas.scene.errors import UnfitStartError
 from stickslip_schemas.store import Store, in_parallel, is_unavailable, open_store
 
 from stickslip_workers.builds import kind, kind_builds, versions
 
 if TYPE_CHECKING:
     from stickslip_sim_core.scenes.kind import Outcome
+
+log = logging.getLogger(__name__)
 
 frames: tuple[int, int] | None = None
 """Frames done and frames in all of the simulation that runs in this process; None if none reports
@@ -119,7 +123,10 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     cpu, wall = time.process_time(), time.perf_counter()
     try:
         results = _run(tasks, store)
+    # Nothing that a task raises may end this process. It is logged with its traceback, and reported
+    # with the task, which a replay runs again.
     except Exception as error:
+        log.exception("%s of %d tasks failed", tasks[0].stage, len(tasks))
         results = [with_damaged_inputs(failure(error), task, store) for task in tasks]
     share = {
         "cpu_seconds": (time.process_time() - cpu) / len(tasks),
@@ -167,7 +174,11 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
     made = kind(names[0])
-    simulations = [task.simulation.inputs(store.read) for task in tasks]
+    try:
+        simulations = [task.simulation.inputs(store.read) for task in tasks]
+    except UnfitStartError as error:
+        # Only scenes have a start that may be impossible, and each is a batch of its own.
+        return [_rejected(Reason.impossible_start, str(error))] * len(tasks)
     outcomes = made.simulate(simulations, _note)
     records = _stored(outcomes, made.batch, store)
     return [
@@ -211,9 +222,11 @@ def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
     numbers = ", ".join(
         f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str)
     )
-    return TaskResult(
-        outcome="rejected", reason=Reason(outcome.code), message=f"{outcome.reason} at {numbers}"
-    )
+    return _rejected(Reason(outcome.code), f"{outcome.reason} at {numbers}")
+
+
+def _rejected(reason: Reason, message: str) -> TaskResult:
+    return TaskResult(outcome="rejected", reason=reason, message=message[:MESSAGE_LENGTH])
 
 
 def failed(reason: Reason, message: str) -> TaskResult:

@@ -1,0 +1,164 @@
+"""Rigid motions of a scene, as far as it must be known before a simulation whether they can work.
+
+The paths are those of the simulation core: monotone cubics through keyframes [Fritsch & Carlson
+1980], or straight lines with ramps.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+SHORTEST_STEPS: Mapping[str, tuple[float, float]] = {
+    "certified": (0.125 / 64, 2e-4),
+    "fast": (0.125 / 16, 4e-4),
+    "fine": (0.0625 / 64, 2e-5),
+    "thesis-high": (0.0005, 2e-4),
+    "thesis-low-small-dt": (0.0005, 2e-4),
+    "thesis-low-big-dt": (0.001, 2e-4),
+}
+"""By preset: the shortest step that its step error asks for [s], and that error [m]."""
+
+SAMPLES_PER_STEP = 2
+"""Samples of a motion in a shortest step: its begin and its middle."""
+
+SAMPLED_STEPS = 2
+"""Steps before and after each key in which a motion is sampled: cubics bend most at their ends."""
+
+
+def rotation_matrix(turn: Floats) -> Floats:
+    """Return the matrix (3, 3) of a rotation vector (3,) [rad] [Rodrigues]."""
+    angle = float(np.linalg.norm(turn))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = turn / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    # Radians have no exact right angles: entries near to whole numbers are meant to be whole.
+    whole = np.rint(matrix)
+    is_right = bool((np.abs(matrix - whole) < 1e-12).all())
+    return whole + 0.0 if is_right else np.asarray(matrix)
+
+
+class Track:
+    """A motion of a document: keyframes, a path or a spin."""
+
+    def __init__(self, motion: Mapping[str, Any]) -> None:
+        self._spin = motion["spin"]
+        self._about = motion["about"]
+        self._ramp = float(motion["ramp"])
+        self._is_linear = motion["interpolation"] == "linear"
+        if self._spin is not None:
+            self.times = np.zeros(1)
+            values = np.zeros((1, 6))
+        elif motion["path"] is not None:
+            path = motion["path"]
+            self.times = np.asarray(path["time"], float)
+            values = np.concatenate([path["move"], path["turn"]], axis=1)
+        else:
+            self.times = np.array([key["time"] for key in motion["keys"]], float)
+            values = np.array([(*key["move"], *key["turn"]) for key in motion["keys"]], float)
+        self.values = np.asarray(values, float)
+        """(K, 6): displacements [m] and rotation vectors [rad] at the keys."""
+        self._slopes = _monotone_slopes(self.times, self.values)
+
+    def pose_at_start(self, middle: Floats) -> Floats:
+        """Return the motion x -> A x + b at 0 s, (3, 4) [m]; `middle` is that of what moves."""
+        # Nothing moves before the first key, so the first values hold at 0 s.
+        about = middle if self._about is None else np.array(self._about, float)
+        turn = rotation_matrix(self.values[0, 3:])
+        shift = about + self.values[0, :3] - turn @ about
+        return np.column_stack([turn, shift])
+
+    def at(self, times: Floats) -> Floats:
+        """Return displacements and rotation vectors at times (T,) [s]: (T, 6)."""
+        if len(self.times) == 1:
+            return np.repeat(self.values, len(times), axis=0)
+        return self._on_lines(times) if self._is_linear else self._on_cubics(times)
+
+    def _on_lines(self, times: Floats) -> Floats:
+        slopes = np.diff(self.values, axis=0) / np.diff(self.times)[:, None]
+        still = np.zeros((1, 6))
+        changes = np.diff(np.concatenate([still, slopes, still]), axis=0)
+        since = np.clip(times[:, None] - self.times, 0.0, None)
+        # The speed changes evenly for the ramp, and is constant after it.
+        ramping = 0.5 * since * since / (self._ramp or 1.0)
+        travelled = np.where(since < self._ramp, ramping, since - 0.5 * self._ramp)
+        return np.asarray(self.values[0] + travelled @ changes)
+
+    def _on_cubics(self, times: Floats) -> Floats:
+        clipped = np.clip(times, self.times[0], self.times[-1])
+        before = np.clip(
+            np.searchsorted(self.times, clipped, side="right") - 1, 0, len(self.times) - 2
+        )
+        length = np.diff(self.times)[before][:, None]
+        s = (clipped - self.times[before])[:, None] / length
+        begin, end = self.values[before], self.values[before + 1]
+        slope_begin, slope_end = self._slopes[before] * length, self._slopes[before + 1] * length
+        # Hermite's cubic between two keys.
+        return np.asarray(
+            begin * (1.0 + 2.0 * s) * (1.0 - s) ** 2
+            + slope_begin * s * (1.0 - s) ** 2
+            + end * s * s * (3.0 - 2.0 * s)
+            + slope_end * s * s * (s - 1.0)
+        )
+
+    def unevenness(self, step: float, radius: float) -> tuple[float, float]:
+        """Return the time and size of the largest distance from an even motion within a step.
+
+        Args:
+            step: Length of the step [s].
+            radius: Distance of what moves from the middle that it turns about [m].
+
+        Returns:
+            The time at which it begins [s], and the distance [m].
+        """
+        if self._spin is not None:
+            # A turn by an angle w h leaves the chord by r (1 - cos(w h / 2)).
+            angle = min(abs(self._spin["speed"]) * step, np.pi)
+            return float(self._spin["begin"]), radius * (1.0 - float(np.cos(0.5 * angle)))
+        half = step / SAMPLES_PER_STEP
+        reach = SAMPLED_STEPS * SAMPLES_PER_STEP
+        offsets = half * np.arange(-reach, reach + 1)
+        windows = np.maximum(self.times[:, None] + offsets, 0.0)
+        samples = self.at(windows.ravel()).reshape(*windows.shape, 6)
+        # The second difference: how far the middle of a step is from that of its ends.
+        bends = 0.5 * np.abs(samples[:, 2:] - 2.0 * samples[:, 1:-1] + samples[:, :-2])
+        moved = np.linalg.norm(bends[..., :3], axis=-1)
+        turned = np.minimum(np.linalg.norm(bends[..., 3:], axis=-1), 1.0) * radius
+        size = np.maximum(moved, turned)
+        key, sample = np.unravel_index(int(np.argmax(size)), size.shape)
+        return float(windows[key, sample]), float(size[key, sample])
+
+    def moves_along(self, direction: Floats) -> tuple[Floats, Floats]:
+        """Return displacements since 0 s along a direction (3,) at all keys [m], and their times.
+
+        A motion that turns has none: where its parts are depends on its shape.
+        """
+        if self._spin is not None or np.any(self.values[:, 3:]):
+            return np.empty(0), np.empty(0)
+        moves = (self.values[:, :3] - self.values[0, :3]) @ direction
+        return np.asarray(moves), self.times + self._ramp
+
+
+def _monotone_slopes(times: Floats, values: Floats) -> Floats:
+    """Return the slopes of monotone cubics (K, n) at the keys: 0 at both ends."""
+    slopes = np.zeros_like(values)
+    if len(times) < 3:
+        return slopes
+    lengths = np.diff(times)[:, None]
+    rates = np.diff(values, axis=0) / lengths
+    before, after = rates[:-1], rates[1:]
+    weight_before = 2.0 * lengths[1:] + lengths[:-1]
+    weight_after = lengths[1:] + 2.0 * lengths[:-1]
+    # The weighted harmonic mean; 0 where a value turns back or rests.
+    rises = before * after > 0.0
+    safe_before = np.where(rises, before, 1.0)
+    safe_after = np.where(rises, after, 1.0)
+    weights = weight_before + weight_after
+    means = weights / (weight_before / safe_before + weight_after / safe_after)
+    slopes[1:-1] = np.where(rises, means, 0.0)
+    return slopes

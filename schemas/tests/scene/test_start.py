@@ -1,0 +1,324 @@
+"""Scenes that can never work: each is refused with the place, the rule and the value."""
+
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import pytest
+from stickslip_schemas.base import replace_at
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.errors import UnfitStartError
+from stickslip_schemas.scene.files import inlined, with_arrays
+from stickslip_schemas.scene.geometry import (
+    TriangleMesh,
+    find_crossing,
+    find_self_crossing,
+    find_touch,
+)
+from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.scene.start import check_start, find_start_faults
+from stickslip_schemas.spec.jobs import StartFault
+
+SCENE: dict[str, Any] = {
+    "format": "stickslip-scene/1",
+    "duration": 0.6,
+    "preset": "fast",
+    "materials": {
+        "lining": {"density": 0.08, "young": 2e6, "poisson": 0.3, "thickness": 1.5e-4},
+    },
+    "sheets": {
+        "cloth": {
+            "material": "lining",
+            "mesh": {"type": "grid", "size": [0.1, 0.1], "cells": [8, 8]},
+            "origin": [0.0, 0.0, 0.06],
+        },
+    },
+    "bodies": {"floor": {"type": "plane"}},
+    "default_friction": 0.4,
+}
+OTHER = SCENE["sheets"]["cloth"]
+CLOTH = ("sheets", "cloth")
+ORIGIN = (*CLOTH, "origin")
+SIZE = (*CLOTH, "mesh", "size")
+HOLDERS = (*CLOTH, "holders")
+BALL = {"type": "sphere", "radius": 0.03, "origin": [0.0, 0.0, 0.05]}
+
+
+def obj(vertices: Any, triangles: Any, flat: Any = None) -> bytes:
+    """Return an OBJ file; `flat` are texture coordinates of the vertices."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    if flat is not None:
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in flat]
+    for corners in triangles:
+        words = (f"{c + 1}/{c + 1}" if flat is not None else f"{c + 1}" for c in corners)
+        lines.append(f"f {' '.join(words)}")
+    return "\n".join(lines).encode()
+
+
+def square(z: float = 0.0) -> tuple[Any, Any]:
+    """Return the corners and triangles of a square of 2 m."""
+    corners = np.array([[-1, -1, z], [1, -1, z], [1, 1, z], [-1, 1, z]], float)
+    return corners, [(0, 1, 2), (0, 2, 3)]
+
+
+def pattern(shift: float = 0.0, scale: float = 0.1) -> tuple[Any, Any]:
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * scale + [shift, 0.0]
+    return corners, [(0, 1, 2), (0, 2, 3)]
+
+
+def islands() -> bytes:
+    one, triangles = pattern()
+    other, _ = pattern(shift=0.2)
+    flat = np.vstack([one, other])
+    return obj(
+        np.column_stack([flat, np.zeros(len(flat))]),
+        [*triangles, *[tuple(c + 4 for c in corners) for corners in triangles]],
+        flat,
+    )
+
+
+def soup() -> bytes:
+    flat, triangles = pattern()
+    corners = flat[np.array(triangles).ravel()]
+    return obj(np.column_stack([corners, np.zeros(6)]), [(0, 1, 2), (3, 4, 5)], corners)
+
+
+def millimetres() -> bytes:
+    flat, triangles = pattern(scale=30.0)
+    return obj(np.column_stack([flat, np.zeros(4)]), triangles, flat)
+
+
+FILES = {
+    "islands.obj": islands(),
+    "soup.obj": soup(),
+    "mm.obj": millimetres(),
+    "plate.obj": obj(*square(0.06)),
+    "blade.obj": obj([(-0.02, 0, 0.03), (0.02, 0, 0.03), (0, 0.001, 0.09)], [(0, 1, 2)]),
+    "chip.obj": obj(
+        [(0.001, 0.001, 0.06), (0.004, 0.001, 0.06), (0.001, 0.004, 0.06)], [(0, 1, 2)]
+    ),
+}
+
+
+def keys(*moves: tuple[float, list[float]], **others: Any) -> dict[str, Any]:
+    return {"keys": [{"time": time, "move": move} for time, move in moves], **others}
+
+
+def faults_of(changes: dict[tuple[str, ...], Any]) -> list[StartFault]:
+    document: Any = deepcopy(SCENE)
+    for location, value in changes.items():
+        if location[-1] in ("holders", "other", "ball", "thing", "floor", "start", "self_contact"):
+            parent = document
+            for step in location[:-1]:
+                parent = parent[step]
+            parent[location[-1]] = value
+        else:
+            document = replace_at(document, location, value)
+    scene, files = inlined(Scene.model_validate(document), FILES.__getitem__)
+    return find_start_faults(with_arrays(scene, files.__getitem__))
+
+
+def file_mesh(name: str) -> dict[str, Any]:
+    return {"type": "file", "file": name}
+
+
+FAULTS: list[tuple[dict[tuple[str, ...], Any], tuple[str, ...], str, Any]] = [
+    ({(*CLOTH, "mesh"): file_mesh("islands.obj")}, (*CLOTH, "mesh", "file"), "1 piece", 2),
+    ({(*CLOTH, "mesh"): file_mesh("soup.obj")}, (*CLOTH, "mesh", "file"), "1 piece", 2),
+    (
+        {(*CLOTH, "mesh"): file_mesh("mm.obj")},
+        (*CLOTH, "mesh", "file"),
+        "at most 20 m long and wide; lengths are in metres: for 30 mm, give 0.03",
+        30.0,
+    ),
+    ({SIZE: [80.0, 80.0]}, SIZE, "for 80 mm, give 0.08", 80.0),
+    ({SIZE: [8e-5, 8e-5]}, SIZE, "higher than the sheet is thick, which is 0.0005 m", 7.07e-6),
+    (
+        {HOLDERS: {"h": {"low": [0.06, 0.06], "high": [0.08, 0.08]}}},
+        (*HOLDERS, "h"),
+        "the flat sheet goes from (-0.05, -0.05) to (0.05, 0.05) m",
+        {"low": [0.06, 0.06], "high": [0.08, 0.08]},
+    ),
+    (
+        {HOLDERS: {"g": {"edge": "top"}, "h": {"edge": "left"}}},
+        (*HOLDERS, "h"),
+        "must not hold vertex 72, which another holder holds",
+        {"edge": "left"},
+    ),
+    (
+        {HOLDERS: {"h": {"low": [-1, -1], "high": [1, 1]}}},
+        HOLDERS,
+        "must leave a vertex free",
+        ["h"],
+    ),
+    ({ORIGIN: [0.0, 0.0, -0.01]}, ORIGIN, "vertex 0 of the sheet is 10 mm inside floor", None),
+    ({("bodies", "ball"): BALL}, ORIGIN, "vertex 40 of the sheet is 20 mm inside ball", None),
+    (
+        {("bodies", "ball"): {**BALL, "type": "box", "size": [0.04, 0.04, 0.2], "radius": ...}},
+        ORIGIN,
+        "vertex 40 of the sheet is 20 mm inside ball",
+        None,
+    ),
+    (
+        {("bodies", "ball"): {**BALL, "origin": [0, 0, 1], "motion": keys((0.0, [0, 0, -0.94]))}},
+        ORIGIN,
+        "vertex 40 of the sheet is 30 mm inside ball",
+        None,
+    ),
+    (
+        {("sheets", "other"): {**OTHER, "turn": [1.2, 0, 0]}},
+        ("sheets", "other", "origin"),
+        "must not cross sheet cloth at the start, and triangle 52 of the sheet crosses triangle 66",
+        None,
+    ),
+    (
+        {("sheets", "other"): OTHER},
+        ("sheets", "other", "origin"),
+        "vertex 0 of the sheet is at 0 m from triangle 0 of it",
+        None,
+    ),
+    (
+        {("bodies", "thing"): {"type": "mesh", "file": "blade.obj"}},
+        ORIGIN,
+        "must not cross body thing at the start, and triangle",
+        None,
+    ),
+    (
+        {("bodies", "thing"): {"type": "mesh", "file": "plate.obj"}},
+        ORIGIN,
+        "must not lie in body thing at the start, and vertex 0 of the sheet is at 0 m",
+        None,
+    ),
+    (
+        {("bodies", "thing"): {"type": "mesh", "file": "chip.obj"}},
+        ORIGIN,
+        "from vertex 0 of it, near (0.001, 0.001, 0.06) m",
+        None,
+    ),
+    (
+        {HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.11, [0, 0, 0.2]))}}},
+        (*HOLDERS, "h", "motion"),
+        "give it more time, or a ramp",
+        None,
+    ),
+    (
+        {
+            ("bodies", "ball"): {
+                **BALL,
+                "origin": [0, 0.3, 0.05],
+                "motion": keys((0.1, [0, 0, 0]), (0.105, [0, -0.3, 0]), interpolation="linear"),
+            }
+        },
+        ("bodies", "ball", "motion"),
+        "must be one that steps of 0.0078125 s follow to 0.0004 m, as the preset fast asks",
+        None,
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.002],
+            ("bodies", "ball"): {
+                "type": "box",
+                "size": [0.05, 0.05, 0.02],
+                "origin": [0, 0, 0.03],
+                "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.03])),
+            },
+        },
+        ("bodies", "ball", "motion"),
+        "at 0.4 s the body goes 10 mm further than the cloth lets it",
+        {"time": 0.4},
+    ),
+]
+
+
+def without_placeholders(value: Any) -> Any:
+    """Return a body without the fields of the shape that it replaces."""
+    if isinstance(value, dict):
+        return {key: item for key, item in value.items() if item is not ...}
+    return value
+
+
+@pytest.mark.parametrize(("changes", "location", "rule", "value"), FAULTS)
+def test_it_is_refused(
+    changes: dict[tuple[str, ...], Any], location: tuple[str, ...], rule: str, value: Any
+) -> None:
+    faults = faults_of({key: without_placeholders(item) for key, item in changes.items()})
+    (fault,) = [fault for fault in faults if fault.location == location]
+    assert rule in fault.rule
+    if isinstance(value, float):
+        assert fault.value == pytest.approx(value, rel=1e-2)
+    elif value is not None:
+        assert fault.value == value
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {ORIGIN: [0.0, 0.0, 0.0]},
+        {("sheets", "other"): {**OTHER, "origin": [0, 0, 0.0605]}},
+        {("bodies", "ball"): {**BALL, "origin": [0, 0, 0.0295]}},
+        {("bodies", "thing"): {"type": "mesh", "file": "plate.obj"}, ORIGIN: [0.0, 0.0, 0.0605]},
+        {HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, 0.1]))}}},
+        {HOLDERS: {"h": {"rim": True}}, ORIGIN: [0.0, 0.0, 0.03]},
+        {
+            (*CLOTH, "mesh"): {"type": "unstructured", "size": [0.1, 0.1], "spacing": 0.01},
+            HOLDERS: {"a": {"edge": "left"}, "b": {"low": [-0.03, -0.05], "high": [0.03, -0.04]}},
+        },
+    ],
+)
+def test_it_can_start(changes: dict[tuple[str, ...], Any]) -> None:
+    assert faults_of(changes) == []
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_built_in_scenes_can_start(name: str) -> None:
+    assert find_start_faults(with_arrays(load_scene(name), built_in_files().__getitem__)) == []
+
+
+def test_the_error_names_all_faults() -> None:
+    document: Any = replace_at(deepcopy(SCENE), SIZE, [80.0, 80.0])
+    scene = Scene.model_validate(document)
+    with pytest.raises(UnfitStartError, match=r"sheets\.cloth\.mesh\.size: must be at most 20 m"):
+        check_start(with_arrays(scene, FILES.__getitem__))
+
+
+def test_every_pair_of_random_triangles_is_compared() -> None:
+    """The trees leave out no crossing: the same answer as all pairs give."""
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        one = TriangleMesh(rng.uniform(0, 1, (60, 3)), np.arange(60).reshape(-1, 3))
+        other = TriangleMesh(rng.uniform(0.9, 1.6, (60, 3)), np.arange(60).reshape(-1, 3))
+        single = [
+            find_crossing(
+                TriangleMesh(one.vertices, one.triangles[i : i + 1]),
+                TriangleMesh(other.vertices, other.triangles[j : j + 1]),
+            )
+            for i in range(20)
+            for j in range(20)
+        ]
+        assert (find_crossing(one, other) is None) == all(item is None for item in single)
+
+
+def test_touches_are_found_at_faces_edges_and_corners() -> None:
+    corners, triangles = square()
+    mesh = TriangleMesh(corners, np.array(triangles))
+    for point, expected in (
+        ((0.2, 0.1, 1e-4), True),
+        ((1.0 + 1e-4, 0.0, 0.0), True),
+        ((1.0, 1.0, 1e-4), True),
+        ((0.2, 0.1, 3e-4), False),
+        ((1.0 + 2e-4, 1.0 + 2e-4, 0.0), False),
+    ):
+        touch = find_touch(np.array([point]), mesh, 2e-4)
+        assert (touch is not None) == expected, point
+
+
+def test_a_fold_crosses_itself_and_a_hinge_does_not() -> None:
+    hinge = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]], float)
+    assert find_self_crossing(TriangleMesh(hinge, np.array([[0, 1, 2], [1, 3, 2]]))) is None
+    through = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -1], [0.3, 0.2, 1], [0.2, 0.3, 1]], float
+    )
+    crossing = find_self_crossing(TriangleMesh(through, np.arange(6).reshape(2, 3)))
+    assert crossing is not None
+    assert (crossing.first, crossing.second) == (0, 1)
