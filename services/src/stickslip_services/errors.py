@@ -1,4 +1,7 @@
-"""Errors of well-formed requests, which api/problems.py maps to problem documents, and of commands."""
+"""Errors of well-formed requests, and of commands.
+
+`api/problems.py` maps those of requests to problem documents.
+"""
 
 import json
 from collections.abc import Sequence
@@ -36,14 +39,15 @@ class PresetNotCertifiedError(StickslipError):
 
     def __init__(self, preset: str, sim_core: str, missing: Sequence[str] = ()) -> None:
         rule = (
-            f"run `stickslip certify --preset {preset}` with the workers' build {sim_core[:12]} (a few minutes; quick "
-            "certificates do not count), or write `allow_uncertified: true` in the spec"
+            f"run `stickslip certify --preset {preset}` with the workers' build {sim_core[:12]} "
+            "(a few minutes; quick certificates do not count), or write "
+            "`allow_uncertified: true` in the spec"
         )
         if missing:
             rule = (
-                f"it must have {', '.join(missing)}, since cloth touches cloth: {rule}. Certificates of the "
-                "thesis's presets have no protocols of contact: take another preset, or in a spec of `cloth_drag` "
-                "write `self_friction: null`"
+                f"it must have {', '.join(missing)}, since cloth touches cloth: {rule}. "
+                "Certificates of the thesis's presets have no protocols of contact: take another "
+                "preset, or in a spec of `cloth_drag` write `self_friction: null`"
             )
         self.fields = [FieldError(pointer="/preset", rule=rule, value=json.dumps(preset))]
         super().__init__(f"preset {preset!r} has no passing certificate: {rule}")
@@ -52,14 +56,14 @@ class PresetNotCertifiedError(StickslipError):
 class QuotaExceededError(StickslipError):
     """A job would exceed the quota of its project."""
 
-    def __init__(self, project: str, what: str, limit: int, *, taken: int, asked: int) -> None:
+    def __init__(self, project: str, quantity: str, limit: int, *, taken: int, asked: int) -> None:
         value = taken + asked
-        whose = f"the project {project!r}" if project else "requests without a project"
-        rule = f"{what} of {whose} that have not ended must be at most {limit}"
+        owner = f"the project {project!r}" if project else "requests without a project"
+        rule = f"{quantity} of {owner} that have not ended must be at most {limit}"
         self.fields = [FieldError(pointer="", rule=rule, value=str(value))]
         super().__init__(
-            f"{rule}: there are {taken}, and with the {asked} of this job there would be {value}. Wait until "
-            "some of them have ended, or cancel some"
+            f"{rule}: there are {taken}, and with the {asked} of this job there would be {value}. "
+            "Wait until some of them have ended, or cancel some"
         )
 
 

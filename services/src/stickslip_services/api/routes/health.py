@@ -1,5 +1,6 @@
-"""Health checks, and Prometheus metrics: the queue and the store, read at each scrape, and counters
-since the start.
+"""Health checks, and Prometheus metrics.
+
+The queue and the store are read at each scrape; counters count since the start.
 """
 
 from collections import Counter as Counts
@@ -37,8 +38,13 @@ class _QueueCollector(Collector):
         self._context = context
 
     def collect(self) -> Iterable[Metric]:
-        own = dataset_versions.c
-        sums = (func.count(), func.sum(own.bytes), func.sum(own.damaged), func.min(own.scrubbed_at))
+        columns = dataset_versions.c
+        sums = (
+            func.count(),
+            func.sum(columns.bytes),
+            func.sum(columns.damaged),
+            func.min(columns.scrubbed_at),
+        )
         with self._context.database.read() as connection:
             alive = alive_workers(self._context, connection)
             tasks = [(*key, count) for key, count in count_tasks(connection).items()]
@@ -47,27 +53,26 @@ class _QueueCollector(Collector):
             ).all()
             held = Counts(connection.scalars(select(tasks_.c.owner).where(IS_LEASED)).all())
             count, size, bad, read_at = connection.execute(
-                select(*sums).where(own.manifest.is_not(None))
+                select(*sums).where(columns.manifest.is_not(None))
             ).one()
-        age, room = (
-            self._context.clock() - read_at if count else 0.0,
-            self._context.store.disk_usage(),
-        )
-        disk = () if room is None else (("free", room.free), ("used", room.used))
+        # Without a version there is nothing to scrub.
+        age = self._context.clock() - read_at if count else 0.0
+        usage = self._context.store.disk_usage()
+        disk = () if usage is None else (("free", usage.free), ("used", usage.used))
         return [
             _gauge("tasks", "Tasks of jobs by stage and state", tasks, "stage", "state"),
             _gauge("jobs", "Jobs by state", by_state, "state"),
             _gauge(
                 "leases",
                 "Tasks on lease by worker",
-                [(one.name, held[one.id]) for one in alive],
+                [(worker.name, held[worker.id]) for worker in alive],
                 "worker",
             ),
             _gauge("workers", "Workers with a recent message", [(len(alive),)]),
             _gauge(
                 "worker_slots",
                 "Slots of workers with a recent message",
-                [(sum(w.condition.slots for w in alive),)],
+                [(sum(worker.condition.slots for worker in alive),)],
             ),
             _gauge("dataset_versions", "Dataset versions", [(count,)]),
             _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),
@@ -78,14 +83,16 @@ class _QueueCollector(Collector):
 
 
 def _gauge(name: str, text: str, rows: Iterable[Sequence[Any]], *labels: str) -> Metric:
-    """Return a gauge from rows of the values of its labels and its own."""
-    made = GaugeMetricFamily(f"stickslip_{name}", text, labels=labels)
-    for *of_labels, value in rows:
-        made.add_metric(of_labels, value)
-    return made
+    """Return a gauge from rows with the values of its labels, and its value last."""
+    gauge = GaugeMetricFamily(f"stickslip_{name}", text, labels=labels)
+    for *label_values, value in rows:
+        gauge.add_metric(label_values, value)
+    return gauge
 
 
 class Metrics:
+    """The metrics of a coordinator."""
+
     def __init__(self, context: Context) -> None:
         self._registry = CollectorRegistry()
         self._registry.register(_QueueCollector(context))

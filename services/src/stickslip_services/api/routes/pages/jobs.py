@@ -1,5 +1,6 @@
-"""Pages of jobs (the list, one job, the map of its grid, its buttons), of workers, and of the HTTP
-interface.
+"""Pages of jobs, of workers, and of the HTTP interface.
+
+A job has a page, a map of its grid, and buttons.
 """
 
 import asyncio
@@ -18,7 +19,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import count, estimate_cost
 
 from stickslip_services.api.routes.common import ContextDep
-from stickslip_services.api.sse import EventStream
+from stickslip_services.api.sse import KEEP_ALIVE_SECONDS, EventStream
 from stickslip_services.catalog.inputs import list_certificates
 from stickslip_services.database.database import PageRequest, as_datetime
 from stickslip_services.database.tables import dataset_versions
@@ -45,8 +46,10 @@ router = APIRouter(include_in_schema=False)
 SHOWN_JOBS = 50
 SHOWN_LOST = 50
 SHOWN_SLOWEST = 8
+SHOWN_MAPS = 3
+SHOWN_CERTIFICATES = 200
 
-MOST_SAMPLES = 20_000
+MAX_SAMPLES = 20_000
 """Larger grids have no map, because reading the states of so many samples takes seconds."""
 
 LOST = (TaskState.rejected, TaskState.failed)
@@ -70,6 +73,7 @@ FilterDep = Annotated[JobFilter, Query()]
 
 @router.get("/")
 def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
+    """Show a page of the jobs that fit the form."""
     with context.database.read() as connection:
         page = list_jobs(
             context,
@@ -97,6 +101,7 @@ def get_jobs(context: ContextDep, chosen: FilterDep) -> Response:
 
 @router.get("/jobs/{job_id}")
 def get_job(job_id: str, context: ContextDep) -> Response:
+    """Show a job: its progress, its spec, and its first rejected and failed samples."""
     with context.database.read() as connection:
         seq = int(find_job(connection, job_id).seq)
         job = show_job(context, connection, seq)
@@ -121,21 +126,24 @@ def get_job(job_id: str, context: ContextDep) -> Response:
 
 @router.get("/ui/jobs/{job_id}/map")
 def get_job_map(job_id: str, context: ContextDep) -> Response:
+    """Show maps of the grid of a job, with the outcomes of its samples."""
     with context.database.read() as connection:
         row = find_job(connection, job_id)
         spec = job_spec_adapter.validate_json(row.spec)
-        if spec.sample_count > MOST_SAMPLES:
+        if spec.sample_count > MAX_SAMPLES:
             return html_page("map.html", maps=None, count=spec.sample_count)
-        samples = list_samples(connection, row.seq, PageRequest(MOST_SAMPLES, None), None).items
+        samples = list_samples(connection, row.seq, PageRequest(MAX_SAMPLES, None), None).items
     if len(samples) < spec.sample_count:
         return html_page("map.html", maps=[], count=spec.sample_count)
-    states = [[sample.state in of for sample in samples] for of in ((TaskState.succeeded,), LOST)]
-    maps = grid_maps(spec, *(np.array(flags) for flags in states), most=3)
+    done = np.array([sample.state is TaskState.succeeded for sample in samples])
+    lost = np.array([sample.state in LOST for sample in samples])
+    maps = grid_maps(spec, done, lost, most=SHOWN_MAPS)
     return html_page("map.html", maps=maps, count=spec.sample_count)
 
 
 @router.get("/ui/jobs/{job_id}/slowest")
 def get_slowest(job_id: str, context: ContextDep) -> Response:
+    """Show the tasks of a job that took longest."""
     with context.database.read() as connection:
         slowest = slowest_tasks(connection, int(find_job(connection, job_id).seq), SHOWN_SLOWEST)
     return html_page("slowest.html", slowest=slowest)
@@ -147,9 +155,9 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
     if verb == "resubmit":
         with context.database.read() as connection:
             spec = job_spec_adapter.validate_json(find_job(connection, job_id).spec)
-        made = submit_job(context, spec)
-        assert isinstance(made, JobDetail)  # without an idempotency key there is no replay
-        job_id = made.id
+        job = submit_job(context, spec)
+        assert isinstance(job, JobDetail)  # without an idempotency key there is no replay
+        job_id = job.id
     elif verb in ("pause", "resume", "cancel"):
         {"pause": pause_job, "resume": resume_job, "cancel": cancel_job}[verb](context, job_id)
     else:
@@ -159,21 +167,20 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
 
 @router.get("/ui/changes")
 def get_changes(context: ContextDep) -> EventStream:
-    """Send an event to a page after each change of the database, at most once a second, without
-    reading it.
+    """Send an event to a page after each change of the database, without reading it.
+
+    At most once a second.
     """
-    return EventStream(
-        _changes(context), headers={"Cache-Control": "no-store"}, media_type="text/event-stream"
-    )
+    headers = {"Cache-Control": "no-store"}
+    return EventStream(_changes(context), headers=headers, media_type="text/event-stream")
 
 
 async def _changes(context: Context) -> AsyncIterator[bytes]:
     yield b"retry: 2000\n\n"
-    # the first event comes at once, because the database may have changed since the page was
-    # rendered
+    # The first event comes at once: the database may have changed since the page was rendered.
     sent = -1
     while True:
-        await context.notifier.wait(sent, 15.0)
+        await context.notifier.wait(sent, KEEP_ALIVE_SECONDS)
         count = context.notifier.count
         yield b": still here\n\n" if count == sent else b"event: change\ndata: {}\n\n"
         sent = count
@@ -182,16 +189,19 @@ async def _changes(context: Context) -> AsyncIterator[bytes]:
 
 @router.get("/workers")
 def get_workers(context: ContextDep) -> Response:
+    """Show the workers with their builds, the disk of the store, and the memory of this machine."""
     with context.database.read() as connection:
         workers = show_workers(context, connection)
         certified = {
             entry.sim_core: entry
-            for entry in reversed(list_certificates(connection, PageRequest(200, None)).items)
+            for entry in reversed(
+                list_certificates(connection, PageRequest(SHOWN_CERTIFICATES, None)).items
+            )
             if entry.extent == "full" and entry.passed
         }
-        own = dataset_versions.c
+        columns = dataset_versions.c
         read_at, damaged = connection.execute(
-            select(func.min(own.scrubbed_at), func.sum(own.damaged))
+            select(func.min(columns.scrubbed_at), func.sum(columns.damaged))
         ).one()
     return html_page(
         "workers.html",
@@ -214,10 +224,11 @@ def _memory() -> dict[str, int] | None:
         lines = [line.split() for line in pathlib.Path("/proc/meminfo").read_text().splitlines()]
     except OSError:
         return None
-    found = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
-    return found if {"MemTotal", "MemAvailable"} <= found.keys() else None
+    sizes = {line[0].rstrip(":"): 1024 * int(line[1]) for line in lines}
+    return sizes if {"MemTotal", "MemAvailable"} <= sizes.keys() else None
 
 
 @router.get("/docs")
 def get_docs(request: Request) -> Response:
+    """Show the operations of the API."""
     return html_page("docs.html", here="docs", api=request.app.openapi())
