@@ -6,7 +6,7 @@ The last clip is half a leg too late.
 
 CLIPS.npz is of `blender_clips.py --segmentation`. Clips are drawn from the seed, each of another
 fabric. For docs/figures/answers.webp: the files matt, patterned, bright, oak, room and oak again of
-`cloth-2.mk`, seed 1.
+`clip_set.py cloth-2`, seed 1.
 """
 
 import argparse

@@ -10,28 +10,15 @@ those of `--only`, take turns.
 
 import argparse
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from clip_draws import ClipDraws, label, looks
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.textures import texture_image
-from stickslip_schemas.kinds.cloth_drag import VIEWPOINTS, ClothDragRender
 from stickslip_schemas.spec.cameras import load_rig
-from stickslip_schemas.spec.jobs import Quality
-from stickslip_schemas.spec.names import Texture
-
-
-@dataclass(frozen=True)
-class Look:
-    """One clip to render, with several textures."""
-
-    run: int
-    textures: list[Texture]
-    document: ClothDragRender
 
 
 def parsed_arguments() -> argparse.Namespace:
@@ -70,6 +57,26 @@ def parsed_arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def draws_of(args: argparse.Namespace, instants: list[int]) -> ClipDraws:
+    """Return the draws that a command line asks for; `instants` are those of the runs."""
+    finish = None
+    if args.albedo is not None:
+        finish = {"albedo": tuple(args.albedo), "roughness": (0.4, 0.9), "grain": args.grain}
+    return ClipDraws(
+        seed=args.seed,
+        clips=args.clips,
+        textures=args.textures,
+        only=args.only,
+        instants=instants if args.instants == ["all"] else list(map(int, args.instants)),
+        quality=args.quality,
+        held_out_textures=args.held_out_textures,
+        held_out_viewpoints=args.held_out_viewpoints,
+        lighting=args.lighting,
+        substrate=args.substrate,
+        finish=finish,
+    )
+
+
 class PackedRuns:
     """Simulations of one mesh, from a file of `cloth_runs.py --pack`."""
 
@@ -86,37 +93,6 @@ class PackedRuns:
         """(runs, instants, vertices, 3) [m]"""
 
 
-def looks(args: argparse.Namespace, runs: PackedRuns) -> Iterator[Look]:
-    """Yield the look of each clip: runs and viewpoints in turn, all else at random."""
-    numbers = args.only or list(range(len(runs.about)))
-    textures = list(Texture)[-4:] if args.held_out_textures else list(Texture)[:-4]
-    viewpoints = VIEWPOINTS[3:] if args.held_out_viewpoints else VIEWPOINTS[:3]
-    instants = runs.instants if args.instants == ["all"] else list(map(int, args.instants))
-    finish = None
-    if args.albedo is not None:
-        finish = {"albedo": tuple(args.albedo), "roughness": (0.4, 0.9), "grain": args.grain}
-    random = np.random.default_rng(args.seed)
-    for clip in range(args.clips):
-        run = numbers[clip % len(numbers)]
-        # The order of these draws is part of what a seed means.
-        chosen = [textures[index] for index in random.permutation(len(textures))[: args.textures]]
-        document = {
-            "material": runs.about[run]["material"],
-            "texture": chosen[0],
-            "viewpoint": viewpoints[clip % len(viewpoints)],
-            "lighting": args.lighting,
-            "substrate": args.substrate,
-            "finish": finish,
-            "quality": Quality(args.quality),
-            "rig": "drag",
-            "rig_digest": "0" * 64,
-            "instants": tuple(instants),
-            "light_seed": int(random.integers(2**31)),
-            "crease_seed": int(random.integers(2**31)),
-        }
-        yield Look(run, chosen, ClothDragRender.model_validate(document))
-
-
 def main() -> None:
     """Render, and write videos and their true values."""
     args = parsed_arguments()
@@ -126,10 +102,10 @@ def main() -> None:
     videos: list[Any] = []
     segmentations: list[Any] = []
     truths: list[dict[str, Any]] = []
-    instants: tuple[int, ...] = ()
-    for look in looks(args, runs):
+    draws = draws_of(args, runs.instants)
+    instants = draws.instants
+    for look in looks(draws, runs.about):
         document = look.document
-        instants = document.instants
         frames = [runs.instants.index(instant) for instant in instants]
         camera = cameras[document.viewpoint]
         clip = renderer.clip(document, camera, runs.positions[look.run][frames])
@@ -140,14 +116,7 @@ def main() -> None:
             segmentation = clip.ground_truth(["segmentation"])["segmentation"]
             segmentations += len(pictures) * [segmentation]
         for texture in look.textures:
-            truth = {
-                "run": look.run,
-                "viewpoint": document.viewpoint,
-                "texture": texture.value,
-                "substrate": args.substrate,
-                "finish": document.finish and document.finish.model_dump(),
-                **runs.about[look.run],
-            }
+            truth = label(look, texture, draws, runs.about)
             truths.append(truth)
             print(json.dumps(truth), flush=True)
     arrays: dict[str, Any] = {

@@ -2,12 +2,10 @@
 
 The set has clips of Blender as a phone would film them, and clips without an answer.
 
-    $BLENDER_PY benchmarks/training/blender_clips.py RUNS.npz FLOOR.npz --segmentation ... # for
-    each sort of floor python benchmarks/training/world_set.py MODEL RUNS.npz FLOOR.npz ... --record
-    RECORD.json
+    python benchmarks/training/world_set.py MODEL RUNS.npz FLOOR.npz ... --record RECORD.json
 
-RUNS.npz is of `cloth_runs.py --vertices 41 --preset certified --self-friction 0.5`, with a seed
-that was never trained on. Every clip is read as it was rendered; with one thing at a time, drawn
+`clip_set.py cloth-2` makes the files, and calls this. RUNS.npz has simulations with a seed that was
+never trained on. Every clip is read as it was rendered; with one thing at a time, drawn
 from a fixed seed: a clamp, hands, a shadow, a focal length wrong by up to 3 %, a roll by up to 1.5
 degrees, a camera that stands 1 cm elsewhere, H.264, noise and exposure; and with all of them. Then
 sorts of clips without an answer are made of the same runs. None of them is one that the reader has

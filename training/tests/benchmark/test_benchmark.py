@@ -9,7 +9,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_testing.samples import samples
 from stickslip_testing.sets import frozen
-from stickslip_training.benchmark import sets
+from stickslip_training.benchmark import clip_sets, sets
 from stickslip_training.benchmark.sets import (
     enter,
     load_set,
@@ -144,7 +144,7 @@ def test_clips_that_look_different_are_refused(folder, make_clips, monkeypatch):
 
 
 def test_an_unknown_set_is_named(folder, rods):
-    with pytest.raises(ValueError, match=r"the test set must be one of .*, and is 'rods-9'"):
+    with pytest.raises(ValueError, match=r"the test set must be one of .*, and is rods-9"):
         load_set("rods-9")
 
 
@@ -339,3 +339,69 @@ def test_the_page_shows_the_committed_records():
         assert record.making == "published"
         assert record.manifest in load_set(record.set).published
         assert record.method in table(record.set, records)
+
+
+# --- sets of clips
+# --------------------------------------------------------------------------------------------------
+
+
+def clip_rows(floor, count=2):
+    constant = {"finish": None, "factors": {"density": 1.0}, "vertices": 41, "preset": "certified"}
+    return [
+        {"run": run, "material": "tango", "mu": 0.1 * run, "seed": run, "self_friction": 0.5}
+        | {"viewpoint": "left", "texture": "dots", "substrate": floor}
+        | constant
+        | {"cpu_s": float(run), "build": "of this machine"}
+        for run in range(count)
+    ]
+
+
+def write_clips_of(folder, floor, rows):
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / f"{floor}.npz", about=np.array([json.dumps(row) for row in rows]))
+
+
+@pytest.fixture
+def clip_set(tmp_path, monkeypatch):
+    sets_folder = tmp_path / "clip-sets"
+    sets_folder.mkdir()
+    monkeypatch.setattr(clip_sets, "CLIP_SETS", sets_folder)
+    labels = [
+        clip_sets.labels_of(floor, row) for floor in ("matt", "oak") for row in clip_rows(floor)
+    ]
+    document = {"about": "clips to test with", "runs": {}, "floors": {"matt": {}, "oak": {}}}
+    document |= {"clips": 4, "labels": clip_sets.digest_of(labels), "published": {}}
+    (sets_folder / "clips-0.json").write_text(json.dumps(document))
+    return tmp_path / "made"
+
+
+def test_clips_that_were_made_elsewhere_are_the_set(clip_set):
+    for floor in ("matt", "oak"):
+        rows = [row | {"build": "another machine"} for row in clip_rows(floor)]
+        write_clips_of(clip_set, floor, rows)
+    result = runner.invoke(app, ["benchmark", "check", "clips-0", str(clip_set)])
+    assert result.exit_code == 0, result.output
+    assert "is clips-0: 4 clips to answer" in result.stdout
+
+
+def test_other_clips_are_refused(clip_set):
+    write_clips_of(clip_set, "matt", clip_rows("matt"))
+    missing = runner.invoke(app, ["benchmark", "check", "clips-0", str(clip_set)])
+    assert missing.exit_code == 1
+    assert "must hold oak.npz to be the test set clips-0, and does not" in missing.stderr
+    changed = clip_rows("oak")
+    changed[1]["mu"] += 1e-6
+    write_clips_of(clip_set, "oak", changed)
+    other = runner.invoke(app, ["benchmark", "check", "clips-0", str(clip_set)])
+    assert other.exit_code == 1
+    assert "the labels of its 4 clips have SHA-256" in other.stderr
+
+
+def test_the_set_that_chose_the_weights_is_another_one():
+    tested, chose = map(clip_sets.load_clip_set, ("cloth-2", "cloth-2-validation"))
+    assert tested.clips == chose.clips == 600
+    assert tested.labels != chose.labels
+    assert tested.runs["seed"] != chose.runs["seed"]
+    assert tested.published == {"as rendered": 0.041, "all": 0.058}
+    with pytest.raises(ValueError, match="must be one of cloth-2, cloth-2-validation, and is x"):
+        clip_sets.load_clip_set("x")

@@ -23,6 +23,7 @@ from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_training.arrays import Array, Integers
+from stickslip_training.benchmark.clip_sets import clip_set_names
 from stickslip_training.benchmark.tasks import ClothTask, RodTask, Task
 from stickslip_training.data.reader import DatasetReader, Split
 
@@ -95,9 +96,14 @@ def set_names() -> tuple[str, ...]:
 
 
 def load_set(name: str) -> NamedSet:
-    """Return a set; raise ValueError if the name is unknown."""
+    """Return a set; raise ValueError if the name is unknown, or is that of a set of clips."""
+    if name in clip_set_names():
+        raise ValueError(
+            f"the test set {name} has no spec: python benchmarks/training/clip_set.py {name} makes "
+            "and scores it"
+        )
     if name not in set_names():
-        raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name!r}")
+        raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name}")
     document = json.loads((SETS / f"{name}.json").read_text(encoding="utf-8"))
     with np.load(SETS / f"{name}.npz") as file:
         seen = {each: file[each] for each in file.files}

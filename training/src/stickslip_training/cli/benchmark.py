@@ -23,6 +23,7 @@ SetArgument = Annotated[
 @benchmark.command("list")
 def list_() -> None:
     """Say which test sets there are."""
+    from stickslip_training.benchmark.clip_sets import clip_set_names, load_clip_set
     from stickslip_training.benchmark.sets import load_set, set_names
 
     listed = Table(box=None, header_style="bold")
@@ -31,6 +32,8 @@ def list_() -> None:
     for name in set_names():
         chosen = load_set(name)
         listed.add_row(name, str(chosen.parsed_spec.kind), chosen.about)
+    for name in clip_set_names():
+        listed.add_row(name, "clips", load_clip_set(name).about)
     Console().print(listed)
 
 
@@ -46,10 +49,17 @@ def spec(name: SetArgument) -> None:
 @benchmark.command()
 def check(name: SetArgument, dataset: DatasetArgument) -> None:
     """Say whether a dataset is the test set, and which making of it."""
+    from stickslip_training.benchmark.clip_sets import clip_set_names, load_clip_set
     from stickslip_training.benchmark.sets import load_set
 
-    with readable_errors(), DatasetReader(dataset) as reader:
-        slots, making = load_set(name).check(reader)
+    with readable_errors():
+        if name in clip_set_names():
+            clip_set = load_clip_set(name)
+            clip_set.check(Path(dataset))
+            typer.echo(f"{dataset} is {name}: {clip_set.clips} clips to answer")
+            return
+        with DatasetReader(dataset) as reader:
+            slots, making = load_set(name).check(reader)
     typer.echo(f"{dataset} is {name}, {making}: {len(slots)} samples to answer")
 
 
