@@ -16,6 +16,7 @@ from stickslip_services.client import (
     Client,
     ClientError,
     ProblemError,
+    UnexpectedError,
     UnreachableError,
     pull,
     verify,
@@ -82,6 +83,17 @@ def test_a_url_without_a_scheme_is_refused() -> None:
         ClientError, match=r"must begin with http:// or https://: it is 'localhost:8765'"
     ):
         Client("localhost:8765")
+
+
+def test_a_list_that_never_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stickslip_services.client.http.MOST_PAGES", 3)
+    page = {"items": [], "next_page_token": "more"}
+    endless = httpx.MockTransport(lambda _: httpx.Response(200, json=page))
+    with (
+        Client(transport=endless) as client,
+        pytest.raises(UnexpectedError, match="/v1/datasets has over 3 pages"),
+    ):
+        list(client.datasets())
 
 
 def test_a_missing_coordinator_is_reported_at_once_and_a_restart_is_waited_for() -> None:

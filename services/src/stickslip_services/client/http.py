@@ -49,6 +49,8 @@ T = TypeVar("T")
 
 PAGE_SIZE = "200"
 """Items of a page: the most that the coordinator sends."""
+MOST_PAGES = 10_000
+"""Most pages of a list. A job has at most 1,000,000 samples, which are 5,000 pages."""
 SILENCE_SECONDS = 60.0
 """How long an event stream may be silent [s]; the coordinator sends a keep-alive every 15 s."""
 EVENT_PAUSE_SECONDS = 1.0
@@ -453,9 +455,10 @@ class Client:
         """Yield the items of all pages of a list."""
         # A page names the next one, so jobs that are added meanwhile shift nothing.
         params = {"page_size": PAGE_SIZE, **(query or {})}
-        while True:
+        for _ in range(MOST_PAGES):
             page = self._call(answer, "GET", path, params=params)
             yield from page.items
             if page.next_page_token is None:
                 return
             params["page_token"] = page.next_page_token
+        raise UnexpectedError(f"{without_password(self.url)}{path} has over {MOST_PAGES} pages")
