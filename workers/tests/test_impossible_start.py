@@ -37,6 +37,9 @@ SCENE: dict[str, Any] = {
 }
 
 
+LARGE = {"type": "grid", "size": [9.0, 9.0], "cells": [4, 4]}
+
+
 def physics(**changes: Any) -> dict[str, Any]:
     document = deepcopy(SCENE)
     document["sheets"]["cloth"].update(changes.pop("cloth", {}))
@@ -49,7 +52,13 @@ def physics(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"cloth": {"mesh": {"type": "grid", "size": [30.0, 30.0], "cells": [4, 4]}}},
+        {
+            "cloth": {"mesh": LARGE},
+            "sheets": {
+                name: {"material": "gray-interlock", "mesh": LARGE, "origin": [0, 0, height]}
+                for name, height in (("other", 1.0), ("third", 2.0))
+            },
+        },
         {"cloth": {"mesh": {"type": "grid", "size": [0.002, 0.002], "cells": [4, 4]}}},
         {"cloth": {"holders": {"h": {"low": [0.06, 0.06], "high": [0.08, 0.08]}}}},
         {"cloth": {"holders": {"g": {"edge": "top"}, "h": {"edge": "left"}}}},

@@ -61,8 +61,8 @@ def square(z: float = 0.0) -> tuple[Any, Any]:
     return corners, [(0, 1, 2), (0, 2, 3)]
 
 
-def pattern(shift: float = 0.0, scale: float = 0.1) -> tuple[Any, Any]:
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * scale + [shift, 0.0]
+def pattern(shift: float = 0.0) -> tuple[Any, Any]:
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float) * 0.1 + [shift, 0.0]
     return corners, [(0, 1, 2), (0, 2, 3)]
 
 
@@ -77,21 +77,8 @@ def islands() -> bytes:
     )
 
 
-def soup() -> bytes:
-    flat, triangles = pattern()
-    corners = flat[np.array(triangles).ravel()]
-    return obj(np.column_stack([corners, np.zeros(6)]), [(0, 1, 2), (3, 4, 5)], corners)
-
-
-def millimetres() -> bytes:
-    flat, triangles = pattern(scale=30.0)
-    return obj(np.column_stack([flat, np.zeros(4)]), triangles, flat)
-
-
 FILES = {
     "islands.obj": islands(),
-    "soup.obj": soup(),
-    "mm.obj": millimetres(),
     "plate.obj": obj(*square(0.06)),
     "blade.obj": obj([(-0.02, 0, 0.03), (0.02, 0, 0.03), (0, 0.001, 0.09)], [(0, 1, 2)]),
     "chip.obj": obj(
@@ -107,7 +94,9 @@ def keys(*moves: tuple[float, list[float]], **others: Any) -> dict[str, Any]:
 def faults_of(changes: dict[tuple[str, ...], Any]) -> list[StartFault]:
     document: Any = deepcopy(SCENE)
     for location, value in changes.items():
-        if location[-1] in ("holders", "other", "ball", "thing", "floor", "start", "self_contact"):
+        if location[:-1] == ("sheets", "other"):
+            document["sheets"][f"other-{location[-1]}"] = value
+        elif location[-1] in ("holders", "other", "ball", "thing"):
             parent = document
             for step in location[:-1]:
                 parent = parent[step]
@@ -124,15 +113,23 @@ def file_mesh(name: str) -> dict[str, Any]:
 
 FAULTS: list[tuple[dict[tuple[str, ...], Any], tuple[str, ...], str, Any]] = [
     ({(*CLOTH, "mesh"): file_mesh("islands.obj")}, (*CLOTH, "mesh", "file"), "1 piece", 2),
-    ({(*CLOTH, "mesh"): file_mesh("soup.obj")}, (*CLOTH, "mesh", "file"), "1 piece", 2),
     (
-        {(*CLOTH, "mesh"): file_mesh("mm.obj")},
-        (*CLOTH, "mesh", "file"),
-        "at most 20 m long and wide; lengths are in metres: for 30 mm, give 0.03",
-        30.0,
+        {
+            SIZE: [9.0, 9.0],
+            **{
+                ("sheets", "other", str(number)): {
+                    **OTHER,
+                    "mesh": {"type": "grid", "size": [9.0, 9.0], "cells": [8, 8]},
+                    "origin": [0.0, 0.0, 1.0 + number],
+                }
+                for number in range(2)
+            },
+        },
+        ("sheets",),
+        "at most 20 m wide together",
+        27.0,
     ),
-    ({SIZE: [80.0, 80.0]}, SIZE, "for 80 mm, give 0.08", 80.0),
-    ({SIZE: [8e-5, 8e-5]}, SIZE, "higher than the sheet is thick, which is 0.0005 m", 7.07e-6),
+    ({SIZE: [1e-3, 1e-3]}, SIZE, "higher than the sheet is thick, which is 0.0005 m", 8.84e-5),
     (
         {HOLDERS: {"h": {"low": [0.06, 0.06], "high": [0.08, 0.08]}}},
         (*HOLDERS, "h"),
@@ -276,9 +273,9 @@ def test_built_in_scenes_can_start(name: str) -> None:
 
 
 def test_the_error_names_all_faults() -> None:
-    document: Any = replace_at(deepcopy(SCENE), SIZE, [80.0, 80.0])
+    document: Any = replace_at(deepcopy(SCENE), SIZE, [1e-3, 1e-3])
     scene = Scene.model_validate(document)
-    with pytest.raises(UnfitStartError, match=r"sheets\.cloth\.mesh\.size: must be at most 20 m"):
+    with pytest.raises(UnfitStartError, match=r"sheets\.cloth\.mesh\.size: must have triangles"):
         check_start(with_arrays(scene, FILES.__getitem__))
 
 

@@ -3,7 +3,8 @@
 The rules are those of the simulation core, found here by geometry alone, so that a coordinator
 without the core refuses a scene before anything is queued:
 
-    sheets      within the size that the solver takes, thinner than their cells, in one piece
+    sheets      together within the size that the solver takes, thinner than their cells, each in
+                one piece
     holders     hold a vertex each, none twice, and leave one free
     start       no sheet inside a body, across another thing, or at no distance from it
     motions     no faster than the shortest steps of the preset can follow
@@ -49,9 +50,6 @@ MAX_UNEVENNESS = 4.0
 The solver rejects a run from 1 on. It may halve a step twice more where that step does not
 converge, so only from 4 on is the end certain."""
 
-MILLIMETRES = 1e-3
-"""A length that is right when it is multiplied by this was given in millimetres."""
-
 
 def check_start(document: Mapping[str, Any]) -> None:
     """Raise UnfitStartError if a scene can never work.
@@ -91,11 +89,6 @@ def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iter
         given = document["sheets"][sheet.name]
         member = "file" if given["mesh"]["type"] == "file" else "size"
         location = ("sheets", sheet.name, "mesh", member)
-        extent = float(np.ptp(sheet.rest, axis=0).max())
-        if extent > MAX_EXTENT:
-            rule = f"must be at most {MAX_EXTENT:g} m long and wide"
-            yield StartFault(location, rule + _unit_hint(extent), extent)
-            continue
         if sheet.pieces > 1:
             rule = (
                 "must have triangles that hang together in 1 piece: weld vertices at equal "
@@ -112,12 +105,11 @@ def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iter
             yield StartFault(location, rule, sheet.least_height)
     total = sum(float(np.ptp(sheet.rest[:, 0])) for sheet in sheets)
     if len(sheets) > 1 and total > MAX_EXTENT:
-        rule = f"must be at most {MAX_EXTENT:g} m wide side by side"
-        yield StartFault(("sheets",), rule + _unit_hint(total), total)
-
-
-def _unit_hint(length: float) -> str:
-    return f"; lengths are in metres: for {length:g} mm, give {length * MILLIMETRES:g}"
+        rule = (
+            f"must be at most {MAX_EXTENT:g} m wide together, side by side: make them smaller, or "
+            "a scene of each"
+        )
+        yield StartFault(("sheets",), rule, total)
 
 
 # ---- Holders
