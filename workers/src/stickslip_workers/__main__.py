@@ -178,7 +178,10 @@ def _dispatch(options: argparse.Namespace) -> int:
         command += [] if settings.max_cpus is None else ["--cpus", str(settings.max_cpus)]
         # It ends after this process: Ray aborts a driver whose head ends at the same time.
         subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
-    place = Place(own_directory(data)) if data is not None else Place(address or "")
+    if data is None:
+        place = Place(address or "")
+    else:
+        place = Place(own_directory(data), log=data / "logs" / "ray.log")
     dispatcher: Dispatcher | None = None
 
     def stop(number: int, _frame: object) -> None:

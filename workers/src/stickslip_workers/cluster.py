@@ -34,6 +34,8 @@ class Place:
     """Where a cluster is: at an address, or that of the head which `run_head` runs in a directory."""
 
     where: str | Path
+    log: Path | None = None
+    """Log of the head, if `stickslip up` runs it."""
 
     def connect(self) -> None:
         """Wait until Ray answers, and become a driver of it."""
@@ -79,8 +81,10 @@ class Place:
         """Return what its files say about a head that does not answer, or where it should be."""
         if isinstance(self.where, str):
             return f"none answers at {self.where}"
-        for name in ("raylet.err", "raylet.out", "gcs_server.out"):
-            path = self.where / "session_latest" / "logs" / name
+        logs = self.where / "session_latest" / "logs"
+        # A head that does not even start its processes says why in its own output only.
+        paths = [logs / name for name in ("raylet.err", "raylet.out", "gcs_server.out")]
+        for path in [*paths, *filter(None, [self.log])]:
             with contextlib.suppress(OSError):  # a head that starts again removes them
                 if lines := path.read_text(errors="replace").split("\n")[:-1]:
                     return f"last line of {path}: {lines[-1][:300]}"
