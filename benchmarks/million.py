@@ -45,7 +45,7 @@ from stickslip_schemas.format.manifest import FileEntry, layout
 from stickslip_schemas.store import DirectoryStore
 from stickslip_services.queue.background import start
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.ids import row_digest
+from stickslip_services.queue.integrity import row_digest
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings

@@ -3,18 +3,21 @@ that it is damaged.
 """
 
 import random
+import sqlite3
 from pathlib import Path
 from shutil import copytree
 from typing import Any
 
 import pytest
 from sqlalchemy import Table, select, text
+from sqlalchemy.exc import DatabaseError, OperationalError
 from stickslip_schemas.base import JobState, Reason, TaskState
 from stickslip_services.database.database import PageRequest
 from stickslip_services.database.tables import jobs, samples, tasks
 from stickslip_services.errors import DamagedRowError
 from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.integrity import reported_damage
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
@@ -180,3 +183,59 @@ def test_no_flip_in_a_row_is_silent(tmp_path: Path, clock: ManualClock) -> None:
         outcome_of_a_flip(tmp_path / str(n), tmp_path / "half", job, n, right) for n in range(FLIPS)
     ]
     assert any(manifest is None for manifest, _ in found)
+
+
+@pytest.mark.parametrize("stage", ["render", "pack"])
+def test_a_bug_in_composing_a_lease_is_called_a_bug(
+    context: Context,
+    worker: PretendWorker,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    stage: str,
+) -> None:
+    job = submit_job(context, parsed(rods()), None)
+    worker.finish(*worker.lease(simulate=100))
+    if stage == "pack":
+        worker.finish(*worker.lease(render=100))
+
+    def planted(*_: object) -> None:
+        raise TypeError("planted")
+
+    monkeypatch.setattr(f"stickslip_services.queue.documents._{stage}_task", planted)
+    assert worker.lease(**{stage: 1}) == ()
+    assert "Traceback" in caplog.text
+    assert "TypeError: planted" in caplog.text
+    with context.database.read() as connection:
+        (row,) = connection.execute(select(tasks).where(tasks.c.state == TaskState.failed))
+        shown: Any = find_job(connection, job.id)  # type: ignore[union-attr]
+        assert violations(connection) == []
+    assert row.reason == Reason.internal_error
+    assert "damaged" not in row.message
+    assert shown.state == JobState.failed
+    assert "internal_error" in shown.message
+    assert f"/v1/tasks/{stage}-" in shown.message  # the reproducer
+    assert "damaged" not in shown.message
+
+    # Once the bug is mended, the next submission goes on.
+    monkeypatch.undo()
+    again = submit_job(context, parsed(rods()), None)
+    worker.work()
+    with context.database.read() as connection:
+        shown = find_job(connection, again.id)  # type: ignore[union-attr]
+    assert shown.state == JobState.succeeded
+
+
+def test_a_damaged_page_of_the_file_is_damage_and_other_errors_are_not() -> None:
+    corrupt = sqlite3.DatabaseError("database disk image is malformed")
+    corrupt.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+    busy = sqlite3.OperationalError("database is locked")
+    busy.sqlite_errorcode = sqlite3.SQLITE_BUSY
+    with (
+        pytest.raises(DamagedRowError, match="database disk image is malformed"),
+        reported_damage(),
+    ):
+        raise DatabaseError("SELECT 1", None, corrupt)
+    with pytest.raises(OperationalError), reported_damage():
+        raise OperationalError("SELECT 1", None, busy)
+    with pytest.raises(KeyError), reported_damage():
+        raise KeyError("a bug")

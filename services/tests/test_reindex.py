@@ -218,6 +218,34 @@ def test_a_newer_database_is_refused(
     assert "install the version that made it again" in sentence
 
 
+@pytest.mark.parametrize("revision", ["0001", "0001_0123456789ab"])
+def test_the_directory_of_an_earlier_state_is_refused_and_not_touched(
+    settings: Settings, made: dict[str, object], capsys: pytest.CaptureFixture[str], revision: str
+) -> None:
+    """0.1.0 was not released: its tables have changed without a migration."""
+    with opened(settings, Role.upkeep) as database, database.write() as connection:
+        connection.execute(text("DROP TABLE ready_tasks"))
+        connection.execute(text(f"UPDATE alembic_version SET version_num = '{revision}'"))
+    before = settings.database_path.read_bytes()
+    sentence = one_sentence(settings, capsys)
+    assert (
+        f"was made by an earlier state of this version of stickslip, whose tables were others (schema {revision})"
+        in sentence
+    )
+    assert (
+        f"move {settings.database_path} away and run `stickslip reindex --data {settings.data}`"
+        in sentence
+    )
+    with pytest.raises(DatabaseRefusedError), opened(settings, Role.upkeep):
+        pass
+    assert settings.database_path.read_bytes() == before
+
+    # Doing as the sentence says brings the datasets back.
+    settings.database_path.rename(settings.data / "old.sqlite3")
+    result = run(settings)
+    assert (result.exit_code, "2 versions found again" in result.output) == (0, True)
+
+
 @pytest.mark.parametrize("how", ["overwritten", "truncated", "not one", "another's"])
 def test_a_damaged_database_is_refused(
     settings: Settings, how: str, capsys: pytest.CaptureFixture[str]
