@@ -68,12 +68,14 @@ class DatasetReader:
     ) -> None:
         """Open a version.
 
-        Args: source: Directory of the version, or its URL (see `sources`). api_key: Key for a
-            server; the default is the environment variable `STICKSLIP_API_KEY`. verify: Read every
-            file first, and check it against the manifest. check_shards: Check a shard in a
-            directory before its first sample is read. Over HTTP only `verify` checks shards, for
-            samples are parts of them. cache_bytes: Memory for decoded chunks of curves, which hold
-            many samples.
+        Args:
+            source: Directory of the version, or its URL (see `sources`).
+            api_key: Key for the server of the URL. By default, the key of the environment variable
+                `STICKSLIP_API_KEY` is sent to the coordinator of `STICKSLIP_URL`, and to no other.
+            verify: Read every file first, and check it against the manifest.
+            check_shards: Check a shard in a directory before its first sample is read. Over HTTP
+                only `verify` checks shards, because samples are parts of them.
+            cache_bytes: Memory for decoded chunks of curves, which hold many samples.
 
         Raises:
             DatasetError: The version is damaged, or contradicts the contract.
