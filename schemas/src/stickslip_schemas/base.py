@@ -96,7 +96,7 @@ def is_sha256(text: str) -> bool:
 
 
 ARTIFACT = "sha256:"
-"""How a reference to an artifact begins, where a name might stand as well."""
+"""Prefix of a reference to an artifact, which a name cannot have."""
 
 ArtifactRef = Annotated[
     str,
@@ -105,7 +105,7 @@ ArtifactRef = Annotated[
 
 
 def artifact_digest(name: str) -> Sha256 | None:
-    """Return the digest that a reference to an artifact names; None where `name` is a name."""
+    """Return the digest that a reference to an artifact names; None of a name."""
     return name.removeprefix(ARTIFACT) if name.startswith(ARTIFACT) else None
 
 
@@ -362,7 +362,7 @@ def models_at(expected: Any, location: Sequence[int | str]) -> list[type[BaseMod
 
 
 def _has_tag(model: type[BaseModel], tag: int | str) -> bool:
-    """Return whether a model is the one of a union that this tag stands for."""
+    """Return whether a model is the member of a union that a tag selects."""
     return any(tag in literals(field.annotation) for field in model.model_fields.values())
 
 

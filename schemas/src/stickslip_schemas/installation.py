@@ -26,6 +26,6 @@ def install_command(distribution: str, *extras: str) -> str:
 
 
 def install_hint(distribution: str, *extras: str) -> str:
-    """Return a sentence that tells the reader of an error how to install what is missing."""
+    """Return a sentence that tells the reader of an error how to install a missing part."""
     command = install_command(distribution, *extras)
     return f"run `{command}` in the folder of the stickslip repository"

@@ -22,7 +22,7 @@ _NOT_CONTENT: Any = {
 
 
 class CurveReport(Document):
-    """A measured curve beside its master curve; null where there is nothing to measure."""
+    """A measured curve beside its master curve; null if there is nothing to measure."""
 
     parameters: dict[str, Float]
     # One value for each point of the curve.

@@ -15,7 +15,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 class ProblemCode(StrEnum):
-    """What went wrong, for programs."""
+    """The sort of a problem, for programs."""
 
     validation_failed = "validation_failed"
     malformed_body = "malformed_body"

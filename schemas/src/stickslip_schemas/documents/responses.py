@@ -108,6 +108,7 @@ class JobDetail(Job):
 class Validation(Document):
     """Size and cost of a job that is not submitted."""
 
+    # Counts first, then sizes and times, then whether it would be accepted.
     spec: AnyJobSpec
     spec_digest: Sha256
     sample_count: int

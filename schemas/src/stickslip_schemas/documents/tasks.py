@@ -76,7 +76,7 @@ class RenderOutput(Document):
 
 
 class PackSlot(Document):
-    """One slot of a shard: where its data lie, or that it was rejected."""
+    """One slot of a shard: the location of its data, or its rejection."""
 
     slot: Int = Field(ge=0)
     sample_key: Sha256

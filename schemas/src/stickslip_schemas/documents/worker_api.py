@@ -63,6 +63,7 @@ class LeaseRequest(Document):
     """Ask for at most so many tasks of each stage."""
 
     worker_id: str
+    # A dispatcher may have room for tasks of one stage and not of another.
     wanted: dict[Stage, Int]
     at_most_seconds: Float | None = Field(
         default=None, gt=0, description="exclude tasks that are known to take longer [s]"

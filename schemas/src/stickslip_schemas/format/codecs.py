@@ -76,7 +76,7 @@ def largest_chunk(size: int) -> int:
 
 
 def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndarray:
-    """Return the decoded bytes of a chunk, into all of `out` where it is given.
+    """Return the decoded bytes of a chunk, into all of `out` if it is given.
 
     Raise CorruptChunkError.
     """
@@ -96,7 +96,7 @@ def encode_clip(clip: np.ndarray) -> bytes:
 def decode_clip(chunk: bytes, out: np.ndarray) -> None:
     """Decode a chunk that `encode_clip` has made into all of `out`; raise CorruptChunkError.
 
-    It needs no copy where `out` lies in memory as the chunk does.
+    Nothing is copied if `out` lies in memory as the chunk does.
     """
     _unpack(chunk, out.transpose(_CLIP_ORDER))
 
@@ -124,9 +124,9 @@ def _turned(array: ArrayLayout, values: np.ndarray) -> np.ndarray:
 def axes_order(array: ArrayLayout) -> tuple[int, ...] | None:
     """Return the order of the axes (sample, ...) of an array in its chunks; None keeps it.
 
-    Those of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate over
-    time are neighbours, and bytes of one significance are put together: float32 positions then take
-    half the space of a plain chunk.
+    The axes of a trajectory (frames, ..., k) are reversed, so that the values of one coordinate
+    over time are neighbours, and bytes of one significance are put together: float32 positions then
+    take half the space of a plain chunk.
     """
     if array.is_clip:
         return (0, *(1 + axis for axis in _CLIP_ORDER))

@@ -28,7 +28,7 @@ from stickslip_schemas.spec.jobs import JobSpec, Quality
 def layout(spec: JobSpec) -> tuple[ArrayLayout, ...]:
     """Return the arrays of the dataset of `spec`.
 
-    Raise UnknownKindError where nobody registered its class.
+    Raises UnknownKindError if its class is not registered.
     """
     return (*registered(spec).arrays(), *COMMON_ARRAYS)
 
@@ -67,6 +67,7 @@ def section_path(number: int) -> str:
     return f"manifest/{number}.json"
 
 
+# Chunk keys of Zarr: the number of the shard follows `c/`.
 _SHARD = re.compile(r"[^/]+/c/(\d{1,18})(?:/|$)")
 
 
@@ -111,7 +112,7 @@ class ManifestSection(Document):
 
 
 class BrokenSectionError(ValueError):
-    """A section of a manifest is not what the manifest says."""
+    """A section of a manifest contradicts the manifest."""
 
 
 class BrokenSealError(ValueError):
@@ -200,6 +201,7 @@ class Manifest(Document):
     def _has_its_sections(self) -> Self:
         if not self.sections:
             return self
+        # Sections are numbered by the samples that they list.
         expected = [
             section_path(number)
             for number in range(-(-self.sample_count // section_samples(self.spec)))
@@ -210,6 +212,7 @@ class Manifest(Document):
                 f"sections must be {len(expected)}, from {expected[0]} to {expected[-1]}; got "
                 f"{paths[:5]}"
             )
+        # Each list stands in one file: two could contradict each other.
         if self.sample_keys or self.rejections:
             raise ValueError(
                 "sample_keys and rejections must be empty, for there are sections, which have them"
@@ -223,7 +226,7 @@ class Manifest(Document):
 
 
 class Contents:
-    """What a manifest lists.
+    """The lists of a manifest.
 
     Sections are read when they are asked for, and checked against their digests.
 
@@ -232,7 +235,7 @@ class Contents:
     """
 
     KEPT = 2
-    """Number of sections in memory, the ones that were read last."""
+    """Number of sections in memory: the last that were read."""
 
     def __init__(self, manifest: Manifest, read: Callable[[FileEntry], bytes]) -> None:
         self.manifest = manifest
@@ -247,7 +250,7 @@ class Contents:
         )
 
     def number_of(self, slot: int) -> int:
-        """Return the number of the section of a sample; 0 where all is in the manifest itself."""
+        """Return the number of the section of a sample; 0 if all is in the manifest itself."""
         return slot // self._samples
 
     def sections(self) -> Iterator[ManifestSection]:
@@ -259,6 +262,7 @@ class Contents:
 
         The three files that vouch for the version are not listed.
         """
+        # The sections are files of the version as well.
         yield from self.manifest.files
         yield from self.manifest.sections
         for section in self.sections() if self.manifest.sections else ():
@@ -274,6 +278,7 @@ class Contents:
         if entry is not None or shard is None or not self.manifest.sections:
             return entry
         # The number of the shard is in its path, and tells the section that lists it.
+        # A shard beyond the last sample is in no section.
         slot = int(shard[1]) * self.manifest.spec.samples_per_shard
         return (
             self._files_of(self.number_of(slot)).get(path)
@@ -299,11 +304,13 @@ class Contents:
         A manifest without sections is like one with one section, but for the files.
         """
         manifest = self.manifest
+        # A small version has all lists in the manifest itself.
         if not manifest.sections:
             return ManifestSection.model_construct(
                 first=0, sample_keys=manifest.sample_keys, rejections=manifest.rejections, files=()
             )
         entry = manifest.sections[number]
+        # The digest in the manifest vouches for the section, and the seal for the manifest.
         data = self._read(entry)
         digest = sha256(data)
         if digest != entry.sha256:
@@ -379,6 +386,7 @@ def check_seal(manifest: bytes, group: bytes, seal: bytes) -> Sha256:
 
 def _seal_digests(seal: bytes) -> dict[str, str]:
     try:
+        # `sha256sum` puts two spaces between digest and name.
         lines = [line.split("  ") for line in seal.decode("ascii").splitlines()]
         return {name: digest for digest, name in lines}
     except ValueError as error:

@@ -29,7 +29,7 @@ Pictures = npt.NDArray[np.uint8]
 class UnfitPictureError(ValueError):
     """A file is no picture that a cloth can be printed with.
 
-    The message has the rule and what was found.
+    The message has the rule and the value.
     """
 
 

@@ -36,7 +36,7 @@ _OPERATORS = ("<=", ">=", "==", "!=", "<", ">", "=")
 _CONDITION = re.compile(
     rf"\s*(?P<label>[^<>=!]+?)\s*(?P<operator>{'|'.join(_OPERATORS)})\s*(?P<value>\S.*?)\s*"
 )
-"""A label may have any character but those of operators, as in `scarf.areal_density<1`."""
+"""A label may have any character that no operator has, as in `scarf.areal_density<1`."""
 _TRUTH = {"true": True, "false": False}
 ROUNDING = 1e-6
 """Relative difference below which a number means a value of a label.
@@ -146,11 +146,13 @@ def part_files(contents: Contents, selection: Selection, label: Labels | None) -
     arrays = layout(manifest.spec)
     chosen_arrays = selection.choose_arrays(arrays)
     names = {array.name for array in arrays}
+    # Without labels nobody knows which samples are chosen.
     slots = None if label is None else np.flatnonzero(selection.choose_samples(arrays, label))
     paths: set[str] = set()
     for array in chosen_arrays:
         if array.is_label or slots is not None:
             paths.add(f"{array.name}/{GROUP_NAME}")
+        # All files of a label: a reader needs them to choose again.
         if array.is_label:
             count = -(-manifest.sample_count // manifest.spec.samples_per_file(array))
             paths.update(array.shard_path(number) for number in range(count))
@@ -185,7 +187,7 @@ def sections_of(contents: Contents, selection: Selection, label: Labels) -> list
 
 
 class PartDocument(Document):
-    """What `selection.json` says: of which version the directory holds a part, and which part."""
+    """The file `selection.json`: the version, and the part of it that the directory holds."""
 
     manifest: Sha256
     selection: Selection

@@ -42,10 +42,10 @@ from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, Se
 from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, name_schema
 
 RIG = "drag"
-"""The cameras; their names are those of the viewpoints."""
+"""The cameras; their names are also the names of the viewpoints."""
 
 SELF_FRICTION = 0.5
-"""Coefficient of friction of a cloth with itself where a spec names none. [Wang et al. 2011]
+"""Coefficient of friction of a cloth with itself if a spec names none. [Wang et al. 2011]
 measured none; this is the middle of the two, of cloth on cloth, with which the thesis simulates
 shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
 
@@ -54,6 +54,7 @@ VIEWPOINTS = tuple(camera.name for camera in load_rig(RIG))
 what it looks at by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes
 of the label `viewpoint`."""
 
+# Types of values have names of their own, which the JSON schema shows.
 Mu = Annotated[
     float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")
 ]
@@ -81,8 +82,9 @@ ViewpointAxis = Annotated[
 
 
 class ClothDragAxes(Document):
-    """What a clip of dragged cloth depends on."""
+    """Axes of a clip of dragged cloth."""
 
+    # The physics first, then the looks: the last axis varies fastest, and looks share simulations.
     material: MaterialAxis = Field(
         description="a measured fabric, or a custom one under `materials`"
     )
@@ -146,11 +148,14 @@ class ClothDragSpec(ClipSpec):
 
     simulation_type = ClothDragSimulation
     render_type = ClothDragRender
+    # The bias is drawn for each point of the physics, so all renders of it show one trajectory. The
+    # light is drawn for each view of it.
     simulation_seeds = (SeedRule("seed", "bias", PHYSICAL_AXES),)
     render_seeds = (
         SeedRule("light_seed", "light", (*PHYSICAL_AXES, "viewpoint", "lighting", "substrate")),
         SeedRule("crease_seed", "creases", PHYSICAL_AXES),
     )
+    # Fabrics come first in the order of the axes.
     custom = (
         {"material": Custom("materials", "fabric", tuple(Material))}
         | dict(ClipSpec.custom)
@@ -209,6 +214,7 @@ class ClothDragSpec(ClipSpec):
         A drag takes 6 s at mesh 21, grows as vertices^1.15, and takes 0.3 to 3 times as much by
         fabric.
         """
+        # The presets differ in their time steps. `certified` is 1.
         preset = {PresetName.fast: 0.7, PresetName.fine: 1.7}.get(self.preset, 1.0)
         seconds = 6.0 * preset * (self.mesh / 21) ** 2.3
         return self.clip_costs(seconds, uncertainty_factor=2.5)
@@ -219,6 +225,7 @@ class ClothDragSpec(ClipSpec):
         Simulations group by material, friction to one digit, mesh and preset; renders by their
         clip.
         """
+        # A clip costs about the same, whatever it shows.
         if stage is Stage.render:
             return super().cost_group(stage, point)
         group = f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
@@ -235,10 +242,12 @@ class ClothDragSpec(ClipSpec):
         return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
+        # Labels of factors say what their axes say.
         descriptions = {
             name: field.description or "" for name, field in ClothDragAxes.model_fields.items()
         }
         return (
+            # Clips and looks, then the physics, its checks, forces and motion.
             *clip_arrays(self),
             codes("material", self.names("material")),
             array("mu", "friction coefficient"),
@@ -293,6 +302,7 @@ def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
     all the same: a repeated row costs some bytes, an array without the dimension `sample` would be
     an exception in every reader.
     """
+    # A square of mesh x mesh vertices has two triangles in each cell.
     vertex = {"vertex": spec.mesh**2}
     corners = {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
     positions = "positions of the vertices [m]; the floor is z = 0"

@@ -1,4 +1,4 @@
-"""A scene of cloth that is data: what stands where, how it moves, and what of it varies."""
+"""A scene of cloth that is data: its things, their motions, and its parameters."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
@@ -92,8 +92,9 @@ class _BuiltIn(BeforeValidator):
 
 
 class ClothSceneAxes(Document):
-    """What a clip of a scene depends on: any parameter of the scene, by its name, and looks."""
+    """Axes of a clip of a scene: any parameter of the scene, by its name, and looks."""
 
+    # The names of parameters are known only with the scene, so they are extra fields here.
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[ParameterName, ParameterAxis]
 
@@ -195,6 +196,7 @@ class ClothSceneSpec(ClipSpec):
     def _can_be_set(
         cls, values: dict[str, JsonValue], info: ValidationInfo
     ) -> dict[str, JsonValue]:
+        # A wrong scene has an error of its own, and no locations to set.
         if isinstance(scene := info.data.get("scene"), Scene):
             for path, value in values.items():
                 try:
@@ -208,12 +210,14 @@ class ClothSceneSpec(ClipSpec):
     @model_validator(mode="after")
     def _within_the_scene(self) -> Self:
         for name, axis in (self.axes.__pydantic_extra__ or {}).items():
+            # An axis must be a parameter of the scene, within its range.
             known = self.stage.parameters
             if name not in known:
                 rule = (
                     f"must be one of {', '.join((*known, *LOOKS_AXES))}{did_you_mean(name, known)}"
                 )
                 refuse(self, ("axes", name), rule, name)
+            # The ends of a range stand for all values within it.
             for location, value in extremes(axis):
                 if not known[name].allows(value):
                     refuse(
@@ -238,6 +242,7 @@ class ClothSceneSpec(ClipSpec):
         These are all names, and the ends of ranges of numbers, one by one and two together. Rules
         between two numbers are linear, so a rule that holds at all ends holds between them.
         """
+        # The ends of each axis. Names have no order, so each of them is an end.
         ends: dict[str, list[Any]] = {}
         for name, axis in (self.axes.__pydantic_extra__ or {}).items():
             values = [value for _, value in extremes(axis)]
@@ -251,6 +256,7 @@ class ClothSceneSpec(ClipSpec):
     @cached_property
     def stage(self) -> Scene:
         """The scene with the values of `set`."""
+        # The scene is validated again with the values of `set`: its counts and frames may change.
         document = self.scene.model_dump(mode="json")
         return Scene.model_validate(
             with_values(document, {resolve_path(document, path): v for path, v in self.set.items()})
@@ -259,6 +265,7 @@ class ClothSceneSpec(ClipSpec):
     @cached_property
     def _parameter_fields(self) -> dict[str, tuple[str, ...]]:
         """Fields of documents that each parameter sets."""
+        # Simulation and render hold the scene as one field, so the path begins with it.
         fields: dict[str, tuple[str, ...]] = {}
         for name in self.stage.parameters:
             locations = self.stage.locations(name)
@@ -312,6 +319,7 @@ class ClothSceneSpec(ClipSpec):
         These are the parameters and, for the light, all axes but the texture, on which no shading
         depends.
         """
+        # Renders that differ in their texture alone share a shading, and so its light.
         left_out = ("texture",) if rule.purpose == "light" else LOOKS_AXES
         return tuple(axis for axis in self.named_axes if axis not in left_out)
 
@@ -350,6 +358,7 @@ class ClothSceneSpec(ClipSpec):
 
         Names of the scene are among them.
         """
+        # A rig and the framing cameras are built in; cameras of the scene are defined by it.
         cameras = self.stage.looks.cameras
         if axis == "viewpoint" and not isinstance(cameras, dict):
             return tuple(
@@ -385,7 +394,8 @@ class ClothSceneSpec(ClipSpec):
 
     @property
     def certified_protocols(self) -> tuple[str, ...]:
-        """Return the protocols of contact, where cloth touches cloth or meshes."""
+        """Return the protocols of contact if cloth touches cloth or meshes."""
+        # Cloth on cloth, and cloth on triangles, need protocols that a plane does not.
         of_cloth = any(other in self.stage.sheets for _, other in self.stage.pairs())
         of_mesh = any(isinstance(body, MeshBody) for body in self.stage.bodies.values())
         return CONTACT_PROTOCOLS if of_cloth or of_mesh else ()
@@ -396,6 +406,7 @@ class ClothSceneSpec(ClipSpec):
 
         Cloth that rests costs a tenth of the middle, and cloth in full swing ten times as much.
         """
+        # Time grows with the vertices, more than in proportion, and with the length of the scene.
         vertices = sum(sheet.mesh.shape[0] for sheet in self.stage.sheets.values())
         duration = self.stage.frames / self.stage.frame_rate
         return self.clip_costs(1e-4 * vertices**1.37 * duration, uncertainty_factor=10.0)
@@ -418,6 +429,7 @@ class ClothSceneSpec(ClipSpec):
         return ", ".join(words)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
+        # With zipped axes, a parameter without an axis has no label.
         labels = (
             parameter_label(self.stage, name)
             for name in self.stage.parameters

@@ -22,6 +22,7 @@ from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render, SeedRul
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
 
+# Quantities have no unit: lengths are over L, and moments over EI/L.
 Gamma = Annotated[
     float,
     quantity("Gamma"),
@@ -76,6 +77,7 @@ class RodHangSpec(JobSpec):
 
     simulation_type = RodHangSimulation
     render_type = RodHangRender
+    # Each rod has a colour of its own, so the axes of all enter the seed.
     render_seeds = (SeedRule("color_seed", "color", None),)
 
     kind: Literal["rod_hang"]
@@ -110,6 +112,7 @@ class RodHangSpec(JobSpec):
         return {"poisson": self.poisson}
 
     def render_settings(self) -> dict[str, Any] | None:
+        # Shapes alone are a dataset, too.
         if self.views is None:
             return None
         return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
@@ -117,6 +120,7 @@ class RodHangSpec(JobSpec):
     @property
     def default_costs(self) -> Costs:
         """CPU times of the packaged records."""
+        # CPU time of a view by quality [s], fitted to `benchmarks/job_costs.py`; there are four.
         view = {"preview": 0.016, "draft": 0.026, "standard": 0.055, "high": 0.18}[self.quality]
         return Costs(simulate=0.001, render=4 * view, renderer_start=0.3)
 
@@ -124,12 +128,14 @@ class RodHangSpec(JobSpec):
         return () if self.views is None else load_rig(self.views)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
+        # Curves are sampled at as many points as the simulation document says.
         points = {"point": RodHangSimulation.model_fields["points"].default}
         curves = (
             ("centerline", {"xyz": 3}, "positions over L at uniform arc length, clamp first"),
             ("curvature", {"strain": 3}, "(twist, bend1, bend2) times L"),
             ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
         )
+        # One picture for each camera of the rig.
         pixels = {"view": len(self.cameras()), "y": 224, "x": 224, "rgb": 3}
         pictures = (
             array("views", "sRGB pictures", "uint8", pixels, per_sample=True),

@@ -3,7 +3,7 @@
 A digest covers the modules that a stage imports, which are found by reading their sources.
 
 A build is part of every content key. So a change of a file that a result depends on changes its
-key, and a change of any other file does not. Four rules say what is followed:
+key, and a change of any other file does not. Four rules say which imports are followed:
 
 - An import counts wherever it stands, also inside a function; `if TYPE_CHECKING:` does not count.
 - A name that a package's `__init__` only passes on leads to the module that defines it.

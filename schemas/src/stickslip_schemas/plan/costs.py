@@ -55,8 +55,8 @@ class Counts:
 def count(spec: JobSpec) -> Counts:
     """Return the numbers of `spec`.
 
-    Two samples share a simulation where they agree in all axes that enter its document or its
-    seeds, and a render where they agree in those of the render, too. Time and memory grow with the
+    Two samples share a simulation if they agree in all axes that enter its document or its
+    seeds, and a render if they also agree in the axes of the render. Time and memory grow with the
     longest axis, not with the grid.
     """
     simulation_axes = _entering_axes(spec, spec.simulation_type, spec.simulation_seeds)
@@ -150,7 +150,7 @@ class Interval(Document):
 
 
 class Estimate(Document):
-    """What a job costs without cached results."""
+    """Cost of a job without cached results."""
 
     cpu_seconds: Interval
     wall_seconds: Interval | None = Field(

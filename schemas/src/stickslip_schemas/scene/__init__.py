@@ -1,1 +1,1 @@
-"""Scenes as data: what stands where, how it moves, what it looks like, and what may vary."""
+"""Scenes as data: things, their motions and looks, and the parameters that may vary."""

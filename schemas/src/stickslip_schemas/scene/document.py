@@ -117,6 +117,8 @@ class Physics(Document):
     @property
     def frames(self) -> int:
         """Number of frames, the first one at 0 s included."""
+        # A frame at 0 s, and one after each whole period. With the tolerance, 0.29 s at 100 frames
+        # a second have 30 frames, although 0.29 * 100 is less than 29 in floating point.
         longest = self.duration if self.end is None else self.end.at_most
         return int((longest or 0.0) * self.frame_rate * (1.0 + 1e-12)) + 1
 
@@ -151,6 +153,7 @@ class Physics(Document):
 
     def files(self) -> Iterator[tuple[Location, str]]:
         """Yield the location in the document and the name of each file of the physics."""
+        # Holders and bodies move; a plane does not.
         motions: list[tuple[Location, Motion | None]] = []
         for name, sheet in self.sheets.items():
             if isinstance(sheet.mesh, FileMesh):
@@ -173,6 +176,7 @@ class Physics(Document):
         for name in self.materials:
             if name in list(Material):
                 refuse(self, ("materials", name), "must not redefine what is built in", name)
+        # Custom fabrics of the scene are known to its sheets alone.
         known = (*map(str, Material), *self.materials)
         for name, sheet in self.sheets.items():
             if sheet.material not in known:
@@ -186,6 +190,7 @@ class Physics(Document):
         if (self.duration is None) == (self.end is None):
             rule = "one of duration [s] and end must be given, and not both"
             refuse(self, ("duration",), rule, self.duration)
+        # Arrays over time have a row for each frame.
         if self.frames > MAX_FRAMES:
             rule = (
                 f"length [s] times frame_rate [1/s] must be at most {MAX_FRAMES} frames, and gives "
@@ -194,6 +199,7 @@ class Physics(Document):
             refuse(self, ("frame_rate",), rule, self.frame_rate)
         for name, sheet in self.sheets.items():
             self._check_extent(name, sheet)
+        # Time and memory grow with the vertices of all sheets together.
         vertices = sum(sheet.mesh.shape[0] for sheet in self.sheets.values())
         if vertices > MAX_VERTICES:
             rule = f"must have at most {MAX_VERTICES} vertices together"
@@ -214,6 +220,7 @@ class Physics(Document):
 
     def _check_sheet(self, name: str, sheet: Sheet) -> None:
         location = ("sheets", name)
+        # Only a single sheet may pass through itself.
         if not sheet.self_contact and len(self.sheets) > 1:
             rule = "must be true if there are several sheets"
             refuse(self, (*location, "self_contact"), rule, False)
@@ -316,7 +323,7 @@ class Scene(Staged):
         return tuple(resolve_path(document, path) for path in self.parameters[parameter].sets)
 
     def default(self, parameter: str) -> Value:
-        """Return the value of a parameter where no axis gives one: what the document says."""
+        """Return the value of a parameter without an axis: the default in the document."""
         value: Value = value_at(self.physics(), self.locations(parameter)[0])
         return value
 

@@ -2,7 +2,7 @@
 
 
 class UnfitFileError(ValueError):
-    """A file cannot be what a scene needs; the message has the rule, and what was found."""
+    """A file that a scene cannot use; the message has the rule and the value."""
 
 
 class UnfitStartError(ValueError):

@@ -1,6 +1,6 @@
 """The files of a scene: references by digest, and the arrays that files hold.
 
-The location of a file in the document says what the file is for: a flat pattern, a start, a body, a
+The location of a file in the document tells its purpose: a flat pattern, a start, a body, a
 motion or a texture.
 """
 
@@ -109,7 +109,7 @@ def weld_notes(physics: Physics, files: Mapping[str, bytes]) -> Iterator[str]:
 def check_scene_file(scene: Scene, location: Location, data: bytes) -> None:
     """Raise UnfitFileError if a scene cannot use a file at a location.
 
-    The counts that the document states must be those of the file.
+    The counts that the document states must be the counts of the file.
     """
     arrays = read_file(location, data)
     counts = _pattern_counts(location, arrays)

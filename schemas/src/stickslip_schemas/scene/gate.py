@@ -1,4 +1,4 @@
-"""The gate for files of scenes: what a file says of itself, before anything in it is decoded.
+"""The gate for files of scenes: their statements about themselves, before anything is decoded.
 
 A small file can ask for much: 400 bytes of NPZ declare an array of 80 GB, and a mesh of two million
 faces takes a parser 20 s. So counts, shapes and sizes are read from headers and from the structure
@@ -190,6 +190,7 @@ def _check_directory(data: bytes) -> None:
 
     ZIP64 has other fields, for archives beyond 4 GB or 65,535 members, and is refused.
     """
+    # The directory is at the end, before a comment of any length.
     tail = data[-(_END_OF_DIRECTORY.size + _MAX_COMMENT_BYTES) :]
     position = tail.rfind(b"PK\x05\x06")
     if position < 0 or position + _END_OF_DIRECTORY.size > len(tail):
@@ -208,6 +209,7 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
     if len(members) > MAX_ARRAYS:
         raise UnfitFileError(f"must have at most {MAX_ARRAYS} arrays, and has {len(members)}")
     names = [member.filename for member in members]
+    # Names decide which role a file can have.
     arrays = {name.removesuffix(".npy") for name in names if name.endswith(".npy")}
     if not any(role <= arrays for role in _ROLES):
         listed = ", ".join(sorted(arrays))[:200] or "none"
@@ -217,6 +219,7 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
         )
     if len(arrays) != len(names):
         raise UnfitFileError("must have only arrays (.npy), each once")
+    # Only what `numpy.savez` writes is read.
     for member in members:
         if member.flag_bits & _ENCRYPTED:
             raise UnfitFileError(f"must not be encrypted, and {member.filename} is")
@@ -225,6 +228,7 @@ def _check_members(members: list[zipfile.ZipInfo]) -> None:
                 "must be stored or compressed with deflate, as numpy.savez does, and "
                 f"{member.filename} has compression {member.compress_type}"
             )
+    # A compressed file may state any size, and is not unpacked to find out.
     unpacked = sum(member.file_size for member in members)
     if unpacked > MAX_FILE_BYTES:
         raise UnfitFileError(
@@ -249,6 +253,7 @@ def _check_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
             )
         header = file.read(length)
     item_bytes, shape = _read_header(name, header)
+    # A header that states more than the member has would ask for memory.
     expected = len(magic) + len(length_bytes) + length + item_bytes * prod(shape)
     if expected != member.file_size:
         raise UnfitFileError(

@@ -20,6 +20,7 @@ def scene_names() -> tuple[str, ...]:
 @cache
 def _loaded(name: str) -> tuple[Scene, dict[str, bytes]]:
     """Return a built-in scene, and its files by digest."""
+    # The name of a built-in scene is that of its file.
     text = (SCENES / f"{name}.yaml").read_text(encoding="utf-8")
     scene = Scene.model_validate({"name": name, **parse_yaml(text)})
     if not any(scene.files()):
@@ -34,6 +35,7 @@ def load_scene(name: str) -> Scene:
 
     Raises ValueError for an unknown name.
     """
+    # A name comes from a spec, and must not become a path.
     if name not in scene_names():
         raise ValueError(
             f"must be one of {', '.join(scene_names())}, or a "

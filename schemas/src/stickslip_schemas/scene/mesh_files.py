@@ -1,6 +1,6 @@
 """Mesh files of other programs: OBJ, STL and PLY, read as polygons.
 
-The readers are ours, and not those of a mesh library, for three reasons (tried with trimesh 5.2).
+The readers are ours, and not of a mesh library, for three reasons (tried with trimesh 5.2).
 Libraries fan every polygon, so concave faces come out wrong. They build all triangles before
 anybody can count them: one face of 4 million corners took 300 MB. And they renumber vertices, while
 frames of an animation and the start of a sheet need the order of the file.
@@ -323,7 +323,7 @@ class PlyHeader:
     """`<` or `>`; empty in text."""
     elements: list[_Element]
     end: int
-    """Where the values begin [bytes]."""
+    """Offset of the first value [bytes]."""
 
     def count(self, name: str) -> int:
         """Return how many elements of a name the file states."""
@@ -399,7 +399,7 @@ def _read_ply(data: bytes) -> Polygons:
 def _binary_element(
     data: bytes, element: _Element, header: PlyHeader, offset: int
 ) -> tuple[dict[str, Any], int]:
-    """Return the values of an element by property, and where it ends [bytes]."""
+    """Return the values of an element by property, and the offset of its end [bytes]."""
     order = header.byte_order
     if all(entry.count_dtype is None for entry in element.properties):
         row = np.dtype([(entry.name, order + entry.dtype) for entry in element.properties])

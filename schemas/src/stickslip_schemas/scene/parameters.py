@@ -16,7 +16,7 @@ Location = tuple[str | int, ...]
 ParameterName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
 
 Value = Float | CustomName
-"""What a parameter may be: a number, or the name of a fabric."""
+"""The value of a parameter: a number, or the name of a fabric."""
 
 LOOKS_AXES = ("texture", "viewpoint", "lighting", "substrate")
 """Axes that every scene has: no parameter may have their names."""
@@ -26,7 +26,7 @@ _FIXED = ("duration", "end", "frame_rate", "spacing")
 
 
 class Parameter(Document):
-    """What may vary: one value, which is set at one or several locations of the document.
+    """A value that may vary, which is set at one or several locations of the document.
 
     The document itself has the default at these locations.
     """
@@ -49,7 +49,7 @@ class Parameter(Document):
     ) -> None:
         """Check a parameter of a scene, whose `document` is JSON.
 
-        `owners` has the locations of parameters before it, and gets those of this one.
+        `owners` has the locations of parameters before it, and gets the locations of this one.
         """
         parent: Location = ("parameters", name)
         if name in LOOKS_AXES:
@@ -123,6 +123,7 @@ class Parameter(Document):
 
         Rules of numbers are ranges, so the ends of a range stand for it.
         """
+        # A parameter has a list of values, or two ends.
         listed: list[tuple[Location, Value | None]] = [
             (("values", at), value) for at, value in enumerate(self.values or ())
         ]
@@ -131,7 +132,7 @@ class Parameter(Document):
 
     @property
     def range(self) -> str:
-        """What it may be, in words."""
+        """The allowed values, in words."""
         # A pure number has no unit to show.
         unit = "" if self.unit == "1" else f" [{self.unit}]"
         if self.values is not None:
@@ -151,7 +152,7 @@ def resolve_path(document: Mapping[str, Any], path: str) -> Location:
 
     `friction.A.B` finds the coefficient of two in any order.
 
-    Raises LookupError, which says from where on it leads nowhere.
+    Raises LookupError, which names the last location that exists.
     """
     words = path.split(".")
     if words[0] == "friction" and len(words) == 3:

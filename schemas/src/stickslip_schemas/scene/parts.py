@@ -55,6 +55,7 @@ def _below_the_scene(name: str) -> str:
         if not is_sha256(name.removeprefix(ARTIFACT)):
             raise ValueError("a reference to a file must be sha256: and 64 hexadecimal digits")
         return name
+    # The document may come from somebody else: no file outside of its folder is read.
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
         raise ValueError(
@@ -83,7 +84,7 @@ BY_NAME = BeforeValidator(_by_name)
 
 
 class Key(Document):
-    """Where something is at an instant, since the start."""
+    """The position of something at an instant, since the start."""
 
     time: Time = Field(description="[s]")
     move: Vector = Field(default=(0.0, 0.0, 0.0), description="displacement since the start [m]")
@@ -137,17 +138,20 @@ class Motion(Document):
 
     @model_validator(mode="after")
     def _is_one_motion(self) -> Self:
+        # Three ways to describe a motion; two of them would contradict each other.
         given = [name for name in ("keys", "spin", "path") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(
                 "a motion must have one of keys, spin and path, and it has "
                 f"{', '.join(given) or 'none'}"
             )
+        # A smooth motion is at rest at its ends, and a spin has a ramp of its own.
         if self.ramp and (self.spin is not None or self.interpolation == "smooth"):
             raise ValueError(
                 "ramp is of linear keys and paths, and this motion is not linear; ramp is "
                 f"{self.ramp:g} s"
             )
+        # Interpolation needs a first and a last key.
         for before, after in pairwise(self.keys or ()):
             if not before.time < after.time:
                 raise ValueError(
@@ -277,10 +281,13 @@ class Unstructured(Document):
 
         The vertices are rows of a triangular lattice, with every second row shifted.
         """
+        # The mesher of sim_core lays the same rows; a contract test compares the counts.
         columns = max(1, round(self.size[0] / self.spacing))
         rows = max(1, round(self.size[1] / (self.spacing * 0.75**0.5)))
         shifted = rows // 2  # rows 1, 3, ... but the last
+        # A shifted row begins and ends on the outline, so it has one vertex more.
         vertices = (rows + 1) * (columns + 1) + shifted
+        # Euler: a triangulation has 2 V - 2 - H triangles, with H vertices on its hull.
         hull = 2 * columns + 2 * rows  # every row begins and ends on the outline
         return vertices, 2 * vertices - 2 - hull
 
@@ -331,7 +338,7 @@ class Stretched(Document):
 
 
 class FromFile(Document):
-    """It starts where a file says."""
+    """It starts at positions in a file."""
 
     type: Literal["file"]
     file: FileName | None = Field(
@@ -369,6 +376,7 @@ class Holder(Document):
 
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
+        # Four ways to choose vertices, of which a holder has one.
         given = [name for name in ("edge", "rim", "vertices") if getattr(self, name) is not None]
         if self.low is not None or self.high is not None:
             given.append("low and high")
@@ -379,6 +387,7 @@ class Holder(Document):
             )
         if (self.low is None) != (self.high is None):
             raise ValueError("low and high must both be given")
+        # A rectangle with its corners exchanged would hold nothing.
         if any(low > high for low, high in zip(self.low or (), self.high or (), strict=True)):
             raise ValueError(
                 f"low must be at most high in both [m], and they are {list(self.low or ())} and "
@@ -424,6 +433,7 @@ class Sheet(Document):
 
     @model_validator(mode="after")
     def _can_start(self) -> Self:
+        # The file of the mesh has positions; a grid has none.
         if (
             isinstance(self.start, FromFile)
             and self.start.file is None
@@ -440,7 +450,7 @@ FILM = 36.0
 
 
 class View(Document):
-    """A camera, by where it is and where it looks."""
+    """A camera, by its position and its target."""
 
     position: Vector = Field(description="[m]")
     target: Vector = Field(description="the point in the middle of the picture [m]")
@@ -450,6 +460,7 @@ class View(Document):
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
+        # The floor ends at 8 m, and is seen from above.
         x, y, z = self.position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
@@ -457,6 +468,7 @@ class View(Document):
                 "above the floor, and "
                 f"it is {list(self.position)} m"
             )
+        # Up would have no direction in the picture.
         if math.hypot(*self._forward[:2]) < 1e-6:
             raise ValueError(
                 "target must not be straight above or below position, and it is "
@@ -471,21 +483,23 @@ class View(Document):
 
     def camera(self, name: str) -> Camera:
         """Return the calibrated camera: upright, with the principal point in the middle."""
+        # Rows of the rotation are the axes of the camera: right, which is level, down and forward.
         x, y, z = (value / math.hypot(*self._forward) for value in self._forward)
         level = math.hypot(x, y)
         rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
+        # t = -R p, for the camera itself is at the origin of its axes.
         a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
         return square(name, CLIP_SIZE, self.focal_length / FILM * CLIP_SIZE, rotation, (a, b, c))
 
 
 class SheetLook(Document):
-    """What a sheet looks like where no axis says it."""
+    """Looks of a sheet, if no axis sets them."""
 
     texture: FileName = Field(description="a built-in texture, or a square PNG or JPEG file")
 
 
 class BodyLook(Document):
-    """What a body looks like."""
+    """Looks of a body."""
 
     color: tuple[Share, Share, Share] = Field(
         default=(0.2, 0.2, 0.2), description="linear red, green, blue, 0 to 1"
@@ -519,6 +533,7 @@ class Looks(Document):
     @field_validator("cameras")
     @classmethod
     def _known_rig(cls, cameras: "str | dict[str, View] | None") -> "str | dict[str, View] | None":
+        # A name is that of a rig; cameras by name are of the scene.
         if isinstance(cameras, str) and cameras not in rig_names():
             raise ValueError(
                 f"cameras must be one of {', '.join(rig_names())}, or cameras by name"

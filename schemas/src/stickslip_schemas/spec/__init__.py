@@ -1,1 +1,1 @@
-"""What a user may ask for: axes, looks, cameras, fabrics, and the arrays that follow."""
+"""Parts of specs: axes, looks, cameras, fabrics, and the arrays that follow."""

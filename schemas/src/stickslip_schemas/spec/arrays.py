@@ -1,8 +1,8 @@
-"""What an array of a dataset is. The first dimension of every array is `sample`.
+"""The layout of an array of a dataset. The first dimension of every array is `sample`.
 
 Labels are a few large chunks; curves are one chunk per shard group; pictures, clips and meshes are
 one chunk per sample, and the chunks of a shard group lie in one shard. Every chunk is
-`bytes(little) -> zstd(3) -> crc32c`, but for those of clips and trajectories: see
+`bytes(little) -> zstd(3) -> crc32c`, but for clips and trajectories: see
 `stickslip_schemas.format.codecs`.
 """
 
@@ -29,14 +29,14 @@ REGIONS = {
     "landed": "cloth within 40 mm of the floor",
     "edge": "a band of 4 px along the silhouette",
 }
-"""Where it is measured how good a clip is."""
+"""Regions in which the quality of a clip is measured."""
 
 NAN = float("nan")
 
 
 @dataclass(frozen=True, slots=True)
 class ArrayLayout:
-    """One array: `shape` and `dimensions` are those of a single sample."""
+    """One array: `shape` and `dimensions` are of a single sample."""
 
     name: str
     dtype: str
@@ -45,26 +45,27 @@ class ArrayLayout:
     description: str
     fill: float | int | bool = 0
     per_sample: bool = False
-    """True where a chunk is one sample and the chunks of a shard group lie in one shard."""
+    """True if a chunk is one sample and the chunks of a shard group lie in one shard."""
     is_recorded: bool = False
-    """True where the values come from the record of the simulation, not from a label or from the
+    """True if the values come from the record of the simulation, not from a label or from the
     renderer.
     """
     categories: tuple[str, ...] = ()
     """Names of the codes 0, 1, ... of a categorical label."""
     is_trajectory: bool = False
-    """True where the first dimension of a sample is time and the values change slowly: coded as a
+    """True if the first dimension of a sample is time and the values change slowly: coded as a
     trajectory.
     """
     is_clip: bool = False
     """True of pictures (frame, y, x, rgb) that change slowly from frame to frame: coded as a clip.
     """
     attributes: dict[str, Any] = field(default_factory=dict, hash=False)
-    """What else the Zarr array says of itself."""
+    """Further attributes of the Zarr array."""
 
     @property
     def sample_bytes(self) -> int:
         """Decoded size of one sample [bytes]."""
+        # NumPy stores a bool in a byte. Other names of types end with their bits.
         bits = 8 if self.dtype == "bool" else int(self.dtype.lstrip("uintfloa"))
         return prod(self.shape) * bits // 8
 
@@ -75,7 +76,7 @@ class ArrayLayout:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What decides on the bytes of the array, as JSON: everything but the description."""
+        """All that decides on the bytes of the array, as JSON: everything but the description."""
         own = {
             field.name: getattr(self, field.name)
             for field in fields(self)
@@ -97,6 +98,7 @@ def array(
 
     `of` has the size of each dimension of a sample, by name; a sample is one number without it.
     """
+    # Signed integers have -1 for missing values, for they have no NaN.
     of = of or {}
     missing = {"f": NAN, "i": -1, "b": False}.get(dtype[0], 0)
     return ArrayLayout(
@@ -107,6 +109,7 @@ def array(
 SPLITS = ("train", "validation", "test")
 """Names of the splits, in the order of their numbers in the array `split`."""
 
+# Readers of any kind of dataset may rely on these.
 COMMON_ARRAYS = (
     array("split", "0 train, 1 validation, 2 test", "uint8", categories=SPLITS),
     array("valid", "false where the sample was rejected; the manifest says why", "bool"),
@@ -117,6 +120,7 @@ COMMON_ARRAYS = (
 
 def describe(array: ArrayLayout) -> dict[str, Any]:
     """Return the attributes that the Zarr array carries."""
+    # Other programs show the description, for example xarray.
     attributes: dict[str, Any] = {"description": array.description, **array.attributes}
     if array.categories:
         attributes["categories"] = list(array.categories)

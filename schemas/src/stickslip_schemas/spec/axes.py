@@ -103,6 +103,7 @@ class SobolAxis(_RangeAxis[T], Generic[T]):
 
 
 def _long_form(value: Any) -> Any:
+    # The short forms: a list, and one value.
     if isinstance(value, list | tuple):
         return {"type": "list", "values": value}
     # In Python, True is an int.
@@ -122,6 +123,7 @@ class _Shorthand(BeforeValidator):
     def __get_pydantic_json_schema__(
         self, core: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
+        # The short forms take a value of the list, which the schema has already.
         long = handler(core)
         if handler.mode == "serialization":
             return long
@@ -136,7 +138,7 @@ class _Shorthand(BeforeValidator):
 SHORTHAND = _Shorthand(_long_form)
 """Lets an axis be written in its short form."""
 TAGGED = Field(discriminator="type")
-"""Stands before `SHORTHAND` where an axis has several forms."""
+"""Stands before `SHORTHAND` if an axis has several forms."""
 
 AnyAxis = ListAxis[Any] | LinspaceAxis[Any] | RandomAxis[Any] | SobolAxis[Any]
 
@@ -186,6 +188,7 @@ def _sobol(num: int, seed: int, dimension: int) -> "npt.NDArray[np.float64]":
     import numpy as np
     from scipy.stats import qmc  # an extra: only who expands a spec needs it
 
+    # A Sobol sequence is even only over a power of two: draw the next one and cut it.
     exponent = max(0, int(num - 1).bit_length())
     generator = np.random.Generator(np.random.PCG64(seed))
     points = qmc.Sobol(dimension + 1, scramble=True, rng=generator).random_base2(exponent)

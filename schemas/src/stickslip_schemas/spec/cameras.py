@@ -9,7 +9,7 @@ A point X [scene units] lands on the pixel (u, v), with the distortion of the le
     v = fy (y g + p1 (s + 2 y^2) + 2 p2 x y) + cy
 
 Integer pixel coordinates are pixel centres: the image covers [-0.5, width - 0.5] x [-0.5, height -
-0.5] and v grows downwards. A camera is nothing but a name and numbers, so its JSON form is what
+0.5] and v grows downwards. A camera is nothing but a name and numbers, so its JSON form
 enters a content key.
 """
 
@@ -50,7 +50,7 @@ _BORDER = 16
 
 
 def distorted(x: Any, y: Any, lens: Lens) -> tuple[Any, Any]:
-    """Return where a lens shows places of the plane at depth 1; numbers or arrays."""
+    """Return the images of points of the plane at depth 1; numbers or arrays."""
     k1, k2, p1, p2, k3 = lens
     s = x * x + y * y
     g = 1.0 + s * (k1 + s * (k2 + s * k3))
@@ -121,7 +121,7 @@ class Camera(Document):
     @field_validator("distortion", mode="before")
     @classmethod
     def _all_five(cls, distortion: Any) -> Any:
-        """Take what OpenCV gives for a lens with fewer numbers: none, or k1, k2, p1, p2."""
+        """Complete the numbers of OpenCV for a simpler lens: none, or k1, k2, p1, p2."""
         short = isinstance(distortion, list | tuple) and len(distortion) in (0, 4)
         return [*distortion, *NO_LENS[len(distortion) :]] if short else distortion
 
@@ -213,8 +213,8 @@ class Camera(Document):
 
         The frame is narrowed by a margin [px] on every side. Negative: the room left. A ball's
         image is taken as a disc, which is right to first order in its angular size. Infinite if a
-        ball reaches behind the camera. What a lens does not see it may fold into its picture: the
-        pinhole camera says how far out that is.
+        ball reaches behind the camera. A lens may fold points that it does not see into its
+        picture: the pinhole camera says how far out that is.
         """
         import numpy as np
 
@@ -252,9 +252,8 @@ def square(name: str, size: int, focal: float, rotation: Any, translation: Vecto
 
 
 FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
-"""Azimuth, seen from what it frames, from +x towards +y, and elevation of each camera that frames
-[degree].
-"""
+"""Azimuth, from +x towards +y, and elevation of each camera that frames, seen from the framed
+points [degree]."""
 
 _FRAMED_FOCAL = 560.0  # [px] at 224 pixels: a lens of 90 mm, as the rigs have
 _FRAMED_MARGIN = 10.0  # [px] at 224 pixels
@@ -308,7 +307,7 @@ _RIG_FILE: TypeAdapter[dict[str, _Rig]] = TypeAdapter(dict[str, _Rig])
 
 
 def read_rigs(path: str | Path) -> dict[str, tuple[Camera, ...]]:
-    """Read the rigs of a calibration file, laid out as those in this package's folder `rigs`."""
+    """Read the rigs of a calibration file, laid out like the shipped ones."""
     data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     return {name: rig.cameras for name, rig in _RIG_FILE.validate_python(data).items()}
 

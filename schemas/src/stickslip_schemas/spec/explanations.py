@@ -35,7 +35,7 @@ class Explanation(NamedTuple):
     rule: str
     """The rule that does not hold, with its unit."""
     location: tuple[int | str, ...]
-    """Where, with parts that only pydantic knows."""
+    """The location, with parts that only pydantic knows."""
     value: Any
     is_missing: bool = False
     """True if there is no value to show."""

@@ -1,6 +1,6 @@
 """Specs: a `JobSpec` is a parameter grid of one kind.
 
-This module holds what all kinds have in common. A kind itself is one module of
+This module holds the parts that all kinds have in common. A kind itself is one module of
 `stickslip_schemas.kinds`.
 """
 
@@ -55,7 +55,7 @@ class Quality(StrEnum):
 class PresetName(StrEnum):
     """Named, frozen sets of solver settings for cloth.
 
-    The thesis's three are those of its Table 4.2.
+    Three are from Table 4.2 of the thesis.
     """
 
     certified = "certified"
@@ -67,7 +67,7 @@ class PresetName(StrEnum):
 
 
 CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
-"""Protocols that a certificate also needs where cloth touches itself or other cloth."""
+"""Protocols that a certificate also needs if cloth touches itself or other cloth."""
 
 
 class Splits(Document):
@@ -95,7 +95,7 @@ class Splits(Document):
 
 
 class Simulation(Document):
-    """What one trajectory depends on besides the build that makes it.
+    """All that one trajectory depends on, besides the build.
 
     Every kind has a class of its own.
     """
@@ -113,7 +113,7 @@ class Simulation(Document):
         return 0
 
     def inputs(self, read: Callable[[str], bytes]) -> dict[str, Any]:
-        """Return what it is made from, as JSON and arrays.
+        """Return the inputs of the solver, as JSON and arrays.
 
         `read` returns the bytes of an artifact by its digest.
         """
@@ -135,12 +135,12 @@ class Render(Document):
 
     @property
     def shading(self) -> dict[str, Any] | None:
-        """What renders have in common that can be made together, as JSON; None where none can."""
+        """All that renders of one shading share, as JSON; None if none can share it."""
         return None
 
     @property
     def variant(self) -> str:
-        """What tells renders apart that can be made together."""
+        """The value that differs between renders of one shading."""
         return ""
 
 
@@ -184,7 +184,7 @@ class Costs(NamedTuple):
 
 
 class JobSpec(Document):
-    """What the specs of all kinds have in common, and what common code may ask a spec.
+    """Base of the specs of all kinds, with all that common code may ask a spec.
 
     A kind states which documents describe a simulation and a render. A field of these documents
     that has the name of an axis takes its value. `simulation_settings` and `render_settings` give
@@ -200,6 +200,7 @@ class JobSpec(Document):
     """True if samples start in a scene, which may be impossible: see `start_faults`."""
     """The axis whose values differ between renders that can be made together, if there is one."""
 
+    # Keys that all kinds have. A kind adds its axes and quality.
     kind: str
     name: str | None = Field(
         default=None,
@@ -266,7 +267,7 @@ class JobSpec(Document):
         raise NotImplementedError
 
     def cameras(self) -> tuple[Camera, ...]:
-        """Return the cameras of the pictures; none where nothing is rendered."""
+        """Return the cameras of the pictures; none if nothing is rendered."""
         raise NotImplementedError
 
     @property
@@ -282,14 +283,14 @@ class JobSpec(Document):
         return str(self.quality) if stage is Stage.render else ""
 
     def fields_of(self, axis: str) -> tuple[str, ...]:
-        """Return the fields of documents that an axis sets: by default the one of its name.
+        """Return the fields of documents that an axis sets: by default the field of its name.
 
         `field/0/name` is a place in a field that holds JSON.
         """
         return (axis,)
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
-        """Return what a value of an axis puts into these fields."""
+        """Return the values that a value of an axis puts into these fields."""
         return dict.fromkeys(self.fields_of(axis), value)
 
     @property
@@ -305,7 +306,7 @@ class JobSpec(Document):
         return None
 
     def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
-        """Raise UnfitFileError if a file is not what the scene of the spec needs at a place."""
+        """Raise UnfitFileError if a file does not fit the scene of the spec."""
         raise NotImplementedError
 
     def start_faults(self, read: Callable[[str], bytes]) -> list[StartFault]:
@@ -332,7 +333,7 @@ class JobSpec(Document):
 
     @property
     def fixed_bodies(self) -> tuple[dict[str, Any], ...]:
-        """Bodies that no scene describes, for example a floor, as JSON like those of a scene."""
+        """Bodies that no scene describes, for example a floor, as JSON like bodies of a scene."""
         return ()
 
     @property
@@ -369,6 +370,7 @@ class JobSpec(Document):
     @property
     def sample_count(self) -> int:
         """Number of points of the grid."""
+        # Zipped axes have one length, and the grid has that many points.
         sizes = [axis.num for axis in self.named_axes.values()]
         return sizes[0] if self.combine == "zip" else prod(sizes)
 
@@ -420,13 +422,13 @@ class JobSpec(Document):
         return self.samples_per_shard
 
     def simulation(self, point: Mapping[str, Any]) -> Simulation:
-        """Return what to simulate at a point of the grid."""
+        """Return the simulation at a point of the grid."""
         return self._document(
             self.simulation_type, point, self.simulation_settings(), self.simulation_seeds
         )
 
     def render(self, point: Mapping[str, Any]) -> Render | None:
-        """Return what to render at a point of the grid; None renders nothing."""
+        """Return the render at a point of the grid; None renders nothing."""
         settings = self.render_settings()
         return (
             None
@@ -441,6 +443,7 @@ class JobSpec(Document):
         settings: dict[str, Any],
         seeds: tuple[SeedRule, ...],
     ) -> D:
+        # Values of axes replace settings; a path replaces a value inside of one.
         fields: dict[str, Any] = {}
         for axis, axis_value in point.items():
             for path, value in self.document_fields(axis, axis_value).items():
@@ -460,6 +463,7 @@ class JobSpec(Document):
 
     @model_validator(mode="after")
     def _countable(self) -> Self:
+        # A grid that is too large is refused before anybody expands it.
         sizes = {name: axis.num for name, axis in self.named_axes.items()}
         if self.combine == "zip" and len(set(sizes.values())) > 1:
             raise ValueError(f"axes that are zipped must have one length, and theirs are {sizes}")

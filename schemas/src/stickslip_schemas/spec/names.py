@@ -87,6 +87,7 @@ class FabricNumbers(Document):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
+        # A table of stretching, or three numbers of an isotropic sheet.
         isotropic = (self.young, self.poisson, self.thickness)
         if self.stretching is not None:
             if any(number is not None for number in isotropic):
@@ -107,6 +108,7 @@ class FabricNumbers(Document):
         elif self.young is None or self.poisson is None or self.thickness is None:
             raise ValueError("give stretching, or all of young, poisson and thickness")
         else:
+            # E h is the stiffness of the sheet in its plane.
             membrane = self.young * self.thickness
             if membrane > MEMBRANE_MAX:
                 raise ValueError(
@@ -355,12 +357,14 @@ class Calibration(Document):
 
     @model_validator(mode="after")
     def _can_be_rendered(self) -> Self:
+        # OpenCV has up to 14 coefficients; the renderer has the first five.
         if any(self.distortion[5:]):
             raise ValueError(
                 "distortion must be 0 after k1, k2, p1, p2, k3: calibrate without rational, prism "
                 "and tilted models; "
                 f"it is {list(self.distortion)}"
             )
+        # The renderer has no skew, and the last row is always 0, 0, 1.
         (fx, skew, cx), (zero, fy, cy), last = self.camera_matrix
         if skew != 0 or zero != 0 or last != (0.0, 0.0, 1.0) or fx <= 0 or fy <= 0:
             raise ValueError(
@@ -382,6 +386,7 @@ class Calibration(Document):
                         f"{FIELD_OF_VIEW} degrees and a centre within half an image of its edges; "
                         f"it is {value:g} px"
                     )
+        # The lens is checked with the camera of the clip, which is cut from the image.
         self._check_lens()
         x, y, z = self.camera("own").position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
@@ -425,6 +430,7 @@ class Calibration(Document):
 
         It shows the square in the middle of the image, scaled to `CLIP_SIZE`.
         """
+        # The clip is the largest square in the middle, scaled.
         width, height = self.image_size
         side = min(width, height)
         scale = CLIP_SIZE / side

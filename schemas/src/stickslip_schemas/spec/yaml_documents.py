@@ -1,7 +1,7 @@
 """The YAML of specs and scenes: the core schema of YAML 1.2, with merge keys.
 
 PyYAML reads YAML 1.1, in which `010` is 8, `1:30` is 90, `.2e7` and `1e-3` are words, and `no` is
-false. Here numbers, booleans and null are those of YAML 1.2.2, section 10.3.2, as in ruamel.yaml
+false. Here numbers, booleans and null are as in YAML 1.2.2, section 10.3.2, as in ruamel.yaml
 and in other languages. Everything else that is not quoted is a word: dates, `yes` and `1_000`, too.
 
 A key must be a word, and be there once. A merge key `<<: *NAME` adds the keys of another mapping.

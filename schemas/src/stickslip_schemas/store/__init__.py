@@ -34,7 +34,9 @@ AT_ONCE = 32
 more.
 """
 
+# A writer works on `.DIGEST.UNIQUE.tmp` beside the artifact, and renames it when it is whole.
 _SCRATCH = re.compile(r"\.([0-9a-f]{64})\..*\.tmp")
+# Errors that say something about the whole store. Others are about one file.
 _UNAVAILABLE = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -60,7 +62,7 @@ def is_unavailable(error: OSError) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A file among the artifacts: an artifact, or what a writer left when it was ended."""
+    """A file among the artifacts: an artifact, or a leftover of a writer that was ended."""
 
     name: str
     """The digest of an artifact. A leftover has another name, which `delete` takes as well."""
@@ -98,21 +100,21 @@ class Store(Protocol):
     """
 
     def __hash__(self) -> int:
-        """Let what was read from a store be cached by it."""
+        """Let data of a store be cached by the store."""
 
     @property
     def place(self) -> str:
-        """What people call the store: its directory or its URL."""
+        """The name of the store for people: its directory or its URL."""
 
     @property
     def cache(self) -> Path | None:
-        """A directory that all workers share for what may be lost; None if the store has none."""
+        """A directory of all workers for files that may be lost; None if there is none."""
 
     def publish(self, data: bytes) -> str:
         """Make `data` an artifact, durably, and return its digest; write a damaged one anew."""
 
     def read(self, digest: str, *, offset: int = 0, length: int | None = None) -> bytes:
-        """Return an artifact's bytes; raise CorruptArtifactError where it is too short.
+        """Return an artifact's bytes; raise CorruptArtifactError if it is too short.
 
         A whole artifact is also checked against its digest.
         """
@@ -120,7 +122,7 @@ class Store(Protocol):
     def stream(self, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes from `start` to `stop` in blocks.
 
-        Raise CorruptArtifactError where it ends before.
+        Raises CorruptArtifactError if it ends before.
         """
 
     def size(self, digest: str) -> int:
@@ -150,11 +152,11 @@ class Store(Protocol):
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
         """Return whether a version shows the bytes of `digest` at `path`.
 
-        They are read where they are a copy.
+        A copy is read; a link is not.
         """
 
     def read_shown(self, dataset: str, version: int, path: str) -> bytes:
-        """Return what a version shows at `path`, unchecked."""
+        """Return the file of a version at `path`, unchecked."""
 
     def versions(self, path: str) -> Iterator[ShownVersion]:
         """Yield the versions that show a file at `path`."""
@@ -169,7 +171,7 @@ class Store(Protocol):
         """Return how full the store is; None if it has no limit that it knows."""
 
     def probe(self) -> None:
-        """Write a small file and delete it; raise OSError where that fails."""
+        """Write a small file and delete it; raise OSError if that fails."""
 
 
 def artifact_name(name: str) -> str:
@@ -179,6 +181,7 @@ def artifact_name(name: str) -> str:
     """
     leftover = _SCRATCH.fullmatch(name)
     digest = leftover[1] if leftover else name
+    # Names become paths, so a name that is no digest could lead out of the store.
     if not is_sha256(digest):
         raise ValueError(f"digest must be 64 lower-case hexadecimal digits, and it is {name!r}")
     if "/" in name:
@@ -194,8 +197,9 @@ def version_name(dataset: str, version: int) -> str:
 def shown_name(dataset: str, version: int, path: str) -> str:
     """Return the path of a file of a version below the root of a store.
 
-    Raise ValueError where it leads outside.
+    Raises ValueError if it leads outside.
     """
+    # Paths come from manifests, which may be of anybody.
     if any(part in ("", ".", "..") for part in path.split("/")):
         raise ValueError(f"path must be relative, without empty parts, '.' and '..'; got {path!r}")
     return f"{version_name(dataset, version)}/{path}"
@@ -204,10 +208,11 @@ def shown_name(dataset: str, version: int, path: str) -> str:
 def in_parallel(
     function: Callable[[T], R], items: Iterable[T], *, at_once: int = AT_ONCE
 ) -> list[R]:
-    """Return what `function` gives for each item, in their order.
+    """Return the results of `function` for each item, in their order.
 
     Raise the first error, and begin nothing more.
     """
+    # Threads wait for a disk or a server, so more of them than cores are of use.
     with ThreadPoolExecutor(at_once) as pool:
         try:
             return list(pool.map(function, items))
@@ -226,12 +231,14 @@ def store_place(place: str | Path) -> str:
     Every process of a machine understands it alike.
     """
     text = str(place)
+    # Without a scheme it is a directory. Processes have different working directories.
     if _SCHEME.match(text) is None and text:
         return str(Path(text).absolute())
     try:
         url = urlsplit(text)
     except ValueError:
         url = urlsplit("")
+    # A URL of another host is no directory of this machine.
     if text.startswith("file://") and url.netloc in ("", "localhost") and url.path.startswith("/"):
         return str(Path(unquote(url.path)))
     if (
@@ -249,7 +256,7 @@ def store_place(place: str | Path) -> str:
 def open_store(place: str | Path) -> Store:
     """Open the store at a place; see `store_place`. Nothing is written, and no server is asked.
 
-    Raises ValueError where there is no such sort of store, or what it needs is not installed.
+    Raises ValueError if there is no such sort of store, or if its library is not installed.
     """
     place = store_place(place)
     if not place.startswith("s3://"):
@@ -303,6 +310,7 @@ class DirectoryStore:
         A damaged one is mended in all versions.
         """
         digest = sha256(data)
+        # An artifact that is there and whole is not written again.
         if not self.holds(digest, size=len(data)):
             path = self.path(digest)
             links = (
@@ -310,8 +318,10 @@ class DirectoryStore:
                 if path.exists() and path.stat().st_nlink > 1
                 else ()
             )
+            # Versions show a damaged artifact by hard links, which all need the new file.
             shown = [file for file in links if file.is_file() and file.samefile(path)]
             write_durably(path, data)
+            # The link of a version still leads to the damaged file.
             for file in shown:
                 _link(path, file)
         return digest
@@ -322,6 +332,7 @@ class DirectoryStore:
             data = file.read(-1 if length is None else length)
         if length not in (None, len(data)):
             raise CorruptArtifactError(f"artifact {digest} ends before {offset} + {length}")
+        # A part of an artifact cannot be checked: its digest is of the whole.
         if offset == 0 and length is None and sha256(data) != digest:
             raise CorruptArtifactError(f"artifact {digest} has other bytes than its name says")
         return data
@@ -330,6 +341,7 @@ class DirectoryStore:
         with self.path(digest).open("rb") as file:
             file.seek(start)
             while start < stop:
+                # In blocks, so that a large file needs little memory.
                 block = file.read(min(BLOCK, stop - start))
                 if not block:
                     raise CorruptArtifactError(f"artifact {digest} ends before {stop}")
@@ -348,6 +360,7 @@ class DirectoryStore:
     def holds(self, digest: str, *, size: int | None = None) -> bool:
         try:
             with self.path(digest).open("rb") as file:
+                # The size is cheap to compare. The digest reads the file.
                 if size is not None and os.fstat(file.fileno()).st_size != size:
                     return False
                 return hashlib.file_digest(file, "sha256").hexdigest() == digest
@@ -368,12 +381,13 @@ class DirectoryStore:
                 FileNotFoundError,
             ):  # of somebody else, or a writer has finished with it
                 continue
+            # A file with more than one link is shown by a version.
             if is_ours:
                 is_shown = is_sha256(path.name) and status.st_nlink > 1
                 yield Stored(path.name, status.st_size, status.st_mtime, is_shown)
 
     def show(self, digest: str, dataset: str, version: int, path: str) -> None:
-        """Where the file system has no hard links, the bytes are written a second time."""
+        """If the file system has no hard links, the bytes are written a second time."""
         target = self.root / shown_name(dataset, version, path)
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -383,6 +397,7 @@ class DirectoryStore:
 
     def shows(self, digest: str, dataset: str, version: int, path: str) -> bool:
         place = self.root / shown_name(dataset, version, path)
+        # A hard link has the bytes of its artifact, and need not be read.
         with suppress(OSError):
             if place.samefile(self.path(digest)):
                 return True
@@ -397,12 +412,14 @@ class DirectoryStore:
     def versions(self, path: str) -> Iterator[ShownVersion]:
         for place in sorted(self.root.glob(f"{DATASETS}/*/v*/{path}")):
             dataset, version = place.relative_to(self.root / DATASETS).parts[:2]
+            # Other directories are not ours.
             if VERSION.fullmatch(version):
                 yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
 
     def hide(self, dataset: str, version: int) -> None:
         directory = self.dataset_path(dataset, version)
         if directory.is_dir():
+            # The links go; the artifacts stay.
             shutil.rmtree(directory)
             if not any(directory.parent.iterdir()):
                 directory.parent.rmdir()
@@ -412,6 +429,7 @@ class DirectoryStore:
 
     def disk_usage(self) -> DiskUsage:
         place = self.root
+        # The directory is created by the first artifact; its file system is known before.
         while not place.exists():
             place = place.parent
         return DiskUsage(*shutil.disk_usage(place))
@@ -427,19 +445,22 @@ def write_durably(path: Path, data: bytes, *, mode: int = 0o666) -> None:
 
     It is there whole or not at all, also after a crash.
 
-    `mode` are its permissions, less those that the umask takes away.
+    `mode` are its permissions, less the ones of the umask.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Readers see the old file or the new one, and never a part of it.
     scratch = _scratch_path(path)
     try:
         with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
             file.flush()
+            # Without this, the name may be on disk before the bytes are.
             os.fsync(file.fileno())
         scratch.replace(path)
     except BaseException:
         scratch.unlink(missing_ok=True)
         raise
+    # Now the name itself must be on disk, too.
     sync(path.parent)
 
 

@@ -1,1 +1,1 @@
-"""What all kinds of cloth share."""
+"""Specs and arrays that all kinds of cloth share."""

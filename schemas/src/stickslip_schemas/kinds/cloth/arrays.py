@@ -35,6 +35,7 @@ def over_time(
     **more: Any,
 ) -> ArrayLayout:
     """Return a recorded array: a number, or an array of dimensions `of`, at each instant."""
+    # Readers need the rate to know the time of an instant.
     attributes = {"instants_per_second": spec.instants_per_second, **more.pop("attributes", {})}
     return array(
         name,
@@ -49,6 +50,7 @@ def over_time(
 
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     """Return the arrays of clips and the labels of looks, which all kinds of cloth have."""
+    # A clip shows some instants of the motion; the attribute says which.
     pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
     instants = {"instants": list(spec.shown_instants)}
     light = "azimuth and elevation of the lamp [degree], its power over the nominal"
@@ -95,6 +97,7 @@ def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayL
 
     Textures share them, and each of their samples has them.
     """
+    # Depth and normals are exact: they are computed, not rendered.
     segments = {"categories": list(spec.segments)}
     normals = "normals towards the camera, in its axes (right, down, forward); 0 where nothing is"
     flow = "motion of the visible point until the next frame of the clip [px], 0 in the last"
@@ -124,6 +127,7 @@ def _ground_truth_arrays(spec: ClipSpec, pixels: dict[str, int]) -> tuple[ArrayL
 
 def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
     """Return the labels of the numbers of a fabric, whose names begin with a prefix."""
+    # Numbers of the fabric after its factors, so that a network can learn them.
     rigidity = "plate rigidities along the warp, along the weft, and of twist [N m]"
     stiffness = "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]"
     return (
@@ -167,12 +171,13 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
         "sharpness": ("side of a cell over the radius of the sharpest body that bore cloth", 2.0),
     }
 )
-"""Checks of the solver by name: what is measured, at its worst, and the limit of valid samples;
+"""Checks of the solver by name: the quantity, at its worst, and the limit of valid samples;
 None: not judged.
 """
 
 
 def _check(name: str, text: str, limit: float | None) -> ArrayLayout:
+    # A check without a limit is recorded, and rejects nobody.
     if limit is None:
         return array(name, text)
     return array(name, f"{text}; at most {limit:g} if valid", attributes={"limit": limit})
@@ -198,11 +203,13 @@ STATES = ("open", "stick", "slip")
 
 
 def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
-    """Return the arrays of a dataset of a scene, without those of clips and parameters."""
+    """Return the arrays of a dataset of a scene, without the arrays of clips and parameters."""
+    # Labels of the scene as a whole, which are there only if the scene has their cause.
     bias = array(
         "bias", "what broke the symmetry: horizontal (x, y) over vertical gravity", of={"xy": 2}
     )
     rest = array("rest_time", "when all was at rest [s]; NaN where it was not")
+    # Positions are by far the largest arrays, and may be left out.
     meshes: list[ArrayLayout] = []
     if spec.store_positions:
         for name in scene.sheets:
@@ -238,6 +245,7 @@ def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
 
 def parameter_label(scene: Scene, parameter: str) -> ArrayLayout:
     """Return the label of a parameter: a number with its unit, or the code of a fabric."""
+    # Numbers have their unit in the description; fabrics are codes.
     document = scene.parameters[parameter]
     if isinstance(scene.default(parameter), float):
         description = document.description or "parameter of the scene"

@@ -34,6 +34,8 @@ from stickslip_schemas.spec.names import (
     name_schema,
 )
 
+# Names of axes are checked by `_known_names`, which knows the definitions of the spec. The
+# annotations give the JSON schema alone.
 VIEWPOINT = Field(description="camera of the rig, or a custom one under `viewpoints`")
 TextureAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Texture"), name_schema(Texture)]],
@@ -58,10 +60,10 @@ SubstrateAxis = Annotated[
 
 
 class Custom(NamedTuple):
-    """Where the spec defines what an axis of names may name besides what is built in."""
+    """Definitions in the spec of names that an axis may use besides built-in ones."""
 
     key: str
-    """Of the spec: a mapping from the user's names to what they mean."""
+    """Of the spec: a mapping from the user's names to their meaning."""
     field: str
     """Of the document that takes it."""
     built_in: tuple[str, ...]
@@ -78,7 +80,7 @@ def definitions(what: str, axis: str, more: str = "", *, at_most: int | None = 6
 
 
 class GroundTruth(StrEnum):
-    """What can be known of every pixel of a clip without rendering it."""
+    """Quantities that are known of every pixel of a clip without rendering it."""
 
     depth = "depth"
     segmentation = "segmentation"
@@ -100,6 +102,7 @@ class ClipRender(Render):
     it.
     """
 
+    # A name of the user has its meaning beside it; a built-in name has none.
     texture: str
     image: ArtifactRef | None = Field(
         default=None, description="picture of a custom texture; null: a built-in one"
@@ -115,6 +118,7 @@ class ClipRender(Render):
         default=None, description="custom substrate; null: a built-in one"
     )
     creases: float = 0.0
+    # Which frames are rendered, what is measured on them, and the seeds of light and creases.
     instants: tuple[int, ...] = Field(
         description="which instants of the trajectory the frames of the clip show"
     )
@@ -125,7 +129,7 @@ class ClipRender(Render):
 
     @property
     def shading(self) -> dict[str, Any]:
-        """What the shading depends on, as JSON: all but the texture."""
+        """All that the shading depends on, as JSON: everything but the texture."""
         return self.model_dump(mode="json", exclude={"texture", "image"})
 
     @property
@@ -150,8 +154,9 @@ class ClipSpec(JobSpec):
         "lighting": Custom("lamps", "lamp", tuple(Lighting)),
         "substrate": Custom("substrates", "finish", tuple(Substrate)),
     }
-    """By axis of names, what the user may add to it."""
+    """Definitions that the user may add, by axis of names."""
 
+    # Definitions of names, one mapping for each axis that may use them.
     textures: dict[CustomName, ArtifactRef] = definitions(
         "textures", "texture", ": `sha256:` and the digest that `stickslip upload` prints"
     )
@@ -224,8 +229,10 @@ class ClipSpec(JobSpec):
 
         Measuring the clips of eight textures costs the fraction `measured` of their shading.
         """
+        # CPU time of shading a frame [s], fitted to `benchmarks/job_costs.py`.
         frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 3.3}
         shade = frame_seconds[self.quality] * self.frames
+        # Composing a texture is cheap. Measuring its quality renders some frames again.
         render = 0.01 * self.frames + self.measured * shade / 8
         return Costs(simulate, render, shade, pack=0.02, uncertainty_factor=uncertainty_factor)
 
@@ -247,6 +254,7 @@ class ClipSpec(JobSpec):
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
         if axis not in self.custom:
             return {axis: value}
+        # The document has the name and its meaning, for two specs may define one name differently.
         given = self.meaning(axis, value)
         if isinstance(given, Calibration | View):
             given = given.camera(value)
@@ -266,9 +274,9 @@ class ClipSpec(JobSpec):
         return tuple(map(str, self.custom[axis].built_in))
 
     def meaning(self, axis: str, name: str) -> Any:
-        """Return what the user has defined a name of an axis to be.
+        """Return the definition of a name of an axis.
 
-        None where it needs no definition.
+        None if it needs no definition.
         """
         return self._defined(axis).get(name)
 
@@ -289,14 +297,17 @@ class ClipSpec(JobSpec):
 
     @model_validator(mode="after")
     def _known_names(self) -> Self:
+        # All unknown names are reported at once, so that nobody mends them one by one.
         unknown = []
         for axis in self.custom:
+            # A definition that hides a built-in name would change its meaning silently.
             for name in self._defined(axis):
                 if name in self.built_in(axis):
                     raise ValueError(
                         f"{self.custom[axis].key} must not redefine what is built in, and {name!r} "
                         "is"
                     )
+            # Built-in names and names of the user.
             known = self.names(axis)
             given = getattr(self.axes, axis)
             unknown += [
