@@ -7,6 +7,7 @@ One that is added and not tried fails the test.
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 
 import httpx
@@ -15,6 +16,7 @@ from fastapi import FastAPI
 from PIL import Image
 from sqlalchemy import insert, select
 from starlette.routing import Route
+from stickslip_schemas.base import JobState
 from stickslip_services.access.keys import create_key
 from stickslip_services.access.principals import Principal, Scope, acting_as
 from stickslip_services.app import make_app
@@ -25,7 +27,7 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import task_id
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import serving
+from stickslip_testing.servers import serving, wait_until
 from stickslip_testing.worker import DirectApi, PretendWorker
 
 SHARED = {
@@ -346,6 +348,10 @@ def test_an_admin_sees_every_project(tenants: Tenants) -> None:
     assert answer.status_code == 200
 
 
+def is_over(client: httpx.Client, job: str) -> bool:
+    return JobState(client.get(job).json()["state"]) is JobState.succeeded
+
+
 def test_a_project_does_not_see_the_name_that_another_gave_a_dataset(tenants: Tenants) -> None:
     """Both have specified the same samples: the dataset is shared, and its name is not."""
     context: Context = tenants.app.state.context
@@ -356,12 +362,16 @@ def test_a_project_does_not_see_the_name_that_another_gave_a_dataset(tenants: Te
     for client, name in names.items():
         job = client.post("/v1/jobs", json=rods(name=name, **spec)).json()["id"]
         worker.work()
+        # The coordinator checks a dataset that exists already in the background.
+        wait_until(partial(is_over, client, f"/v1/jobs/{job}"))
         datasets_of[client] = client.get(f"/v1/jobs/{job}").json()["dataset"]["dataset"]
     assert datasets_of[tenants.alpha] == datasets_of[tenants.beta]
     path = f"/v1/datasets/{datasets_of[tenants.beta]}"
     assert tenants.alpha.get(path).json()["name"] == "alpha-secret"
     assert tenants.beta.get(path).json()["name"] is None
-    for page in (path, "/v1/datasets", "/datasets", f"{path.removeprefix('/v1')}/v1"):
+    files = f"{path}/versions/1/files"
+    pages = (path, "/v1/datasets", "/datasets", f"{path.removeprefix('/v1')}/v1")
+    for page in (*pages, f"{path}/versions/1/manifest", f"{files}/zarr.json"):
         answer = tenants.beta.get(page)
         assert answer.is_success
         assert "alpha-secret" not in answer.text, page

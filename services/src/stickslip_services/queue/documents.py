@@ -321,13 +321,23 @@ def _publish_task(connection: Connection, task: Leasable, publish: Publish) -> P
 
     outputs = [_output(packs[shard]) for shard in sorted(packs)]
     return PublishTask(
-        spec=spec,
+        spec=_without_name(connection, job, spec),
         dataset=spec.dataset_id,
         version=version_number(connection, spec.dataset_id, task.seq),
         builds=inputs.builds,
         sections=tuple(in_parallel(publish, _sections(connection, job, spec, outputs))),
         certificate=payload.get("certificate"),
     )
+
+
+def _without_name(connection: Connection, job: int, spec: JobSpec) -> JobSpec:
+    """Return a spec for the manifest of a dataset: that of a project has no name.
+
+    Another project that specifies the same samples reads the same files, and a name may be a
+    secret. Jobs without a project are of people who see all projects.
+    """
+    project = connection.scalar(select(jobs.c.project).where(jobs.c.seq == job))
+    return spec.model_copy(update={"name": None}) if project else spec
 
 
 def _sections(
