@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 from stickslip_schemas.scene.document import MAX_VERTICES
 from stickslip_schemas.scene.errors import UnfitFileError
-from stickslip_schemas.scene.gate import MAX_FILE_BYTES, MAX_TRIANGLES, check_file
+from stickslip_schemas.scene.gate import (
+    MAX_FILE_BYTES,
+    MAX_SOUP_VERTICES,
+    MAX_TRIANGLES,
+    check_file,
+)
 
 SECONDS = 2.0
 """CPU time to refuse a file [s]."""
@@ -130,7 +135,7 @@ TEXT: dict[str, Callable[[], bytes]] = {
     "a face of 8 million corners": lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + b" 1" * 8_000_000,
     "that face in many lines": lambda: b"v 0 0 0\nf" + b" 1 2 3 \\\n" * 1_500_000,
     "many faces of many corners": lambda: b"v 0 0 0\n" + (b"f" + b" 1" * 20_000 + b"\n") * 300,
-    "many vertices": lambda: b"v 0 0 0\n" * (MAX_VERTICES + 1),
+    "many vertices": lambda: b"v 0 0 0\n" * (MAX_SOUP_VERTICES + 1),
     "empty lines": lambda: b"\n" * MAX_FILE_BYTES,
     "vertical tabs": lambda: b"\x0b" * MAX_FILE_BYTES,
     "line separators": lambda: "\u2028".encode() * (MAX_FILE_BYTES // 3),

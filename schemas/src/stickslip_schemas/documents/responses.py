@@ -186,7 +186,7 @@ class FileUpload(Document):
 
     file: ArtifactRef = Field(description="reference for the document of a scene")
     counts: Annotated[tuple[int, ...], Field(min_length=2, max_length=2)] | None = Field(
-        description="vertices and triangles of an OBJ file: `counts` of a mesh"
+        description="vertices and triangles of a mesh file: `counts` of a mesh"
     )
     bytes: int
 

@@ -438,14 +438,14 @@ class ClothSceneSpec(ClipSpec):
         return (*clip_arrays(self), *labels, *scene_arrays(self, self.stage))
 
     def scene_place(self, pointer: str) -> tuple[str, ...] | None:
-        word, *place = pointer.split("/")[1:]
-        is_of_physics = word == "scene" and place[0] != "looks"
-        return tuple(place) if is_of_physics else None
+        word, *location = pointer.split("/")[1:]
+        is_of_physics = word == "scene" and location[0] != "looks"
+        return tuple(location) if is_of_physics else None
 
-    def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
+    def check_scene_file(self, location: tuple[str, ...], data: bytes) -> None:
         from stickslip_schemas.scene.files import check_scene_file  # needs the extra `arrays`
 
-        check_scene_file(self.stage, place, data)
+        check_scene_file(self.stage, location, data)
 
     def start_faults(self, read: Callable[[str], bytes]) -> list[StartFault]:
         from stickslip_schemas.scene.files import with_arrays  # needs the extra `arrays`
@@ -467,9 +467,9 @@ class ClothSceneSpec(ClipSpec):
 
         A spec without an axis of the scene has one sample in this respect.
         """
-        given = self.axes.__pydantic_extra__ or {}
-        values = {name: [value for _, value in extremes(axis)] for name, axis in given.items()}
-        for name, axis in given.items():
+        axes = self.axes.__pydantic_extra__ or {}
+        values = {name: [value for _, value in extremes(axis)] for name, axis in axes.items()}
+        for name, axis in axes.items():
             if not isinstance(axis, ListAxis):
                 low, high = values[name]
                 values[name] = [low, 0.5 * (low + high), high]
@@ -482,8 +482,8 @@ class ClothSceneSpec(ClipSpec):
 
     def unresolved_files(self) -> dict[str, str]:
         return {
-            "/".join(("/scene", *map(str, place))): name
-            for place, name in self.scene.files()
+            "/".join(("/scene", *map(str, location))): name
+            for location, name in self.scene.files()
             if artifact_digest(name) is None
         }
 
@@ -506,9 +506,9 @@ class ClothSceneSpec(ClipSpec):
 
         # One parameter may set several places of the document.
         values = {
-            place: numbers[name]
+            location: numbers[name]
             for name in self.scene_numbers
-            for place in self.stage.locations(name)
+            for location in self.stage.locations(name)
         }
         return with_arrays(self.stage.physics_with(values), read)
 

@@ -192,12 +192,16 @@ def _read_pattern(data: bytes) -> Arrays:
         triangle = int(np.argmin(area))
         raise UnfitFileError(
             f"all triangles of the flat pattern must have areas above 0 m^2; {triangle} has "
-            f"{area[triangle]:g}"
+            f"{area[triangle]:g}: triangles must be turned counterclockwise in the pattern"
         )
     _check_corners(triangles)
     _check_edges(triangles, len(rest))
     if len(np.unique(triangles)) != len(rest):
-        raise UnfitFileError("must have no vertex without a triangle")
+        loose = int(np.setdiff1d(np.arange(len(rest)), triangles)[0])
+        raise UnfitFileError(
+            f"must have no vertex without a triangle, and vertex {loose + 1} has none: delete "
+            "loose vertices (in Blender: Mesh, Clean Up, Delete Loose)"
+        )
     _check_sewn(rest, polygons.positions)
     return {"rest": rest, "positions": polygons.positions, "triangles": triangles}
 
@@ -342,7 +346,8 @@ def _check_edges(triangles: Indices, vertices: int) -> None:
     if (counts > 1).any():
         raise UnfitFileError(
             "must be a manifold: at most two triangles share an edge, turned alike; "
-            f"{int((counts > 1).sum())} edges are not so"
+            f"{int((counts > 1).sum())} edges are not so: turn all faces to one side (in Blender: "
+            "Mesh, Normals, Recalculate Outside), and delete faces inside"
         )
 
 
@@ -357,7 +362,7 @@ def _check_areas(vertices: Floats, triangles: Indices) -> None:
     if flat.any():
         raise UnfitFileError(
             f"all triangles must have areas above 0 m^2, and triangle {int(np.argmax(flat))} has "
-            "none"
+            "none: delete such triangles (in Blender: Mesh, Clean Up, Degenerate Dissolve)"
         )
 
 

@@ -147,9 +147,10 @@ def _check_obj(data: bytes) -> None:
     A face of n corners has n - 2 triangles.
     """
     text = obj_text(data)
+    # Equal vertices are welded later, so there may be more of them than a body may have.
     vertices = sum(1 for _ in _VERTEX.finditer(text))
-    if vertices > MAX_VERTICES:
-        raise UnfitFileError(f"must have at most {MAX_VERTICES} vertices, and has {vertices}")
+    if vertices > MAX_SOUP_VERTICES:
+        raise UnfitFileError(f"must have at most {MAX_SOUP_VERTICES} vertices, and has {vertices}")
     triangles = 0
     for face in _FACE.finditer(text):
         corners = face[1]

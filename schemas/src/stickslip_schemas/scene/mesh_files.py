@@ -262,7 +262,7 @@ def _fill_pattern(
     if missing.any():
         raise UnfitFileError(
             "must have texture coordinates (vt), one for each vertex: the flat pattern [m]; "
-            f"vertex {int(np.argmax(missing)) + 1} has none"
+            f"vertex {int(np.argmax(missing)) + 1} has none: unwrap the sheet, and export UVs"
         )
     return None
 

@@ -139,11 +139,11 @@ class Motion(Document):
     @model_validator(mode="after")
     def _is_one_motion(self) -> Self:
         # Three ways to describe a motion; two of them would contradict each other.
-        given = [name for name in ("keys", "spin", "path") if getattr(self, name) is not None]
-        if len(given) != 1:
+        choices = [name for name in ("keys", "spin", "path") if getattr(self, name) is not None]
+        if len(choices) != 1:
             raise ValueError(
                 "a motion must have one of keys, spin and path, and it has "
-                f"{', '.join(given) or 'none'}"
+                f"{', '.join(choices) or 'none'}"
             )
         # A smooth motion is at rest at its ends, and a spin has a ramp of its own.
         if self.ramp and (self.spin is not None or self.interpolation == "smooth"):
@@ -377,13 +377,13 @@ class Holder(Document):
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
         # Four ways to choose vertices, of which a holder has one.
-        given = [name for name in ("edge", "rim", "vertices") if getattr(self, name) is not None]
+        choices = [name for name in ("edge", "rim", "vertices") if getattr(self, name) is not None]
         if self.low is not None or self.high is not None:
-            given.append("low and high")
-        if len(given) != 1:
+            choices.append("low and high")
+        if len(choices) != 1:
             raise ValueError(
                 "a holder must have one of low and high, edge, rim and vertices, and it has "
-                f"{', '.join(given) or 'none'}"
+                f"{', '.join(choices) or 'none'}"
             )
         if (self.low is None) != (self.high is None):
             raise ValueError("low and high must both be given")

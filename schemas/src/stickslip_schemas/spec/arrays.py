@@ -77,12 +77,12 @@ class ArrayLayout:
     @property
     def identity(self) -> dict[str, Any]:
         """All that decides on the bytes of the array, as JSON: everything but the description."""
-        own = {
+        identity = {
             field.name: getattr(self, field.name)
             for field in fields(self)
             if field.name != "description"
         }
-        return own | {"fill": repr(self.fill)}  # NaN has no JSON form
+        return identity | {"fill": repr(self.fill)}  # NaN has no JSON form
 
     def shard_path(self, shard: int) -> str:
         """Path, inside the dataset, of file `shard` of the array [Zarr v3 default chunk keys]."""

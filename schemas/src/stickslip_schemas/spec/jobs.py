@@ -285,7 +285,7 @@ class JobSpec(Document):
     def fields_of(self, axis: str) -> tuple[str, ...]:
         """Return the fields of documents that an axis sets: by default the field of its name.
 
-        `field/0/name` is a place in a field that holds JSON.
+        `field/0/name` is a location in a field that holds JSON.
         """
         return (axis,)
 
@@ -299,13 +299,13 @@ class JobSpec(Document):
         return {}
 
     def scene_place(self, pointer: str) -> tuple[str, ...] | None:
-        """Return the place in its scene of an artifact, by its JSON pointer into the spec.
+        """Return the location in its scene of an artifact, by its JSON pointer into the spec.
 
         None if the artifact is a texture.
         """
         return None
 
-    def check_scene_file(self, place: tuple[str, ...], data: bytes) -> None:
+    def check_scene_file(self, location: tuple[str, ...], data: bytes) -> None:
         """Raise UnfitFileError if a file does not fit the scene of the spec."""
         raise NotImplementedError
 

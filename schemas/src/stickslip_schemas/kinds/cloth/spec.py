@@ -69,12 +69,12 @@ class Custom(NamedTuple):
     built_in: tuple[str, ...]
 
 
-def definitions(what: str, axis: str, more: str = "", *, at_most: int | None = 64) -> Any:
+def definitions(things: str, axis: str, more: str = "", *, at_most: int | None = 64) -> Any:
     """Return the field of a spec that defines custom names of an axis."""
     return Field(
         default_factory=dict,
         max_length=at_most,
-        description=f"custom {what}, by the names that the axis `{axis}` uses{more}",
+        description=f"custom {things}, by the names that the axis `{axis}` uses{more}",
         json_schema_extra={"additionalProperties": False},
     )
 
@@ -219,10 +219,10 @@ class ClipSpec(JobSpec):
         return not self.allow_uncertified
 
     def render_settings(self) -> dict[str, Any] | None:
-        own = {
+        settings = {
             name: getattr(self, name) for name in ("quality", "creases", "ground_truth", "measured")
         }
-        return own | {"instants": self.shown_instants}
+        return settings | {"instants": self.shown_instants}
 
     def clip_costs(self, simulate: float, uncertainty_factor: float) -> Costs:
         """Return CPU times of clips.
@@ -255,14 +255,14 @@ class ClipSpec(JobSpec):
         if axis not in self.custom:
             return {axis: value}
         # The document has the name and its meaning, for two specs may define one name differently.
-        given = self.meaning(axis, value)
-        if isinstance(given, Calibration | View):
-            given = given.camera(value)
+        meaning = self.meaning(axis, value)
+        if isinstance(meaning, Calibration | View):
+            meaning = meaning.camera(value)
         return {
             axis: value,
-            self.custom[axis].field: given.model_dump(mode="json")
-            if isinstance(given, Document)
-            else given,
+            self.custom[axis].field: meaning.model_dump(mode="json")
+            if isinstance(meaning, Document)
+            else meaning,
         }
 
     def _defined(self, axis: str) -> dict[str, Any]:
@@ -309,7 +309,7 @@ class ClipSpec(JobSpec):
                     )
             # Built-in names and names of the user.
             known = self.names(axis)
-            given = getattr(self.axes, axis)
+            names_axis = getattr(self.axes, axis)
             unknown += [
                 InitErrorDetails(
                     type=PydanticCustomError(
@@ -320,7 +320,7 @@ class ClipSpec(JobSpec):
                     loc=("axes", axis, "list", "values", position),
                     input=name,
                 )
-                for position, name in enumerate(() if given is None else given.values)
+                for position, name in enumerate(() if names_axis is None else names_axis.values)
                 if name not in known
             ]
         if unknown:
