@@ -41,12 +41,8 @@ class StageProgress(Document):
 
     @property
     def done(self) -> int:
-        """Number of tasks that have ended without being cancelled."""
-        return sum(
-            count
-            for state, count in self.counts.items()
-            if state.is_over and state is not TaskState.cancelled
-        )
+        """Number of tasks that have a result: those that failed or were cancelled have none."""
+        return sum(count for state, count in self.counts.items() if state.is_settled)
 
 
 class Eta(Document):
@@ -60,7 +56,7 @@ class Eta(Document):
 class Progress(Document):
     """Progress of a job."""
 
-    done: int = Field(description="ended tasks of all stages")
+    done: int = Field(description="tasks of all stages that have a result")
     total: int
     planned: int = Field(description="planned samples; `done` and `total` count only their tasks")
     stages: dict[Stage, StageProgress]

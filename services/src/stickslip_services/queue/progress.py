@@ -113,7 +113,7 @@ def _progress_of(row: ShownJob, numbers: _Numbers) -> Progress:
             frames=_frames_of(row, stage, numbers),
         )
         total += sum(counts.values())
-        done += sum(count for state, count in counts.items() if state.is_over)
+        done += stages[stage].done
     return Progress(
         done=done,
         total=total,
