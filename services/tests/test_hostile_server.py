@@ -242,14 +242,16 @@ def long_list(item: str, field: str, document: dict[str, object]) -> bytes:
     return text.replace(f'"{field}":[]', f'"{field}":[{",".join([item] * count)}]').encode()
 
 
-@pytest.mark.parametrize("item", ["[]", '""', "0.5", "{}"])
-@pytest.mark.parametrize("field", ["files", "sample_keys", "gamma"])
+@pytest.mark.parametrize(
+    ("field", "item"),
+    [("files", "[]"), ("files", "0.5"), ("sample_keys", '""'), ("gamma", "[]"), ("gamma", "0.5")],
+)
 def test_a_manifest_of_wrong_values(
     server: Server,
     honest: tuple[dict[str, bytes], Manifest],
     tmp_path: Path,
-    item: str,
     field: str,
+    item: str,
 ) -> None:
     """Neither the values nor the errors that they cause fill the memory."""
     document = json.loads(honest[0]["manifest"])
@@ -265,7 +267,7 @@ def test_a_manifest_of_wrong_values(
     assert memory < MEMORY_LIMIT
 
 
-@pytest.mark.parametrize("item", ["{}", '""', "0.5"])
+@pytest.mark.parametrize("item", ["{}", "0.5"])
 def test_as_many_wrong_values_as_are_parsed(
     server: Server, honest: tuple[dict[str, bytes], Manifest], tmp_path: Path, item: str
 ) -> None:
@@ -328,16 +330,25 @@ def test_a_file_of_a_hidden_folder(
     assert not (tmp_path / "d").exists()
 
 
-@pytest.mark.parametrize("states_its_size", [True, False])
+@pytest.mark.parametrize(
+    ("size", "states_its_size", "message"),
+    [
+        (2**31, True, "is larger than 32 bytes can be"),
+        (2**24, True, "decodes to 16777216 bytes, and 32 are expected"),
+        (2**24, False, "decodes to None bytes, and 32 are expected"),
+    ],
+)
 def test_a_label_that_decodes_to_gigabytes(
     server: Server,
     honest: tuple[dict[str, bytes], Manifest],
     tmp_path: Path,
+    size: int,
     states_its_size: bool,
+    message: str,
 ) -> None:
-    """A chunk of 64 kB whose zstd frame decodes to 2 GB."""
-    chunk = encode_chunk(bytes(2 * 2**30)) if states_its_size else streamed_chunk(2 * 2**30)
-    assert len(chunk) < MEGABYTE
+    """A small chunk whose zstd frame decodes to 2 GB, or to 16 MB from under a kilobyte."""
+    chunk = encode_chunk(bytes(size)) if states_its_size else streamed_chunk(size)
+    assert len(chunk) < 2**17
     document = json.loads(honest[0]["manifest"])
     for entry in document["files"]:
         if entry["path"] == "gamma/c/0":
@@ -347,7 +358,7 @@ def test_a_label_that_decodes_to_gigabytes(
     status, error, memory = run_pull(
         server, honest[1].dataset, tmp_path / "d", "--where", "gamma<1.5"
     )
-    assert (status, "decodes to" in error) == (1, True), error
+    assert (status, message in " ".join(error.split())) == (1, True), error
     assert memory < MEMORY_LIMIT
 
 

@@ -15,7 +15,12 @@ from stickslip_schemas.format.manifest import FileEntry
 from stickslip_schemas.store import sync
 from stickslip_schemas.transport.http import AnswerError, TransportError
 
-from stickslip_services.client.errors import DamagedError, UnexpectedError, UnreachableError
+from stickslip_services.client.errors import (
+    ClientError,
+    DamagedError,
+    UnexpectedError,
+    UnreachableError,
+)
 from stickslip_services.client.http import Client
 from stickslip_services.client.verifying import CONNECTIONS, PART_SUFFIX, file_digest, safe_path
 
@@ -74,39 +79,42 @@ class Downloader:
             part.unlink()
         self.on_bytes(_size(part))
         # Pauses grow, so that a coordinator that restarts has time to do so.
-        fault = ""
+        failure: ClientError = UnreachableError(f"{file.path} was not requested")
         for attempt in range(ATTEMPTS):
             pause = 0.0 if attempt == 0 else min(2.0**attempt / 4, self.client.retry_timeout)
             if self.stop.wait(pause):
                 return
             try:
-                fault = self._fetch(file, part)
+                self._fetch(file, part)
             except TransportError as error:
-                fault = str(error)
+                failure = UnreachableError(
+                    f"{file.path} could not be downloaded in {ATTEMPTS} attempts: the server "
+                    f"{error}"
+                )
                 continue  # the part keeps the received bytes
             except AnswerError as error:
                 raise UnexpectedError(str(error)) from error
             if self.stop.is_set():
                 return
             # The size is compared first, because a digest reads the whole file.
-            if not fault and _size(part) == file.size and file_digest(part) == file.sha256:
+            if _size(part) == file.size and file_digest(part) == file.sha256:
                 sync(part)
                 part.replace(path)
                 return
             # A part of another file, or damaged on its way: start again.
             part.unlink(missing_ok=True)
-            fault = fault or "it has other bytes than the manifest states"
-        if part.exists():
-            raise UnreachableError(
-                f"{file.path} could not be downloaded in {ATTEMPTS} attempts: {fault}"
+            failure = DamagedError(
+                f"{file.path} arrived {ATTEMPTS} times with other bytes than the manifest states"
             )
-        raise DamagedError(f"{file.path} arrived damaged {ATTEMPTS} times: {fault}")
+        raise failure
 
-    def _fetch(self, file: FileEntry, part: Path) -> str:
-        """Append the bytes of a file that its part lacks; return their fault, or an empty text.
+    def _fetch(self, file: FileEntry, part: Path) -> None:
+        """Append the bytes of a file that its part lacks.
 
         Raises:
             TransportError: The connection failed.
+            AnswerError: The body is compressed.
+            DamagedError: The server sends more bytes than the manifest states.
         """
         # Only the bytes that an earlier attempt did not get are requested, and only if the file
         # is still the same.
@@ -116,22 +124,25 @@ class Downloader:
             headers = {"Range": f"bytes={received}-", "If-Range": f'"{file.sha256}"'}
         with self.client.stream(self.root + file.path, headers) as response:
             if response.status_code == 416:  # the part is at least as long as the file
-                return ""
+                return
             self.client.check_status(response)
             is_rest = response.status_code == 206
             # A server that ignores the range sends all of the file.
             room = file.size - (received if is_rest else 0)
             with part.open("ab" if is_rest else "wb") as stream:
                 for block in response.iter_raw():
-                    # More bytes than stated are never written.
+                    # A broken connection loses bytes and adds none, so this is no accident.
                     if len(block) > room:
-                        return f"it has more than the {file.size} bytes that the manifest states"
+                        part.unlink()
+                        raise DamagedError(
+                            f"{file.path} has more than the {file.size} bytes that the manifest "
+                            "states"
+                        )
                     stream.write(block)
                     room -= len(block)
                     self.on_bytes(len(block))
                     if self.stop.is_set():
-                        break
-        return ""
+                        return
 
 
 def _size(path: Path) -> int:
