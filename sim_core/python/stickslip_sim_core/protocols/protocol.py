@@ -155,9 +155,14 @@ class Protocol(ABC):
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         """Measure the points x of the curve with the parameters `at`."""
-        pairs = [self.measure(point, at) for point in x]
-        measured, master = (tuple(float(pair[i]) for pair in pairs) for i in (0, 1))
-        return Curve({name: float(value) for name, value in at.items()}, x, measured, master)
+        measured = []
+        master = []
+        for point in x:
+            value, expected = self.measure(point, at)
+            measured.append(float(value))
+            master.append(float(expected))
+        parameters = {name: float(value) for name, value in at.items()}
+        return Curve(parameters, x, tuple(measured), tuple(master))
 
     constants: ClassVar[Mapping[str, Setting]] = {}
     """Numbers of the protocol that no setting changes, for the result."""
@@ -172,15 +177,16 @@ class Protocol(ABC):
     def run(self) -> ProtocolResult:
         """Measure all points of all curves."""
         x = tuple(float(point) for point in getattr(self, self.points))
-        curves = tuple(
-            self.curve(x, dict(zip(self.parameters, values, strict=True)))
-            for values in product(*(getattr(self, values) for values in self.parameters.values()))
-        )
+        # There is a curve for each combination of the parameters' values.
+        values_of = [getattr(self, field) for field in self.parameters.values()]
+        curves = []
+        for values in product(*values_of):
+            curves.append(self.curve(x, dict(zip(self.parameters, values, strict=True))))
         return ProtocolResult(
             self.name,
             self.x_name,
             self.y_name,
-            curves,
+            tuple(curves),
             self.tolerance,
             {**self.reported(), **self.constants},
             build_info().build_hash,
@@ -299,18 +305,20 @@ class RefinedProtocol(MeshedProtocol):
         return self.measure_with(self.finer(x) * self.cells[-1], x, at), self.master(x, at)
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
-        cells = tuple(tuple(self.finer(point) * count for point in x) for count in self.cells)
-        measured = tuple(
-            tuple(
-                self.measure_with(count, point, at) for count, point in zip(counts, x, strict=True)
-            )
-            for counts in cells
-        )
-        sizes = tuple(tuple(cell_of(count) / LENGTH for count in counts) for counts in cells)
+        # A row for each of the three meshes, the coarsest first.
+        cells = []
+        measured = []
+        sizes = []
+        for count in self.cells:
+            counts = tuple(self.finer(point) * count for point in x)
+            values = [self.measure_with(n, point, at) for n, point in zip(counts, x, strict=True)]
+            cells.append(counts)
+            measured.append(tuple(values))
+            sizes.append(tuple(cell_of(n) / LENGTH for n in counts))
         return Curve(
             {name: float(value) for name, value in at.items()},
             x,
             measured[-1],
             tuple(self.master(point, at) for point in x),
-            Refinement.of(cells, sizes, measured),
+            Refinement.of(tuple(cells), tuple(sizes), tuple(measured)),
         )

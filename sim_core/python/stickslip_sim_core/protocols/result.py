@@ -6,6 +6,7 @@ They say whether the curves agree, and have points for pictures.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -142,14 +143,16 @@ class ProtocolResult:
     @property
     def error(self) -> float:
         """Largest |relative error| over all curves; infinite if nothing was measured."""
-        return max((abs(e) for curve in self.curves for e in curve.errors), default=math.inf)
+        errors = chain.from_iterable(curve.errors for curve in self.curves)
+        return max(map(abs, errors), default=math.inf)
 
     @property
     def limit_error(self) -> float | None:
         """Largest |relative error| of a limit; None without three meshes."""
         if self.limit_tolerance is None:
             return None
-        return max((abs(e) for curve in self.curves for e in curve.limit_errors), default=math.inf)
+        errors = chain.from_iterable(curve.limit_errors for curve in self.curves)
+        return max(map(abs, errors), default=math.inf)
 
     @property
     def passed(self) -> bool:

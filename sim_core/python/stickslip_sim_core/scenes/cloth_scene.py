@@ -1,7 +1,8 @@
 """Scenes of data: sheets, holders, bodies and their friction, as a document says."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -46,26 +47,30 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     """
     names = sorted(document["sheets"])
     mu = _friction(document)
-    sheets = [
-        sheet(name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel)
-        for name in names
-    ]
-    for one in sheets:
-        if sheet_count(one.mesh.rest, one.mesh.triangles) != 1:
-            raise ValueError(f"sheets.{one.name}.mesh: must hang together in one piece")
-    things = [
-        thing(name, given, [mu[one, name] for one in names])
-        for name, given in sorted(document["bodies"].items())
-    ]
-    ends = np.cumsum([0, *(len(one.start) for one in sheets)])
-    holders = [
-        replace(holder, vertices=holder.vertices + begin)
-        for one, begin in zip(sheets, ends, strict=False)
-        for holder in one.holders.values()
-    ]
+    sheets = []
+    for name in names:
+        part = sheet(
+            name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel
+        )
+        if sheet_count(part.mesh.rest, part.mesh.triangles) != 1:
+            raise ValueError(f"sheets.{name}.mesh: must hang together in one piece")
+        sheets.append(part)
+    things = []
+    for name, body in sorted(document["bodies"].items()):
+        things.append(thing(name, body, [mu[sheet_name, name] for sheet_name in names]))
+    # The solver numbers the vertices of all sheets together, one sheet after the other.
+    ends = np.cumsum([0, *(len(part.start) for part in sheets)])
+    holders = []
+    poses: list[Callable[[float], Floats]] = []
+    boxes: list[Floats] = []
+    for part, begin in zip(sheets, ends, strict=False):
+        for holder in part.holders.values():
+            holders.append(replace(holder, vertices=holder.vertices + begin))
+        poses += part.tracks.values()
+        boxes += part.boxes.values()
     gravity = _Gravity(document, sheets, seed)
-    rigid = [one.rigid for one in things if one.rigid is not None]
-    placed = [one.pose for one in things if one.rigid is not None]
+    rigid = [body.rigid for body in things if body.rigid is not None]
+    placed = [body.pose for body in things if body.rigid is not None]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         return gravity.at(time), [at(time) for at in rigid]
@@ -73,33 +78,33 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     length = document["duration"]
     end = document["end"]
     calm = document["calm"]
-    last = max([0.0, gravity.last, *(one.last for one in sheets), *(one.last for one in things)])
+    last = max(
+        [0.0, gravity.last, *(part.last for part in sheets), *(body.last for body in things)]
+    )
     tracks = {
-        f"{one.name}.vertices": one.surface.at
-        for one in things
-        if one.surface is not None and one.deforms
+        f"{body.name}.vertices": body.surface.at
+        for body in things
+        if body.surface is not None and body.deforms
     }
     if things:
-        tracks["body_pose"] = lambda time: np.stack([one.pose(time) for one in things])
+        tracks["body_pose"] = lambda time: np.stack([body.pose(time) for body in things])
     if holders:
-        poses = [track for one in sheets for track in one.tracks.values()]
         tracks["holder_pose"] = lambda time: np.stack([pose(time) for pose in poses])
         tracks["grasped"] = lambda time: np.array(
             [holder.holds(time) for holder in holders], np.uint8
         )
-    boxes = [box for one in sheets for box in one.boxes.values()]
     return Scene(
-        mesh=meshes.together(*(one.mesh for one in sheets)),
-        fabrics=[one.fabric for one in sheets],
+        mesh=meshes.together(*(part.mesh for part in sheets)),
+        fabrics=[part.fabric for part in sheets],
         preset=preset_named(document["preset"]),
-        start=np.concatenate([one.start for one in sheets]),
+        start=np.concatenate([part.start for part in sheets]),
         motion=motion,
         poses=lambda times: np.swapaxes(
             np.reshape([at(times) for at in placed], (-1, len(times), 3, 4)), 0, 1
         ),
         holders=holders,
         self_contact=_touch(document, sheets, mu),
-        surfaces=[one.surface for one in things if one.surface is not None],
+        surfaces=[body.surface for body in things if body.surface is not None],
         damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
         frames=int(
             (length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)
@@ -113,39 +118,46 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         arrays=lambda run: _arrays(run, sheets, things, ends),
         labels=lambda run: _labels(run, document, sheets, gravity.bias),
         kernel=kernel,
-        reason=next(
-            (one.hung.reason for one in sheets if one.hung is not None and one.hung.reason), ""
-        ),
+        reason=_hanging_fault(sheets),
     )
+
+
+def _hanging_fault(sheets: Sequence[Sheet]) -> str:
+    """Return why a hung sheet does not start in a stable equilibrium; empty if all do."""
+    for part in sheets:
+        if part.hung is not None and part.hung.reason:
+            return part.hung.reason
+    return ""
 
 
 def _friction(document: Document) -> dict[tuple[str, str], float]:
     """Return the coefficient of friction of each sheet with each sheet and body."""
-    given: dict[frozenset[str], float] = {
-        frozenset(pair["between"]): pair["mu"] for pair in document["friction"]
-    }
-    others = [*document["sheets"], *document["bodies"]]
-    return {
-        (one, other): float(given.get(frozenset((one, other)), document["default_friction"] or 0.0))
-        for one in document["sheets"]
-        for other in others
-    }
+    pairs = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
+    default: float = document["default_friction"] or 0.0
+    mu = {}
+    for names in product(document["sheets"], (*document["sheets"], *document["bodies"])):
+        # A pair has no order; that of a sheet with itself is a set of a single name.
+        mu[names] = float(pairs.get(frozenset(names), default))
+    return mu
 
 
 def _touch(
     document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
 ) -> SelfContact | None:
     """Return the contact of cloth with cloth."""
-    through = [one.name for one in sheets if not document["sheets"][one.name]["self_contact"]]
-    if through and len(sheets) > 1:
+    names = [part.name for part in sheets]
+    without = [name for name in names if not document["sheets"][name]["self_contact"]]
+    if without and len(sheets) > 1:
         raise ValueError(
-            f"sheets.{through[0]}.self_contact: must be true in a scene of several sheets, "
+            f"sheets.{without[0]}.self_contact: must be true in a scene of several sheets, "
             "got false"
         )
-    if through:
+    if without:
         return None
-    friction = [[mu[one.name, other.name] for other in sheets] for one in sheets]
-    return SelfContact(friction, [one.thickness for one in sheets], document["bearing"])
+    friction = []
+    for name in names:
+        friction.append([mu[name, other] for other in names])
+    return SelfContact(friction, [part.thickness for part in sheets], document["bearing"])
 
 
 class _Gravity:
@@ -164,29 +176,28 @@ class _Gravity:
             self._until = document["bias"]["until"]
             self.bias = np.random.default_rng(seed).uniform(-size, size, 2)
             self._tilted = self._down + self._size * np.append(self.bias, 0.0)
-        self._hung = [
-            (
-                slice(begin - len(one.start), begin),
-                one.hung.tilt,
-                document["sheets"][one.name]["start"]["bias_until"],
-            )
-            for one, begin in zip(
-                sheets, np.cumsum([len(one.start) for one in sheets]), strict=True
-            )
-            if one.hung is not None
-        ]
+        # Vertices, tilt and end of the bias of each sheet that hangs at the start.
+        self._hung: list[tuple[slice, Floats, float]] = []
+        begin = 0
+        for part in sheets:
+            end = begin + len(part.start)
+            if part.hung is not None:
+                until = document["sheets"][part.name]["start"]["bias_until"]
+                self._hung.append((slice(begin, end), part.hung.tilt, until))
+            begin = end
         self.last = max([0.0, self._until, *(until + UPRIGHT for _, _, until in self._hung)])
         """When it stops to change [s]."""
 
     def at(self, time: float) -> Floats:
         """Return the acceleration of each vertex at a time [s]: (V, 3) [m/s^2]."""
-        found = self._tilted if time < self._until else self._down
+        acceleration = self._tilted if time < self._until else self._down
         if self._hung:
-            found = found.copy()
-        for own, tilt, until in self._hung:
+            acceleration = acceleration.copy()
+        for vertices, tilt, until in self._hung:
+            # The bias of a hung sheet fades within `UPRIGHT` seconds after its end.
             upright = min(max(time - until, 0.0) / UPRIGHT, 1.0)
-            found[own] += tilt * self._size * (1.0 - upright)
-        return found
+            acceleration[vertices] += tilt * self._size * (1.0 - upright)
+        return acceleration
 
 
 class _Forces:

@@ -204,17 +204,16 @@ class Scene:
                 rest_time = time
                 break
         missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
-        for found in (paths, forces, crossed):
-            found += missing * found[-1:]  # type: ignore[operator]
+        # A scene that has come to rest repeats its last frame.
+        for frames in (paths, forces, crossed):
+            frames += missing * frames[-1:]  # type: ignore[operator]
         path = np.stack(paths)
         times = np.arange(len(path)) / self.frame_rate
-        record: dict[str, Array] = {
-            name: np.stack([each[name] for each in forces]) for name in forces[0]
-        }
-        record |= {
-            name: np.stack([np.asarray(at(float(t))) for t in times])
-            for name, at in self.tracks.items()
-        }
+        record: dict[str, Array] = {}
+        for name in forces[0]:
+            record[name] = np.stack([of_frame[name] for of_frame in forces])
+        for name, at in self.tracks.items():
+            record[name] = np.stack([np.asarray(at(float(time))) for time in times])
         worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
         code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(

@@ -9,7 +9,7 @@ colours on top, as it does with the floor's.
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Protocol
 
 import numpy as np
@@ -137,9 +137,10 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
         )
         points.append((((1 - u) * a + u * b) * (1 - v) + ((1 - u) * d + u * c) * v).reshape(-1, 3))
         row = along + 1
-        corners = [count + i * row + j for i in range(across) for j in range(along)]
-        pieces += [(corner, corner + row, corner + row + 1, corner + 1) for corner in corners]
-        owners += [number] * len(corners)
+        for i, j in product(range(across), range(along)):
+            corner = count + i * row + j
+            pieces.append((corner, corner + row, corner + row + 1, corner + 1))
+        owners += [number] * (across * along)
         count += len(points[-1])
     given = np.concatenate(points)
     _, first, joint = np.unique(
@@ -388,11 +389,11 @@ class Holders:
             box(ROD, (0.0, 0.0, ROD[2] / 2)),
         ]  # a clip and the rod it hangs on
         vertices = np.concatenate([corners for corners, _ in boxes])
-        faces = [
-            tuple(8 * part + index for index in face)
-            for part, (_, sides) in enumerate(boxes)
-            for face in sides
-        ]
+        faces: list[tuple[int, ...]] = []
+        for number, (_, sides) in enumerate(boxes):
+            # Each box has eight vertices, which follow those of the boxes before it.
+            for side in sides:
+                faces.append(tuple(8 * number + index for index in side))
         self.props = tuple(
             Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2)
         )

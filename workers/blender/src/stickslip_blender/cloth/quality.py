@@ -170,11 +170,12 @@ def pooled(
 
     `usual`: means of weights over the regions in all frames.
     """
-    found = [
-        _pooled([(error, weights[k]) for error, weights in measured], usual[k])
-        for k in range(len(REGIONS))
-    ]
-    return Measured(*zip(*found, strict=True))
+    # Each region has weights of its own: all cloth, landed cloth, and the edge.
+    values = []
+    for region in range(len(REGIONS)):
+        of_region = [(error, weights[region]) for error, weights in measured]
+        values.append(_pooled(of_region, usual[region]))
+    return Measured(*zip(*values, strict=True))
 
 
 def _pooled(

@@ -23,6 +23,7 @@ they are in the frame before (clips are 6 % smaller for it), and that the colour
 """
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -144,11 +145,10 @@ class Composer:
             return floor
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
         seen = see(projections, props, window, _PROP_GRID)
-        samples = [
-            seen.triangle[r::_PROP_GRID, c::_PROP_GRID]
-            for r in range(_PROP_GRID)
-            for c in range(_PROP_GRID)
-        ]
+        # The samples of a pixel form a grid; each entry has the same sample of all pixels.
+        samples = []
+        for r, c in product(range(_PROP_GRID), range(_PROP_GRID)):
+            samples.append(seen.triangle[r::_PROP_GRID, c::_PROP_GRID])
         shown = sum(
             (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
         ) / len(samples)

@@ -167,9 +167,10 @@ def decoded(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 
 def fans(faces: Sequence[Sequence[int]]) -> Indices:
     """Return convex polygons as fans of triangles, shape (T, 3)."""
-    return np.array(
-        [(face[0], b, c) for face in faces for b, c in pairwise(face[1:])], dtype=np.int32
-    )
+    triangles = []
+    for face in faces:
+        triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
+    return np.array(triangles, dtype=np.int32)
 
 
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -214,9 +215,11 @@ class RodRenderer:
         """
         padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
         rows, columns = coverage.shape
-        around = np.sum(
-            [padded[r : r + rows, c : c + columns] for r in range(3) for c in range(3)], axis=0
-        )
+        # The sum over the 3 x 3 pixels around each pixel.
+        shifted = []
+        for r, c in product(range(3), range(3)):
+            shifted.append(padded[r : r + rows, c : c + columns])
+        around = np.sum(shifted, axis=0)
         hit = around[..., 3:] > 0.0
         help_ = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
         mean = (light + help_)[..., :3] / np.where(hit, (light + help_)[..., 3:], 1.0)
