@@ -47,21 +47,21 @@ CASES: dict[str, str] = {
             smooth.body_first path.rounds_max
             factor.fold_smallest newton.common_least newton.slow newton.smooth_hops
             newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy
-            stepping.smooth_iterations stepping.strained_long""",
+            stepping.smooth_iterations stepping.stalled_long""",
         "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at control.newton_work
             control.looks control.novelty control.reject_at control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
         "valley": "contact.fillet",
-        "push": "stepping.near_patience stepping.strained_soon",
+        "push": "stepping.near_patience stepping.stalled_soon",
         "let down": "control.halvings",
     }.items()
     for name in names.split()
 }
 """The scene in which each constant matters, and which is quick."""
 
-DEARER = {("stepping.strained_soon", 0.5): 20.0}
+DEARER = {("stepping.stalled_soon", 0.5): 20.0}
 """Factors of the cost beyond COST."""
 
 OTHERWISE = {("newton.cuts_max", 0.5), ("contact.penalty", 2.0), ("control.grow_at", 2.0)}

@@ -50,7 +50,8 @@ def test_exported_names() -> None:
 def test_import_needs_numpy_only() -> None:
     code = (
         "import sys, numpy; before = set(sys.modules); import stickslip_sim_core; "
-        "print(sorted({m.split('.')[0] for m in set(sys.modules) - before} - set(sys.stdlib_module_names)))"
+        "names = {m.split('.')[0] for m in set(sys.modules) - before}; "
+        "print(sorted(names - set(sys.stdlib_module_names)))"
     )
     loaded = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True

@@ -64,17 +64,19 @@ void bind_cloth(nb::module_& m) {
   m.def(
       "cloth_constants", [] { return Constants().by_name(); },
       "Internal: constants of the cloth solver by name; see cloth/settings.hpp.");
-  nb::class_<Observed>(m, "Observed",
-                       "Worst values over the accepted steps, for the checks of a run.")
-      .def_ro("stretch", &Observed::stretch, "Largest principal stretch of a triangle.")
-      .def_ro("depth", &Observed::depth,
+  nb::class_<DiagnosticExtremes>(m, "Observed",
+                                 "Worst values over the accepted steps, for the checks of a run.")
+      .def_ro("stretch", &DiagnosticExtremes::stretch, "Largest principal stretch of a triangle.")
+      .def_ro("depth", &DiagnosticExtremes::depth,
               "Largest depth in a body beyond what round bodies allow [cells].")
-      .def_ro("passages", &Observed::passages, "Triangles that passed the core of a body.")
-      .def_ro("contact_work", &Observed::contact_work,
+      .def_ro("passages", &DiagnosticExtremes::passages,
+              "Triangles that passed the core of a body.")
+      .def_ro("contact_work", &DiagnosticExtremes::contact_work,
               "Work of bodies on motion against them, where positive [J].")
-      .def_ro("flow", &Observed::flow,
+      .def_ro("flow", &DiagnosticExtremes::flow,
               "Sum of the sizes of all changes of energy and of all work [J].")
-      .def_ro("gain", &Observed::gain, "Largest energy gained beyond the work of all forces [J].");
+      .def_ro("gain", &DiagnosticExtremes::gain,
+              "Largest energy gained beyond the work of all forces [J].");
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
       .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")
@@ -99,7 +101,7 @@ void bind_cloth(nb::module_& m) {
           "How often each rung of the fallback ladder was tried and converged, by name.")
       .def_ro("seen", &StepReport::seen)
       .def_ro("sharpest", &StepReport::sharpest,
-              "Least radius of a skeleton that cloth touched, in cells.")
+              "Least radius of a medial axis that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,
               "Distance of what drives the cloth from an even motion within a step of the "
               "controller [m].")
@@ -108,10 +110,10 @@ void bind_cloth(nb::module_& m) {
               "where none are near.");
   using PairForces = ClothSolver::PairForces;
   nb::class_<PairForces>(m, "PairForces",
-                         "Forces of cloth on cloth, surfaces and the skeletons of bodies, at P "
+                         "Forces of cloth on cloth, surfaces and the medial axes of bodies, at P "
                          "pairs of closest points.")
       .def_ro("vertices", &PairForces::vertices,
-              "(P, 4); those of surfaces and then of skeletons come after those of the cloth.")
+              "(P, 4); those of surfaces and then of medial axes come after those of the cloth.")
       .def_ro("weights", &PairForces::weights,
               "(P, 4): the force acts on each vertex by its weight.")
       .def_ro("forces", &PairForces::forces, "(P, 3) [N]")
@@ -176,7 +178,7 @@ void bind_cloth(nb::module_& m) {
              const PathCallback& path) {
             DriveNow now;
             nb::gil_scoped_release release;
-            const auto drive = [&](double at) -> Drive {
+            const auto drive = [&](double at) -> BoundaryConditions {
               nb::gil_scoped_acquire acquire;
               auto [gravity, held, surfaces, bodies, damping] = motion(at);
               now = {gravity, held, surfaces, bodies_of(bodies)};
@@ -201,7 +203,7 @@ void bind_cloth(nb::module_& m) {
       .def("pair_forces", &ClothSolver::pair_forces)
       .def("masses", &ClothSolver::masses)
       .def("energies", &ClothSolver::energies, "positions"_a)
-      .def("softest", &ClothSolver::softest, "positions"_a)
+      .def("softest", &ClothSolver::lowest_eigenvalue, "positions"_a)
       .def("kernel", &ClothSolver::kernel);
 }
 

@@ -121,7 +121,7 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
            law_.data(), tabulated_.data(), slots_.data(), nullptr};
 }
 
-void Membrane::lag_from(const ClothKernel& kernel, const double* x, double share) {
+void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, double share) {
   data_.lag = nullptr;
   if (share == 0.0 ||
       std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; }))
@@ -132,12 +132,12 @@ void Membrane::lag_from(const ClothKernel& kernel, const double* x, double share
 }
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, int others, int bones,
+                   const std::vector<std::int32_t>& held, int others, int capsules,
                    const FactorSettings& settings)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics)),
       compact_stencils(bending_stencils(mesh, fabrics, true)),
-      numbering(mesh, stencils, compact_stencils, held, others, bones),
+      numbering(mesh, stencils, compact_stencils, held, others, capsules),
       mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
       mass(numbering.nodes, 0.0),
       own_damping(numbering.nodes, 0.0),
@@ -193,7 +193,7 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   std::fill(gradient.begin(), gradient.end(), 0.0);
   if (with_matrix) std::fill(blocks_.begin(), blocks_.end(), 0.0f);
   membrane_energy = kernel.membrane(membrane_.data(), x.data(), gradient.data(),
-                                    with_matrix ? blocks_.data() : nullptr, definite);
+                                    with_matrix ? blocks_.data() : nullptr, use_convex_hessian);
   bending_energy = kernel.bending(bending_.data(), x.data(), gradient.data(), stiffening_.data(),
                                   with_matrix ? &folds_ : nullptr);
   if (with_matrix) assemble_bending();

@@ -35,7 +35,7 @@ class Membrane {
   Membrane(const Membrane&) = delete;
 
   const MembraneData& data() const { return data_; }
-  void lag_from(const ClothKernel& kernel, const double* x, double share);
+  void set_lagged_stretch(const ClothKernel& kernel, const double* x, double share);
 
  private:
   Buffer<int> nodes_, slots_, fabric_;
@@ -51,9 +51,9 @@ struct NeighbourNumbers {
 
 class Assembly {
  public:
-  // `others`: vertices of surfaces; `bones`: points of skeletons.
+  // `others`: vertices of surfaces; `capsules`: points of medial axes.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, int others, int bones,
+           const std::vector<std::int32_t>& held, int others, int capsules,
            const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 
@@ -70,13 +70,13 @@ class Assembly {
   ClothMatrix matrix{};
   // Whether the matrix has the positive part of the stress and of the law only, as that of a convex
   // energy does.
-  bool definite = false;
+  bool use_convex_hessian = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
   // From now on stretching lags behind what it is at x by this share, none if 0: see
   // kernels/membrane.hpp.
-  void lag_from(const Buffer<double>& x, double share) {
-    membrane_.lag_from(kernel, x.data(), share);
+  void set_lagged_stretch(const Buffer<double>& x, double share) {
+    membrane_.set_lagged_stretch(kernel, x.data(), share);
   }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
   void set_diagonal(double dt, double damping);

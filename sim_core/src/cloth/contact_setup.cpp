@@ -57,33 +57,33 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
   return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
 }
 
-// Sheets, and after them surfaces and skeletons.
+// Sheets, and after them surfaces and medial axes.
 std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering,
                                  const SurfaceMeshes& surfaces,
-                                 const std::vector<Skeleton>& skeletons) {
+                                 const std::vector<MedialAxis>& medial_axes) {
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = mesh.sheet_of_vertex[i];
   const int* others = numbering.node.data() + numbering.vertices;
   for (int i = 0; i < numbering.others; ++i)
     out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
-  int next = numbering.nodes - numbering.bones,
+  int next = numbering.nodes - numbering.capsule_points,
       sheet = mesh.sheets + static_cast<int>(surfaces.crease.size());
-  for (const Skeleton& skeleton : skeletons) {
-    for (std::size_t p = 0; p < skeleton.points.size(); ++p) out[next++] = sheet;
+  for (const MedialAxis& medial_axis : medial_axes) {
+    for (std::size_t p = 0; p < medial_axis.points.size(); ++p) out[next++] = sheet;
     ++sheet;
   }
   return out;
 }
 
-// Pieces of skeletons, by node.
-Bones bones_of(const Numbering& numbering, const std::vector<Skeleton>& skeletons) {
-  Bones out;
-  int first = numbering.nodes - numbering.bones;
-  for (const Skeleton& skeleton : skeletons) {
-    const int count = static_cast<int>(skeleton.points.size());
+// Pieces of medial axes, by node.
+CapsulePieces capsules_of(const Numbering& numbering, const std::vector<MedialAxis>& medial_axes) {
+  CapsulePieces out;
+  int first = numbering.nodes - numbering.capsule_points;
+  for (const MedialAxis& medial_axis : medial_axes) {
+    const int count = static_cast<int>(medial_axis.points.size());
     for (int p = 0; p < count; ++p) out.points.push_back(first + p);
-    for (const auto& [a, b] : skeleton.segments) out.segments.push_back({first + a, first + b});
-    for (const auto& [a, b, c] : skeleton.triangles)
+    for (const auto& [a, b] : medial_axis.segments) out.segments.push_back({first + a, first + b});
+    for (const auto& [a, b, c] : medial_axis.triangles)
       out.triangles.push_back({first + a, first + b, first + c});
     first += count;
   }
@@ -105,19 +105,20 @@ double cell_of(const ClothMesh& mesh) {
   return out;
 }
 
-ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
-                                const std::vector<Body>& bodies, double cell) {
+ContactMaterials with_capsules(ContactMaterials materials,
+                               const std::vector<MedialAxis>& medial_axes,
+                               const std::vector<Body>& bodies, double cell) {
   const Eigen::Index before = materials.mu.rows(),
-                     count = before + static_cast<Eigen::Index>(skeletons.size());
+                     count = before + static_cast<Eigen::Index>(medial_axes.size());
   Eigen::MatrixXd mu = Eigen::MatrixXd::Constant(count, count, -1.0);
   mu.topLeftCorner(before, before) = materials.mu;
   materials.cell = cell;
-  for (const Skeleton& one : skeletons) {
-    const Eigen::Index row = before + static_cast<Eigen::Index>(materials.bones.size());
+  for (const MedialAxis& one : medial_axes) {
+    const Eigen::Index row = before + static_cast<Eigen::Index>(materials.capsules.size());
     for (int sheet = 0; sheet < materials.sheets; ++sheet) {
       mu(row, sheet) = mu(sheet, row) = bodies[one.body].mu_of(sheet);
     }
-    materials.bones.push_back({one.body, one.radius, one.whole});
+    materials.capsules.push_back({one.body, one.radius, one.replaces_nodes});
   }
   materials.mu = std::move(mu);
   return materials;
@@ -126,14 +127,14 @@ ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Sk
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
                                            const SurfaceMeshes& surfaces,
-                                           const std::vector<Skeleton>& skeletons,
+                                           const std::vector<MedialAxis>& medial_axes,
                                            const Constants& constants) {
   check_thickness(mesh, materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
   append(surfaces.triangles, numbering.node.data() + numbering.vertices, triangles);
-  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, skeletons),
-                  (materials.mu.array() >= 0.0).matrix(), bones_of(numbering, skeletons));
+  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, medial_axes),
+                  (materials.mu.array() >= 0.0).matrix(), capsules_of(numbering, medial_axes));
   const double cell = std::sqrt(2.0 * mesh.area.mean());
   return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact,
                                       constants.path, constants.path.margin * cell,

@@ -43,7 +43,7 @@ void PairFactor::collect(const ContactSet& pairs, int free_nodes) {
     if (!pair.active()) continue;
     Entry entry;
     for (int c = 0; c < 4; ++c) {
-      const int node = pair.who.node[c];
+      const int node = pair.stencil.node[c];
       entry.node[c] = node < free_nodes && (pinned_.empty() || !pinned_[node]) ? node : -1;
       entry.weight[c] = static_cast<float>(pair.weights[c]);
     }

@@ -94,20 +94,20 @@ struct SteppingSettings {
   // Strained iterations in a row, stopped short or with all rounds taken, after which an attempt
   // that the controller may halve at once is given up. Sweep: 1 takes 19 times as many where walls
   // push, 4 takes 1 % less.
-  int strained_soon = 2;
+  int stalled_soon = 2;
   // The same of an attempt for which halving comes last. Sweep: 2 takes 20 % more in a crumple, 8
   // takes 6 % more.
-  int strained_long = 4;
+  int stalled_long = 4;
   // Iterations of an attempt by way of the smoothed law. Sweep: 50 takes 9 % less and 200 takes 38
   // % more in a crumple.
   int smooth_iterations = 100;
 
-  // Way of a vertex relative to a body that is no skeleton, over half the body's least extent, from
-  // which a step is halved: what begins a step before a body must not be predicted behind its
+  // Way of a vertex relative to a body without a medial axis, over half the body's least extent,
+  // from which a step is halved: what begins a step before a body must not be predicted behind its
   // middle.
   double sweep = 0.5;
 
-  SIM_CORE_NAMED(inside, lag, easy, near_patience, strained_soon, strained_long, smooth_iterations,
+  SIM_CORE_NAMED(inside, lag, easy, near_patience, stalled_soon, stalled_long, smooth_iterations,
                  sweep)
 };
 
@@ -179,13 +179,13 @@ struct Constants {
   ContactSettings contact;
   PathSettings path;
   SmoothSettings smooth;
-  SkeletonSettings skeleton;
+  CapsuleSettings medial_axis;
   NewtonSettings newton;
   SteppingSettings stepping;
   ControlSettings control;
   FactorSettings factor;
 
-  SIM_CORE_NAMED(contact, path, smooth, skeleton, newton, stepping, control, factor)
+  SIM_CORE_NAMED(contact, path, smooth, medial_axis, newton, stepping, control, factor)
 
   Constants() = default;
   // Replaces those named "group.name". Throws std::invalid_argument if there is none of that name,

@@ -21,12 +21,12 @@ struct ClothSolver::Impl {
   const Numbering& numbering;
 
   explicit Impl(const ClothSetup& setup, const std::vector<Body>& bodies = {},
-                const std::vector<Skeleton>& skeletons = {})
+                const std::vector<MedialAxis>& medial_axes = {})
       : mesh(setup.rest, setup.triangles),
         surfaces(setup.surfaces),
-        materials(with_skeletons(setup.touch, skeletons, bodies, cell_of(mesh))),
+        materials(with_capsules(setup.touch, medial_axes, bodies, cell_of(mesh))),
         assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(skeletons),
+                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(medial_axes),
                  setup.constants.factor),
         stepper(mesh, assembly, setup.settings, setup.constants),
         controller(stepper, setup.control, setup.constants.control),
@@ -37,20 +37,21 @@ struct ClothSolver::Impl {
       newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
     if ((materials.mu.array() >= 0.0).any()) {
       newton.pairs =
-          contact_set_of(mesh, numbering, materials, surfaces, skeletons, setup.constants);
+          contact_set_of(mesh, numbering, materials, surfaces, medial_axes, setup.constants);
     }
     if (numbering.others > 0) {
       newton.contact.surfaces =
           smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
     }
-    stepper.skeletons = skeletons;
-    newton.contact.whole_skeletons.assign(bodies.size(), 0);
-    for (const Skeleton& one : skeletons) newton.contact.whole_skeletons[one.body] = one.whole;
+    stepper.medial_axes = medial_axes;
+    newton.contact.replaced_bodies.assign(bodies.size(), 0);
+    for (const MedialAxis& one : medial_axes)
+      newton.contact.replaced_bodies[one.body] = one.replaces_nodes;
   }
 
-  static int points_of(const std::vector<Skeleton>& skeletons) {
+  static int points_of(const std::vector<MedialAxis>& medial_axes) {
     std::size_t count = 0;
-    for (const Skeleton& one : skeletons) count += one.points.size();
+    for (const MedialAxis& one : medial_axes) count += one.points.size();
     return static_cast<int>(count);
   }
 
@@ -102,19 +103,19 @@ ClothSolver::ClothSolver(const ClothSetup& setup)
     : setup_(setup), impl_(std::make_unique<Impl>(setup_)) {}
 ClothSolver::~ClothSolver() = default;
 
-// Before a first step: takes skeletons of these bodies in place of those of others.
+// Before a first step: takes medial axes of these bodies in place of those of others.
 void ClothSolver::meet(const std::vector<Body>& bodies) {
   if (impl_->stepper.started()) return;
   const Points3 at = positions();
   const double across =
       (setup_.rest.colwise().maxCoeff() - setup_.rest.colwise().minCoeff()).norm();
-  const std::vector<Skeleton> skeletons =
-      skeletons_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
-                   at.colwise().maxCoeff().transpose(), setup_.constants.skeleton.beyond * across,
-                   setup_.constants.skeleton);
-  if (skeletons.empty() && impl_->stepper.skeletons.empty()) return;
-  std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, skeletons);
-  const long kept = 4L * (next->numbering.nodes - next->numbering.bones);
+  const std::vector<MedialAxis> medial_axes =
+      medial_axes_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
+                     at.colwise().maxCoeff().transpose(),
+                     setup_.constants.medial_axis.beyond * across, setup_.constants.medial_axis);
+  if (medial_axes.empty() && impl_->stepper.medial_axes.empty()) return;
+  std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, medial_axes);
+  const long kept = 4L * (next->numbering.nodes - next->numbering.capsule_points);
   std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
   std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());
   impl_ = std::move(next);
@@ -162,15 +163,15 @@ Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v)
 Points3 ClothSolver::reactions() const { return impl_->unload(impl_->newton.residual); }
 
 template <class Call>
-void ClothSolver::each_bone_contact(const Call& call) const {
+void ClothSolver::each_capsule_contact(const Call& call) const {
   if (!impl_->newton.pairs) return;
   for (const Pair& pair : impl_->newton.pairs->list()) {
-    const Bone* bone = impl_->newton.pairs->bone_of(pair.who);
-    if (!bone || !pair.active()) continue;
+    const Capsule* capsule = impl_->newton.pairs->capsule_of(pair.stencil);
+    if (!capsule || !pair.active()) continue;
     for (int c = 0; c < 4; ++c) {
-      const int vertex = impl_->numbering.vertex[pair.who.node[c]];
+      const int vertex = impl_->numbering.vertex[pair.stencil.node[c]];
       if (vertex < impl_->numbering.vertices && pair.weights[c] != 0.0)
-        call(vertex, pair, bone->body);
+        call(vertex, pair, capsule->body);
     }
   }
 }
@@ -180,7 +181,7 @@ std::vector<std::int32_t> ClothSolver::contacts() const {
   std::vector<std::int32_t> out(numbering.vertices, -1);
   for (int i = 0; i < numbering.free_nodes; ++i)
     out[numbering.vertex[i]] = impl_->newton.contact.touched[i];
-  each_bone_contact([&](int vertex, const Pair&, int body) { out[vertex] = body; });
+  each_capsule_contact([&](int vertex, const Pair&, int body) { out[vertex] = body; });
   return out;
 }
 
@@ -190,7 +191,7 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
   }
-  each_bone_contact(
+  each_capsule_contact(
       [&](int vertex, const Pair& pair, int) { out[vertex] |= pair.row.mode == contact_slip; });
   return out;
 }
@@ -203,11 +204,12 @@ Points3 ClothSolver::surface_forces() const {
   const ContactState& contact = impl_->newton.contact;
   for (int i = 0; i < impl_->numbering.free_nodes; ++i) {
     if (contact.touched[i] < static_cast<int>(impl_->stepper.bodies().size())) continue;
-    const Foot& foot = contact.surfaces->foot(i);
+    const Projection& projection = contact.surfaces->projection(i);
     for (int k = 0; k < 3; ++k) {
-      const int vertex = impl_->numbering.vertex[contact.surfaces->triangles()[foot.triangle][k]];
+      const int vertex =
+          impl_->numbering.vertex[contact.surfaces->triangles()[projection.triangle][k]];
       out.row(vertex - impl_->numbering.vertices) -=
-          foot.weights[k] * at_node(impl_->newton.residual, i).transpose();
+          projection.weights[k] * at_node(impl_->newton.residual, i).transpose();
     }
   }
   return out;
@@ -226,13 +228,13 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
                  Points3(count, 3), Eigen::VectorXd(count),
                  Truths(count),     Eigen::VectorXi(count)};
   for (Eigen::Index p = 0; p < count; ++p) {
-    for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->who.node[c]];
+    for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->stencil.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
     out.forces.row(p) = some[p]->contact.force.transpose();
     out.distance[p] = some[p]->contact.gap + some[p]->thickness;
     out.sliding[p] = some[p]->row.mode == contact_slip;
-    const Bone* bone = impl_->newton.pairs->bone_of(some[p]->who);
-    out.body[p] = bone ? bone->body : -1;
+    const Capsule* capsule = impl_->newton.pairs->capsule_of(some[p]->stencil);
+    out.body[p] = capsule ? capsule->body : -1;
   }
   return out;
 }
@@ -245,14 +247,14 @@ std::tuple<double, double, Points3> ClothSolver::energies(const Points3& positio
 
 // Inverse iteration: v <- (K + M/T^2)^-1 M v tends to the softest mode, and 1/growth - 1/T^2 to its
 // eigenvalue.
-double ClothSolver::softest(const Points3& positions) {
+double ClothSolver::lowest_eigenvalue(const Points3& positions) {
   constexpr double period = 0.3;  // T, s
   constexpr int iterations = 40;
   Assembly& assembly = impl_->assembly;
   const int free_nodes = impl_->numbering.free_nodes;
   const Buffer<double> x = impl_->at(positions);
   assembly.set_diagonal(period, 0.0);
-  assembly.definite = false;
+  assembly.use_convex_hessian = false;
   assembly.evaluate(x, true);
   const ContactState open(free_nodes);
   StaleFactor factor(impl_->numbering);

@@ -33,15 +33,16 @@ struct SurfaceMeshes {
 //
 // Side of a cell of the coarsest sheet, m.
 double cell_of(const ClothMesh& mesh);
-// The materials with skeletons of these bodies.
-ContactMaterials with_skeletons(ContactMaterials materials, const std::vector<Skeleton>& skeletons,
-                                const std::vector<Body>& bodies, double cell);
+// The materials with medial axes of these bodies.
+ContactMaterials with_capsules(ContactMaterials materials,
+                               const std::vector<MedialAxis>& medial_axes,
+                               const std::vector<Body>& bodies, double cell);
 
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
                                            const SurfaceMeshes& surfaces,
-                                           const std::vector<Skeleton>& skeletons,
+                                           const std::vector<MedialAxis>& medial_axes,
                                            const Constants& constants);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials,
@@ -97,7 +98,7 @@ class ClothSolver {
   Points3 surface_forces() const;
 
   // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices
-  // of surfaces and points of skeletons come after those of the cloth.
+  // of surfaces and points of medial axes come after those of the cloth.
   using Truths = Eigen::Matrix<bool, Eigen::Dynamic, 1>;
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
@@ -113,7 +114,7 @@ class ClothSolver {
   std::tuple<double, double, Points3> energies(const Points3& positions);
   // The smallest eigenvalue of K v = lambda M v at `positions`, without contact, 1/s^2: positive
   // where they are stable.
-  double softest(const Points3& positions);
+  double lowest_eigenvalue(const Points3& positions);
 
   const Eigen::VectorXd& masses() const;
   std::string kernel() const;
@@ -123,9 +124,9 @@ class ClothSolver {
   const ClothSetup setup_;
   std::unique_ptr<Impl> impl_;
 
-  // Calls with each vertex of a pair with a skeleton that bears, the pair, and the body.
+  // Calls with each vertex of a pair with a medial axis that bears, the pair, and the body.
   template <class Call>
-  void each_bone_contact(const Call& call) const;
+  void each_capsule_contact(const Call& call) const;
 
   void meet(const std::vector<Body>& bodies);
   void begin(const std::vector<Body>& bodies, bool begins = true);

@@ -21,7 +21,7 @@ struct RungCount {
 };
 
 // Worst values over the accepted steps, which the checks of a run judge, see checks.py.
-struct Observed {
+struct DiagnosticExtremes {
   double stretch = 0.0;  // largest principal stretch of a triangle at the end of a step
   double depth =
       0.0;  // largest depth in a body at the end of a step beyond what round bodies allow, cells
@@ -32,7 +32,7 @@ struct Observed {
   double balance = 0.0;  // J: energy gained beyond the work of all forces
   double gain = 0.0;     // J: the largest `balance` at the end of a step
 
-  void add(const Observed& next) {
+  void add(const DiagnosticExtremes& next) {
     stretch = std::max(stretch, next.stretch);
     depth = std::max(depth, next.depth);
     passages += next.passages;
@@ -52,12 +52,12 @@ struct StepReport {
   double least_distance =
       std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
   double sharpest =
-      std::numeric_limits<double>::infinity();  // cells: least radius of a skeleton that bears
+      std::numeric_limits<double>::infinity();  // cells: least radius of a medial axis that bears
   double uneven =
       0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
   double factorizations = 0.0;                       // whole ones, and shares of those in part
   std::array<RungCount, rung_names.size()> rungs{};  // by Rung, rejected steps included
-  Observed seen;
+  DiagnosticExtremes seen;
 
   void count(Rung rung, bool solved) {
     RungCount& counted = rungs[static_cast<std::size_t>(rung)];

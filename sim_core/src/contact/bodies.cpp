@@ -17,8 +17,8 @@ Corners at_share(const Corners& start, const Corners& end, double share) {
   return out;
 }
 
-// The share of the way at which `f` changes its sign, by bisection; NaN if it has one sign at both
-// ends.
+// The share of the displacement at which `f` changes its sign, by bisection; NaN if it has one sign
+// at both ends.
 template <class F>
 double change_of_sign(const F& f) {
   constexpr int halvings = 30;
@@ -64,7 +64,8 @@ bool passes_segment(const Core& core, const Corners& start, const Corners& end, 
     const Vector3d p = start[c] + share * (end[c] - start[c]),
                    q = start[d] + share * (end[d] - start[d]);
     const Vector2d a = across(p), b = across(q);
-    const double way = (a - b).squaredNorm(), place = way > 0.0 ? a.dot(a - b) / way : 0.0;
+    const double displacement = (a - b).squaredNorm(),
+                 place = displacement > 0.0 ? a.dot(a - b) / displacement : 0.0;
     if (place < 0.0 || place > 1.0) continue;
     if (std::abs(p[along] + place * (q[along] - p[along])) <= core.half[along]) return true;
   }
@@ -91,8 +92,8 @@ std::array<double, 2> range_along(const Vector3d& axis, const Vector3d& origin, 
 
 // Corners of the core: bit `a` of a corner's number says on which side of axis `a` it lies, where
 // the core has one.
-Skeleton skeleton_of(const std::array<std::array<double, 2>, 3>& core, bool whole) {
-  Skeleton out{};
+MedialAxis medial_axis_of(const std::array<std::array<double, 2>, 3>& core, bool whole) {
+  MedialAxis out{};
   std::vector<int> axes;
   for (int a = 0; a < 3; ++a) {
     if (core[a][0] < core[a][1]) axes.push_back(a);
@@ -144,8 +145,8 @@ Gap gap_of(const Body& body, const Vector3d& x) {
   return {beyond[axis] - body.radius, body.rotation * normal};
 }
 
-// A body is convex, so its distance grows by at least the normal's share of the way from the
-// triangle's middle. Where that leaves it open, its quarters are looked at.
+// A body is convex, so its distance grows by at least the normal's share of the path from
+// the triangle's middle. Where that leaves it open, its quarters are looked at.
 double depth_beyond(const Body& body, const std::array<Vector3d, 3>& triangle, double allowed) {
   const auto& [a, b, c] = triangle;
   const Vector3d middle = (a + b + c) / 3.0;
@@ -191,12 +192,12 @@ Core core_of(const Body& body) {
 }
 
 bool passes(const Core& core, const Corners& start, const Corners& end) {
-  Eigen::AlignedBox3d way;
+  Eigen::AlignedBox3d displacement;
   for (const Corners* at : {&start, &end}) {
-    for (const Vector3d& p : *at) way.extend(p);
+    for (const Vector3d& p : *at) displacement.extend(p);
   }
   const Vector3d half(core.half.x(), core.half.y(), 0.0);
-  if (!way.intersects({-half, half})) return false;
+  if (!displacement.intersects({-half, half})) return false;
   const bool wide = core.half.y() > 0.0, thin = !(core.half.x() > 0.0) && !wide;
   if (thin) return passes_point(start, end, Vector3d::Zero());
   const auto corners = [&] {
@@ -216,10 +217,10 @@ bool passes(const Core& core, const Corners& start, const Corners& end) {
   return corners() || (wide && passes_inside(core, start, end));
 }
 
-std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell,
-                                   const Vector3d& low, const Vector3d& high, double beyond,
-                                   const SkeletonSettings& settings) {
-  std::vector<Skeleton> out;
+std::vector<MedialAxis> medial_axes_of(const std::vector<Body>& bodies, double cell,
+                                       const Vector3d& low, const Vector3d& high, double beyond,
+                                       const CapsuleSettings& settings) {
+  std::vector<MedialAxis> out;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     const Body& body = bodies[b];
     if (body.shape == Body::plane || body.radius >= settings.radius_max * cell) continue;
@@ -232,10 +233,10 @@ std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell,
       core[a][1] += beyond;
     }
     const bool whole = body.core.minCoeff() + body.radius < settings.thickness_max * cell;
-    Skeleton one = skeleton_of(core, whole);
+    MedialAxis one = medial_axis_of(core, whole);
     one.body = static_cast<int>(b);
     one.radius = body.radius;
-    one.whole = whole;
+    one.replaces_nodes = whole;
     out.push_back(std::move(one));
   }
   return out;

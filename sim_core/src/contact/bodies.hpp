@@ -1,4 +1,4 @@
-// Bodies that cloth touches: their gaps, normals and motion, their cores and skeletons.
+// Bodies that cloth touches: their gaps, normals and motion, their cores and medial axes.
 #pragma once
 
 #include <Eigen/Core>
@@ -68,11 +68,11 @@ bool passes(const Core& core, const Corners& start, const Corners& end);
 // The points, segments and faces of a body's core, which cloth touches by pairs of closest points
 // at the distance of the radius. What is small against a cell slips through between vertices, so
 // vertices do not feel it.
-struct Skeleton {
+struct MedialAxis {
   int body;
-  double radius;  // m
-  bool whole;     // no vertex touches the body itself; else vertices do, and pairs hold what lies
-                  // between them
+  double radius;        // m
+  bool replaces_nodes;  // no vertex touches the body itself; else vertices do, and pairs hold what
+                        // lies between them
   std::vector<Eigen::Vector3d> points;  // in the body's axes, m
   std::vector<std::array<int, 2>> segments;
   std::vector<std::array<int, 3>> triangles;  // with two corners alike: a segment, for vertices
@@ -82,8 +82,8 @@ struct Skeleton {
 
 // Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from
 // the cloth, which lies between `low` and `high`.
-std::vector<Skeleton> skeletons_of(const std::vector<Body>& bodies, double cell,
-                                   const Eigen::Vector3d& low, const Eigen::Vector3d& high,
-                                   double beyond, const SkeletonSettings& settings);
+std::vector<MedialAxis> medial_axes_of(const std::vector<Body>& bodies, double cell,
+                                       const Eigen::Vector3d& low, const Eigen::Vector3d& high,
+                                       double beyond, const CapsuleSettings& settings);
 
 }  // namespace sim_core

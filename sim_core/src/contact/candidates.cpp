@@ -119,9 +119,9 @@ bool in_order(const Candidate& p, const Candidate& q) {
   return p.first != q.first ? p.first < q.first : p.second < q.second;
 }
 
-// Pairs with skeletons, which have few pieces and reach far: each is compared with all of the
+// Pairs with medial axes, which have few pieces and reach far: each is compared with all of the
 // cloth.
-struct SkeletonSearch {
+struct CapsuleSearch {
   const Surface& surface;
   const Buffer<double>& x;
   const double reach;
@@ -129,7 +129,7 @@ struct SkeletonSearch {
 
   double reach_of(int node) const { return reach + farther[surface.sheet_of_node[node]]; }
 
-  // Calls with each piece of the cloth whose box meets that of a piece of a skeleton.
+  // Calls with each piece of the cloth whose box meets that of a piece of a medial axis.
   template <class Pieces, class Call>
   void near(const Box& box, int node, const Pieces& pieces, int count, const Call& call) const {
     for (int i = 0; i < count; ++i) {
@@ -140,10 +140,10 @@ struct SkeletonSearch {
 
   void find_vertices(std::vector<Candidate>& out) const {
     const std::size_t before = out.size();
-    for (std::size_t t = surface.bone_triangles; t < surface.triangles.size(); ++t) {
+    for (std::size_t t = surface.capsule_triangles; t < surface.triangles.size(); ++t) {
       const auto& corner = surface.triangles[t];
       const Box box = box_of(corner, x, reach_of(corner[0]));
-      for (int v = 0; v < surface.bone_vertices; ++v) {
+      for (int v = 0; v < surface.capsule_vertices; ++v) {
         const int vertex = surface.vertices[v];
         if (!box.contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
         add_if_near(out,
@@ -155,10 +155,10 @@ struct SkeletonSearch {
                     x, reach_of(corner[0]));
       }
     }
-    for (std::size_t v = surface.bone_vertices; v < surface.vertices.size(); ++v) {
+    for (std::size_t v = surface.capsule_vertices; v < surface.vertices.size(); ++v) {
       const int vertex = surface.vertices[v];
       const Box box = box_of(std::array<int, 1>{vertex}, x, reach_of(vertex));
-      near(box, vertex, surface.triangles, surface.bone_triangles, [&](int t) {
+      near(box, vertex, surface.triangles, surface.capsule_triangles, [&](int t) {
         const auto& corner = surface.triangles[t];
         add_if_near(
             out,
@@ -170,9 +170,9 @@ struct SkeletonSearch {
   }
 
   void find_edges(std::vector<Candidate>& out) const {
-    for (std::size_t e = surface.bone_edges; e < surface.edges.size(); ++e) {
+    for (std::size_t e = surface.capsule_edges; e < surface.edges.size(); ++e) {
       const auto& b = surface.edges[e];
-      near(box_of(b, x, reach_of(b[0])), b[0], surface.edges, surface.bone_edges, [&](int i) {
+      near(box_of(b, x, reach_of(b[0])), b[0], surface.edges, surface.capsule_edges, [&](int i) {
         const auto& a = surface.edges[i];
         add_if_near(out,
                     {PairKind::edge_edge, i, static_cast<int>(e), {a[0], a[1], b[0], b[1]}, 0.0}, x,
@@ -193,7 +193,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
                                   const std::vector<double>& farther) {
   std::vector<Candidate> out;
   std::vector<Box> boxes;
-  for (int t = 0; t < surface.bone_triangles; ++t)
+  for (int t = 0; t < surface.capsule_triangles; ++t)
     boxes.push_back(box_of(surface.triangles[t], x, reach));
   if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
         return box.min().allFinite() && box.max().allFinite();
@@ -201,7 +201,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
     return out;
   }
   const Grid around_triangles(boxes);
-  for (int v = 0; v < surface.bone_vertices; ++v) {
+  for (int v = 0; v < surface.capsule_vertices; ++v) {
     const int vertex = surface.vertices[v];
     const int cell = around_triangles.cell_at(at_node(x, vertex).array());
     if (cell < 0) continue;
@@ -216,11 +216,11 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
           x, reach);
     }
   }
-  const SkeletonSearch skeletons{surface, x, reach, farther};
-  skeletons.find_vertices(out);
+  const CapsuleSearch medial_axes{surface, x, reach, farther};
+  medial_axes.find_vertices(out);
   const std::size_t vertex_pairs = out.size();
   boxes.clear();
-  for (int e = 0; e < surface.bone_edges; ++e)
+  for (int e = 0; e < surface.capsule_edges; ++e)
     boxes.push_back(box_of(surface.edges[e], x, 0.5 * reach));
   const Grid edges(boxes);
   Around around;
@@ -243,7 +243,7 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       }
     }
   }
-  skeletons.find_edges(out);
+  medial_axes.find_edges(out);
   std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(), in_order);
   return out;
 }

@@ -81,11 +81,12 @@ double crossing_squared(const FourPoints& x) {
   return u.cross(v).squaredNorm() / (u.squaredNorm() * v.squaredNorm());
 }
 
-double Leaves::of(double distance) const {
+double MinDistanceRule::of(double distance) const {
   return std::max(share * std::min(distance, most), std::min(distance, floor));
 }
 
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, const Leaves& leaves) {
+double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to,
+                  const MinDistanceRule& rule_of) {
   FourPoints at = x, motion;
   Vector3d mean = Vector3d::Zero();
   for (int i = 0; i < 4; ++i) mean += 0.25 * (to[i] - x[i]);
@@ -99,7 +100,7 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, cons
                              ? speed[0] + std::max({speed[1], speed[2], speed[3]})
                              : std::max(speed[0], speed[1]) + std::max(speed[2], speed[3]);
   double distance = between_closest(closest_weights(kind, x), x).norm();
-  const double least = leaves.of(distance);
+  const double least = rule_of.of(distance);
   if (fastest <= distance - least) return 1.0;
   if (!(distance > 0.0) || !std::isfinite(fastest)) return 0.0;
   double share = 0.0;
@@ -107,8 +108,8 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to, cons
     // The distance is at least `least` up to here, and above 0 up to `next`.
     const double safe = share + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next =
-        std::min(1.0, share + std::max((1.0 - leaves.rest) * distance, distance - least) / fastest);
+    const double next = std::min(
+        1.0, share + std::max((1.0 - rule_of.rest) * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
     const double before =
         std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());

@@ -22,7 +22,7 @@ void turn(Pair& pair, const Buffer<double>& x) {
   pair.sliding.setZero();
   pair.turning.setZero();
   if (!pair.active() || pair.contact.force.isZero(0.0)) return;
-  const FourPoints at = points_of(pair.who, x);
+  const FourPoints at = points_of(pair.stencil, x);
   const int count =
       (pair.along_first.isZero(0.0) ? 0 : 1) + (pair.along_second.isZero(0.0) ? 0 : 1);
   const double distance = pair.contact.gap + pair.thickness;
@@ -40,15 +40,15 @@ void turn(Pair& pair, const Buffer<double>& x) {
   } else if (count == 1) {
     pair.sliding.row(0) = asked.row(0) / a.col(0).squaredNorm();
   }
-  Eigen::Matrix<double, 3, 9> way = a * pair.sliding;
-  way.leftCols<3>() += Matrix3d::Identity();
-  pair.turning = pair.row.turning * (way - n * (n.transpose() * way)) / distance;
+  Eigen::Matrix<double, 3, 9> displacement = a * pair.sliding;
+  displacement.leftCols<3>() += Matrix3d::Identity();
+  pair.turning = pair.row.turning * (displacement - n * (n.transpose() * displacement)) / distance;
 }
 
 }  // namespace
 
 PairPast::PairPast(const Pair& pair)
-    : who(pair.who),
+    : stencil(pair.stencil),
       feature(pair.feature),
       mode(pair.row.mode),
       force(pair.contact.force),
@@ -62,11 +62,11 @@ PairPast::PairPast(const Pair& pair)
 PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
   PairMotions out = given;
   for (int c = 0; c < 4; ++c) {
-    if (who.node[c] >= free_nodes) continue;
-    const Vector3d way = at_node(change, who.node[c]).cast<double>();
-    out.segment<3>(0) += weights[c] * way;
-    out.segment<3>(3) += along_first[c] * way;
-    out.segment<3>(6) += along_second[c] * way;
+    if (stencil.node[c] >= free_nodes) continue;
+    const Vector3d displacement = at_node(change, stencil.node[c]).cast<double>();
+    out.segment<3>(0) += weights[c] * displacement;
+    out.segment<3>(3) += along_first[c] * displacement;
+    out.segment<3>(6) += along_second[c] * displacement;
   }
   return out;
 }
@@ -83,14 +83,15 @@ Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
 Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
   Vector3d out = given.head<3>();
   for (int c = 0; c < 4; ++c) {
-    if (who.node[c] < free_nodes) out += weights[c] * at_node(change, who.node[c]).cast<double>();
+    if (stencil.node[c] < free_nodes)
+      out += weights[c] * at_node(change, stencil.node[c]).cast<double>();
   }
   return out;
 }
 
 Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
-  const PairMotions way = motions(change, free_nodes);
-  return row.force - row.stiffness * way.head<3>() + turning * way;
+  const PairMotions displacement = motions(change, free_nodes);
+  return row.force - row.stiffness * displacement.head<3>() + turning * displacement;
 }
 
 LawResponse Pair::law() const {
@@ -102,17 +103,17 @@ double violation(const Contact& contact, int mode) {
 }
 
 void ContactSet::restart() {
-  kept_.clear();
+  history_.clear();
   pairs_.clear();
 }
 
-void ContactSet::keep() {
-  kept_.clear();
+void ContactSet::store_history() {
+  history_.clear();
   for (const Pair& pair : pairs_) {
     if (pair.contact.force.isZero(0.0)) continue;
-    kept_.emplace_back(pair);
-    kept_.back().change.setZero();
-    kept_.back().penalty_scale = 1.0;
+    history_.emplace_back(pair);
+    history_.back().change.setZero();
+    history_.back().penalty_scale = 1.0;
   }
 }
 
@@ -124,7 +125,7 @@ void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& r
   for (const Pair& pair : pairs_) {
     if (pair.contact.force.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c)
-      at_node(residual, pair.who.node[c]) -= pair.weights[c] * pair.contact.force;
+      at_node(residual, pair.stencil.node[c]) -= pair.weights[c] * pair.contact.force;
   }
 }
 
@@ -133,13 +134,13 @@ void ContactSet::add_stiffness(double share, std::vector<double>& stiffness) con
     if (!pair.active()) continue;
     const double own = share * pair.row.symmetric.trace() / (3.0 * pair.penalty_scale);
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] < free_nodes_)
-        stiffness[pair.who.node[c]] += pair.weights[c] * pair.weights[c] * own;
+      if (pair.stencil.node[c] < free_nodes_)
+        stiffness[pair.stencil.node[c]] += pair.weights[c] * pair.weights[c] * own;
     }
   }
 }
 
-void ContactSet::count_errors(double stiffness, Norms& norms) const {
+void ContactSet::count_errors(double stiffness, ForceNorms& norms) const {
   for (const Pair& pair : pairs_) {
     Contact contact = pair.contact;
     contact.stiffness = stiffness;
@@ -151,7 +152,8 @@ void ContactSet::count_errors(double stiffness, Norms& norms) const {
 bool ContactSet::relevant() const {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   return std::any_of(pairs_.begin(), pairs_.end(), [&](const Pair& pair) {
-    const int last = std::max(sheet_of_node[pair.who.node[0]], sheet_of_node[pair.who.node[3]]);
+    const int last =
+        std::max(sheet_of_node[pair.stencil.node[0]], sheet_of_node[pair.stencil.node[3]]);
     return pair.active() || last < materials.sheets;
   });
 }
@@ -159,8 +161,8 @@ bool ContactSet::relevant() const {
 double ContactSet::sharpest() const {
   double out = std::numeric_limits<double>::infinity();
   for (const Pair& pair : pairs_) {
-    const Bone* bone = bone_of(pair.who);
-    if (bone && pair.active()) out = std::min(out, bone->radius / materials.cell);
+    const Capsule* capsule = capsule_of(pair.stencil);
+    if (capsule && pair.active()) out = std::min(out, capsule->radius / materials.cell);
   }
   return out;
 }
@@ -190,7 +192,7 @@ void ContactSet::return_to_best() {
   for (PairPast& pair : base_) pair.change.setZero();
 }
 
-bool ContactSet::resume() {
+bool ContactSet::warm_start() {
   bool any = false;
   for (Pair& pair : pairs_) {
     if (pair.active() || pair.contact.force.isZero(0.0) ||
@@ -222,7 +224,7 @@ bool ContactSet::activate(const Buffer<float>& change) {
   for (PairKind kind : {PairKind::vertex_triangle, PairKind::edge_edge}) {
     bool any = false;
     for (Pair& pair : pairs_) {
-      if (pair.who.kind != kind || pair.active() || pair.released) continue;
+      if (pair.stencil.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
       if (!(pair.contact.gap + pair.contact.normal.dot(motion) <
             -settings_.closing_gap * pair.scale))
@@ -248,7 +250,7 @@ PairData ContactSet::rows() {
   stiffness_.clear();
   for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
-    for (int node : pair.who.node) nodes_.push_back(node < free_nodes_ ? node : -1);
+    for (int node : pair.stencil.node) nodes_.push_back(node < free_nodes_ ? node : -1);
     for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
       for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
     }
@@ -269,8 +271,8 @@ void ContactSet::subtract_right_side(Buffer<float>& force) const {
     change.head<3>() += pair.row.force;
     if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {
-      if (pair.who.node[c] >= free_nodes_) continue;
-      at_node(force, pair.who.node[c]) -=
+      if (pair.stencil.node[c] >= free_nodes_) continue;
+      at_node(force, pair.stencil.node[c]) -=
           (pair.weights[c] * change.segment<3>(0) + pair.along_first[c] * change.segment<3>(3) +
            pair.along_second[c] * change.segment<3>(6))
               .cast<float>();

@@ -21,16 +21,16 @@ using PairMotions = Eigen::Matrix<double, 9, 1>;
 
 // One pair of closest points: its geometry, its force, and its part of Newton's system.
 struct Pair {
-  Candidate who;
+  Candidate stencil;
   int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node
                 // (after the edges); or the second edge
   Eigen::Vector4d weights;
   Contact contact;
   ProximalStiffness proximal;
   double smoothing_energy;  // epsilon, J: 0 under the exact law
-  Eigen::Vector3d middle;   // of the two points, or with a skeleton that of the cloth, m
+  Eigen::Vector3d middle;   // of the two points, or with a medial axis that of the cloth, m
   double thickness;         // m: that it keeps apart
-  double scale;             // m: that of the cloth, which is less with a skeleton
+  double scale;             // m: that of the cloth, which is less with a medial axis
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
@@ -58,7 +58,7 @@ struct Pair {
 
 // Record of a pair at an earlier iterate.
 struct PairPast {
-  Candidate who;
+  Candidate stencil;
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
   double scale, penalty_scale;
@@ -79,7 +79,7 @@ class ContactSet {
   double smoothing = 0.0;  // length over which the law is smoothed, m; 0: the exact law
   bool stiff = false;      // along the normals, too
 
-  Neighbourhood near;
+  CandidateSet near;
   const ContactMaterials materials;
   const std::vector<Pair>& list() const { return pairs_; }
 
@@ -87,19 +87,19 @@ class ContactSet {
   void restart();
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
   // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m;
-  // `bone_turns`: of the skeletons in the step.
+  // `capsule_turns`: of the medial axes in the step.
   void begin(const Buffer<double>& start, const Buffer<double>& ends,
              const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own,
-             std::vector<Eigen::Matrix3d> bone_turns);
+             std::vector<Eigen::Matrix3d> capsule_turns);
   // Keeps the forces at the end of a step for the next one.
-  void keep();
+  void store_history();
 
   // Finds and linearizes the pairs at x, with a share of the forces' last changes, and subtracts
   // their forces from the residual.
   void update(const Buffer<double>& x, double share, Buffer<double>& residual);
   // After the first look of a step: activates pairs that have a force and are open by no more than
   // what a prediction on straight lines opens over curved cloth. Returns whether there are any.
-  bool resume();
+  bool warm_start();
   // After a linear problem: releases added pairs that would pull, and adds pairs that would come
   // too near, vertices before edges. Returns whether the active set has changed.
   bool activate(const Buffer<float>& change);
@@ -118,13 +118,13 @@ class ContactSet {
   void add_stiffness(double share, std::vector<double>& stiffness) const;
   // Counts the forces by which the law is missed, where this stiffness [N/m] turns gaps and slips
   // into forces.
-  void count_errors(double stiffness, Norms& norms) const;
+  void count_errors(double stiffness, ForceNorms& norms) const;
 
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
-  // The skeleton of a pair, or null.
-  const Bone* bone_of(const Candidate& pair) const;
-  // Least radius over the side of a cell of a skeleton that bears; infinite where none does.
+  // The medial axis of a pair, or null.
+  const Capsule* capsule_of(const Candidate& pair) const;
+  // Least radius over the side of a cell of a medial axis that bears; infinite where none does.
   double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
@@ -139,9 +139,9 @@ class ContactSet {
   void find(const Buffer<double>& x);
   void find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
   void find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
-  void add(const Candidate& who, int feature, const Eigen::Vector4d& weights,
+  void add(const Candidate& stencil, int feature, const Eigen::Vector4d& weights,
            const Buffer<double>& x);
-  Eigen::Vector3d slip(const Candidate& who, const Eigen::Vector4d& weights,
+  Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,
                        const Eigen::Vector3d& rho);
   void transfer(double share);
   void merge();
@@ -150,13 +150,13 @@ class ContactSet {
   ContactSettings settings_;
   int free_nodes_;
   double least_distance_;
-  std::vector<double> ways_;  // of each node in the step but for a common one, m
+  std::vector<double> displacements_;  // of each node in the step but for a common one, m
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
-  std::vector<Eigen::Matrix3d> own_, bone_turns_;
-  std::vector<Pair> pairs_;                   // sorted by kind, first, feature
-  std::vector<PairPast> base_, kept_, best_;  // likewise
-  std::vector<int> nodes_;                    // of `rows`
+  std::vector<Eigen::Matrix3d> own_, capsule_turns_;
+  std::vector<Pair> pairs_;                      // sorted by kind, first, feature
+  std::vector<PairPast> base_, history_, best_;  // likewise
+  std::vector<int> nodes_;                       // of `rows`
   Buffer<float> weights_, stiffness_;
 };
 

@@ -42,10 +42,11 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
   return {first, second};
 }
 
-// How much farther than other pairs those with each sheet, surface and skeleton reach, m.
+// How much farther than other pairs those with each sheet, surface and medial axis reach, m.
 std::vector<double> farther_of(const ContactMaterials& materials) {
   std::vector<double> out(materials.thickness.size(), 0.0);
-  for (const Bone& bone : materials.bones) out.push_back(bone.radius - materials.farthest());
+  for (const Capsule& capsule : materials.capsules)
+    out.push_back(capsule.radius - materials.farthest());
   return out;
 }
 
@@ -59,33 +60,33 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
       settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
-      ways_(near.surface.sheet_of_node.size()),
+      displacements_(near.surface.sheet_of_node.size()),
       turns_(settings.turn_max) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
                        const Buffer<double>& expected, std::vector<Matrix3d> own,
-                       std::vector<Matrix3d> bone_turns) {
+                       std::vector<Matrix3d> capsule_turns) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
-  bone_turns_ = std::move(bone_turns);
-  base_ = kept_;
+  capsule_turns_ = std::move(capsule_turns);
+  base_ = history_;
 }
 
 void ContactSet::find(const Buffer<double>& x) {
   std::vector<Candidate>& candidates = near.pairs(x);
   const double range = (settings_.detection_range - 1.0) * near.thickness;
-  near.measure(*start_, x, ways_);
+  near.measure(*start_, x, displacements_);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
   find_vertices(candidates, range, x);
   find_edges(candidates, range, x);
 }
 
-const Bone* ContactSet::bone_of(const Candidate& pair) const {
+const Capsule* ContactSet::capsule_of(const Candidate& pair) const {
   const std::vector<int>& sheet = near.surface.sheet_of_node;
-  return materials.bone_of(sheet[pair.node[0]], sheet[pair.node[3]]);
+  return materials.capsule_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
 // `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a
@@ -109,20 +110,21 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
     const int vertex = candidates[c].first;
     double reach = range;
     for (; is_of(end, vertex); ++end)
-      reach = std::max(reach, range + fastest(candidates[end], ways_));
+      reach = std::max(reach, range + fastest(candidates[end], displacements_));
     found.clear();
     for (; c < end; ++c) {
-      Candidate& who = candidates[c];
-      if (who.distance > near.apart(who) + reach) continue;
-      const FourPoints at = points_of(who, x);
-      const Vector4d weights = closest_weights(who.kind, at);
-      who.distance = between_closest(weights, at).norm();
+      Candidate& stencil = candidates[c];
+      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
+      const FourPoints at = points_of(stencil, x);
+      const Vector4d weights = closest_weights(stencil.kind, at);
+      stencil.distance = between_closest(weights, at).norm();
       int corner = 0, opposite = 0;
       for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
       const auto corners = (weights.tail<3>().array() != 0.0).count();
-      const int feature = corners == 3   ? who.second
-                          : corners == 2 ? triangles + surface.triangle_edges[who.second][opposite]
-                                         : triangles + edges + who.node[1 + corner];
+      const int feature = corners == 3 ? stencil.second
+                          : corners == 2
+                              ? triangles + surface.triangle_edges[stencil.second][opposite]
+                              : triangles + edges + stencil.node[1 + corner];
       found.push_back({feature, static_cast<int>(c), weights});
     }
     std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
@@ -136,19 +138,20 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
                              ? surface.triangles_of_edge[feature - triangles]
                              : around_node(feature - triangles - edges);
       if (static_cast<int>(next - i) != around) continue;
-      const Candidate& who = candidates[found[i].candidate];
-      if (who.distance > near.apart(who) + reach) continue;
+      const Candidate& stencil = candidates[found[i].candidate];
+      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
       // Corners of the cloth touch a body by themselves where pairs only hold what lies between
       // them.
-      if (const Bone* bone = bone_of(who); bone && !bone->whole && feature >= triangles + edges)
+      if (const Capsule* capsule = capsule_of(stencil);
+          capsule && !capsule->replaces_nodes && feature >= triangles + edges)
         continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
-        const auto first =
-            std::lower_bound(pairs_.begin(), pairs_.end(), other,
-                             [](const Pair& pair, int who) { return pair.who.first < who; });
+        const auto first = std::lower_bound(
+            pairs_.begin(), pairs_.end(), other,
+            [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
         if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
-              return pair.who.first == other && pair.feature == triangles + edges + vertex;
+              return pair.stencil.first == other && pair.feature == triangles + edges + vertex;
             })) {
           continue;
         }
@@ -160,64 +163,65 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
 
 void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
                             const Buffer<double>& x) {
-  for (Candidate& who : candidates) {
-    const double reach = near.apart(who) + range + fastest(who, ways_);
-    if (who.kind != PairKind::edge_edge || who.distance > reach) continue;
-    const FourPoints at = points_of(who, x);
-    const Vector4d weights = closest_weights(who.kind, at);
-    who.distance = between_closest(weights, at).norm();
-    if (who.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
+  for (Candidate& stencil : candidates) {
+    const double reach = near.rest_distance(stencil) + range + fastest(stencil, displacements_);
+    if (stencil.kind != PairKind::edge_edge || stencil.distance > reach) continue;
+    const FourPoints at = points_of(stencil, x);
+    const Vector4d weights = closest_weights(stencil.kind, at);
+    stencil.distance = between_closest(weights, at).norm();
+    if (stencil.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
         crossing_squared(at) < settings_.crossing_least)
       continue;
-    add(who, who.second, weights, x);
+    add(stencil, stencil.second, weights, x);
   }
 }
 
 // With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum
 // w_i^2/k_i: its stiffness scales with the inverse of that.
-void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
+void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weights,
                      const Buffer<double>& x) {
-  const FourPoints at = points_of(who, x);
+  const FourPoints at = points_of(stencil, x);
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
-  const int a = near.surface.sheet_of_node[who.node[0]],
-            b = near.surface.sheet_of_node[who.node[3]];
-  const Bone* bone = materials.bone_of(a, b);
-  if (!bone) least_distance_ = std::min(least_distance_, distance);
+  const int a = near.surface.sheet_of_node[stencil.node[0]],
+            b = near.surface.sheet_of_node[stencil.node[3]];
+  const Capsule* capsule = materials.capsule_of(a, b);
+  if (!capsule) least_distance_ = std::min(least_distance_, distance);
   if (!(distance > 0.0)) return;
-  const auto [along_first, along_second] = directions(who.kind, weights);
+  const auto [along_first, along_second] = directions(stencil.kind, weights);
   PairMotions given = PairMotions::Zero();
   for (int c = 0; c < 4; ++c) {
-    const int node = who.node[c];
+    const int node = stencil.node[c];
     if (node < free_nodes_) continue;
-    const Vector3d way = at_node(*ends_, node) - at_node(x, node);
-    given.segment<3>(0) += weights[c] * way;
-    given.segment<3>(3) += along_first[c] * way;
-    given.segment<3>(6) += along_second[c] * way;
+    const Vector3d displacement = at_node(*ends_, node) - at_node(x, node);
+    given.segment<3>(0) += weights[c] * displacement;
+    given.segment<3>(3) += along_first[c] * displacement;
+    given.segment<3>(6) += along_second[c] * displacement;
   }
   const Vector3d n = rho / distance;
   const double share = stiff ? settings_.stiff_mean_share : settings_.mean_share;
   double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
   for (int c = 0; c < 4; ++c) {
-    if (who.node[c] >= free_nodes_) continue;
-    const Matrix3d& own = own_[who.node[c]];
+    if (stencil.node[c] >= free_nodes_) continue;
+    const Matrix3d& own = own_[stencil.node[c]];
     const double mean = own.trace() / 3.0;
     softness += weights[c] * weights[c] / mean;
     softness_along += weights[c] * weights[c] / (share * mean + std::max(n.dot(own * n), 0.0));
   }
   if (!(softness > 0.0)) return;
-  Vector3d slip = this->slip(who, weights, rho);
+  Vector3d slip = this->slip(stencil, weights, rho);
   slip -= slip.dot(n) * n;
-  const double thickness = materials.apart(who.kind, a, b), k = settings_.law_stiffness / softness;
+  const double thickness = materials.rest_distance(stencil.kind, a, b),
+               k = settings_.law_stiffness / softness;
   const double along =
       smoothing > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
   const double across =
       (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
-  const Vector3d first = who.kind == PairKind::vertex_triangle
+  const Vector3d first = stencil.kind == PairKind::vertex_triangle
                              ? at[0]
                              : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  const double back = !bone ? 0.5 : a > b ? 1.0 : 0.0;
-  pairs_.push_back({who,
+  const double back = !capsule ? 0.5 : a > b ? 1.0 : 0.0;
+  pairs_.push_back({stencil,
                     feature,
                     weights,
                     {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k},
@@ -225,7 +229,7 @@ void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
                     k * smoothing * smoothing,
                     first - back * rho,
                     thickness,
-                    bone ? materials.thickness[std::min(a, b)] : thickness,
+                    capsule ? materials.thickness[std::min(a, b)] : thickness,
                     along_first,
                     along_second,
                     given});
@@ -233,21 +237,21 @@ void ContactSet::add(const Candidate& who, int feature, const Vector4d& weights,
 
 // Motion of the first point over the second, less that by which rho turns: with a body or surface,
 // or half with each sheet.
-Vector3d ContactSet::slip(const Candidate& who, const Vector4d& weights, const Vector3d& rho) {
+Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
-  const int a = sheet_of_node[who.node[0]], b = sheet_of_node[who.node[3]];
+  const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
   Matrix3d turn = Matrix3d::Zero();
-  if (bone_of(who)) {
-    turn = bone_turns_[std::max(a, b) - materials.first_bone()];
+  if (capsule_of(stencil)) {
+    turn = capsule_turns_[std::max(a, b) - materials.first_capsule()];
   } else {
     for (int c = 0; c < 4; ++c) {
-      const int own = sheet_of_node[who.node[c]], other = who.on_first(c) ? b : a;
+      const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
       const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
       if (share * weights[c] != 0.0)
-        turn += share * std::abs(weights[c]) * turns_.of(near.surface, who.node[c]);
+        turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
     }
   }
-  return rho - turn * between_closest(weights, points_of(who, *start_));
+  return rho - turn * between_closest(weights, points_of(stencil, *start_));
 }
 
 }  // namespace sim_core

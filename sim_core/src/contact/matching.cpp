@@ -13,7 +13,7 @@ using Eigen::Vector3d;
 
 template <class Any>
 auto key(const Any& pair) {
-  return std::make_tuple(pair.who.kind, pair.who.first, pair.feature);
+  return std::make_tuple(pair.stencil.kind, pair.stencil.first, pair.feature);
 }
 
 }  // namespace
@@ -54,7 +54,7 @@ void ContactSet::transfer(double share) {
     std::size_t match = pairs_.size();
     double best = settings_.match_cosine;
     for (std::size_t i : fresh) {
-      const Candidate &a = pairs_[i].who, &b = orphan->who;
+      const Candidate &a = pairs_[i].stencil, &b = orphan->stencil;
       if (a.kind != b.kind) continue;
       const bool common = a.kind == PairKind::vertex_triangle
                               ? a.first == b.first
@@ -96,8 +96,8 @@ void ContactSet::merge() {
   std::vector<std::tuple<bool, bool, double>> rank(
       count);  // whether it keeps less apart, has no force; its gap
   for (std::size_t i = 0; i < count; ++i) {
-    const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].who.node[c]]; };
-    rank[i] = {pairs_[i].thickness < materials.apart(sheet(0), sheet(3)),
+    const auto sheet = [&](int c) { return near.surface.sheet_of_node[pairs_[i].stencil.node[c]]; };
+    rank[i] = {pairs_[i].thickness < materials.rest_distance(sheet(0), sheet(3)),
                pairs_[i].contact.force.isZero(0.0), pairs_[i].contact.gap};
   }
   std::stable_sort(order.begin(), order.end(),
@@ -107,7 +107,7 @@ void ContactSet::merge() {
     if (gone[i]) continue;
     const double radius = settings_.merge_radius * pairs_[i].scale;
     const auto take = [&](std::size_t j) {
-      if (gone[j] || bone_of(pairs_[j].who) != bone_of(pairs_[i].who) ||
+      if (gone[j] || capsule_of(pairs_[j].stencil) != capsule_of(pairs_[i].stencil) ||
           (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
         return;
       const Vector3d& force = pairs_[j].contact.force;

@@ -18,16 +18,18 @@ AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from,
 
 }  // namespace
 
-double fastest(const Candidate& pair, const std::vector<double>& ways) {
+double fastest(const Candidate& pair, const std::vector<double>& displacements) {
   const auto& node = pair.node;
   if (pair.kind == PairKind::vertex_triangle) {
-    return ways[node[0]] + std::max({ways[node[1]], ways[node[2]], ways[node[3]]});
+    return displacements[node[0]] +
+           std::max({displacements[node[1]], displacements[node[2]], displacements[node[3]]});
   }
-  return std::max(ways[node[0]], ways[node[1]]) + std::max(ways[node[2]], ways[node[3]]);
+  return std::max(displacements[node[0]], displacements[node[1]]) +
+         std::max(displacements[node[2]], displacements[node[3]]);
 }
 
-Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double margin,
-                             const PathSettings& settings, std::vector<double> farther)
+CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double margin,
+                           const PathSettings& settings, std::vector<double> farther)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       margin_(margin),
@@ -35,54 +37,55 @@ Neighbourhood::Neighbourhood(Surface surface_in, double thickness_in, double mar
       farther_(std::move(farther)),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
-      way_(share_) {
+      displacement_(share_) {
   farther_.resize(surface.collides.rows(), 0.0);
 }
 
-double Neighbourhood::apart(const Candidate& pair) const {
+double CandidateSet::rest_distance(const Candidate& pair) const {
   const std::vector<int>& sheet = surface.sheet_of_node;
   return thickness + farther_[std::max(sheet[pair.node[0]], sheet[pair.node[3]])];
 }
 
-Leaves Neighbourhood::leaves(const Candidate& pair) const {
-  const double most = apart(pair);
+MinDistanceRule CandidateSet::rule_of(const Candidate& pair) const {
+  const double most = rest_distance(pair);
   return {settings_.keep, most, settings_.floor * most, settings_.rest};
 }
 
 // Half of the diagonal of the box of the motions.
-double Neighbourhood::moved(const Buffer<double>& from, const Buffer<double>& to,
-                            const Buffer<double>* or_to) const {
+double CandidateSet::moved(const Buffer<double>& from, const Buffer<double>& to,
+                           const Buffer<double>* or_to) const {
   AlignedBox3d box = box_of_ways(surface, from, to);
   if (or_to) box.extend(box_of_ways(surface, from, *or_to));
   return 0.5 * box.diagonal().norm();
 }
 
-Eigen::Vector3d Neighbourhood::measure(const Buffer<double>& from, const Buffer<double>& to,
-                                       std::vector<double>& ways) const {
+Eigen::Vector3d CandidateSet::measure(const Buffer<double>& from, const Buffer<double>& to,
+                                      std::vector<double>& displacements) const {
   const AlignedBox3d box = box_of_ways(surface, from, to);
   const Eigen::Vector3d common = 0.5 * (box.min() + box.max());
-  for (int i : surface.vertices) ways[i] = (at_node(to, i) - at_node(from, i) - common).norm();
+  for (int i : surface.vertices)
+    displacements[i] = (at_node(to, i) - at_node(from, i) - common).norm();
   return common;
 }
 
-void Neighbourhood::rebuild(const Buffer<double>& x) {
+void CandidateSet::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
   pairs_ = candidates(surface, x, thickness + 2.0 * margin_, farther_);
 }
 
-std::vector<Candidate>& Neighbourhood::pairs(const Buffer<double>& x) {
+std::vector<Candidate>& CandidateSet::pairs(const Buffer<double>& x) {
   if (reference_.empty() || !(moved(reference_, x) <= margin_)) rebuild(x);
-  measure(at_, x, way_);
-  for (Candidate& pair : pairs_) pair.distance -= fastest(pair, way_);
+  measure(at_, x, displacement_);
+  for (Candidate& pair : pairs_) pair.distance -= fastest(pair, displacement_);
   at_ = x;
   return pairs_;
 }
 
-bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops_max) {
+bool CandidateSet::limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, int hops_max) {
   if (!reference_.empty() && moved(reference_, from) <= margin_ &&
       moved(reference_, to) <= margin_) {
     Buffer<double> capped = to;
-    if (cap_near(from, capped)) return true;
+    if (limit_listed(from, capped)) return true;
     if (moved(reference_, from, &to) <= margin_) {
       to = std::move(capped);
       return false;
@@ -96,18 +99,19 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops
       for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
       return out;
     };
-    // From the middle of a hop both of its ends are within the margin, but for a common way. Nodes
-    // that are stopped do not go that: so where there are any, the hop is shorter.
+    // From the middle of a hop both of its ends are within the margin, but for a common
+    // displacement. Nodes that are stopped do not go that: so where there are any, the hop is
+    // shorter.
     double share = std::min(1.0, 2.0 * margin_ / moved(at, to));
     rebuild(part(0.5 * share));
     Buffer<double> wanted = part(share), next = wanted;
-    bool stopped = !cap_near(at, next);
+    bool stopped = !limit_listed(at, next);
     const double shorter = margin_ / moved(part(0.5), at, &to);
     if (stopped && shorter < share) {
       share = shorter;
       rebuild(part(0.5 * share));
       wanted = next = part(share);
-      stopped = !cap_near(at, next);
+      stopped = !limit_listed(at, next);
     }
     if (stopped) {  // who is has arrived
       whole = false;
@@ -122,21 +126,21 @@ bool Neighbourhood::cap(const Buffer<double>& from, Buffer<double>& to, int hops
   return false;
 }
 
-double Neighbourhood::common_share(const Buffer<double>& from, const Buffer<double>& to) {
+double CandidateSet::collision_free_fraction(const Buffer<double>& from, const Buffer<double>& to) {
   double least = 1.0;
   const std::vector<Candidate>& near = pairs(from);
-  measure(from, to, way_);
+  measure(from, to, displacement_);
   for (const Candidate& pair : near) {
-    if (fastest(pair, way_) <= pair.distance - leaves(pair).of(pair.distance)) continue;
+    if (fastest(pair, displacement_) <= pair.distance - rule_of(pair).of(pair.distance)) continue;
     least = std::min(
-        least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), leaves(pair)));
+        least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule_of(pair)));
   }
   return least;
 }
 
-bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
+bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) {
   measure(at_, from, drift_);
-  const Eigen::Vector3d common = measure(from, to, way_);
+  const Eigen::Vector3d common = measure(from, to, displacement_);
   std::fill(share_.begin(), share_.end(), 1.0);
   const auto place = [&](int i) -> Eigen::Vector3d {
     if (share_[i] == 1.0) return at_node(to, i);
@@ -144,17 +148,17 @@ bool Neighbourhood::cap_near(const Buffer<double>& from, Buffer<double>& to) {
   };
   const auto shorten = [&](int i, double share) {
     share_[i] *= share;
-    way_[i] = (place(i) - at_node(from, i) - common).norm();
+    displacement_[i] = (place(i) - at_node(from, i) - common).norm();
   };
   bool whole = true;
   for (int round = 0; round <= settings_.rounds_max; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
-      if (fastest(pair, way_) <= distance - leaves(pair).of(distance)) continue;
+      if (fastest(pair, displacement_) <= distance - rule_of(pair).of(distance)) continue;
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]),
                             place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, leaves(pair));
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, rule_of(pair));
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == settings_.rounds_max) continue;

@@ -23,65 +23,66 @@ struct Candidate {
 };
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x);
-// No distance of a point of the first from one of the second changes by more, if nodes go `ways`,
-// m.
-double fastest(const Candidate& pair, const std::vector<double>& ways);
+// No distance of a point of the first from one of the second changes by more, if nodes go
+// `displacements`, m.
+double fastest(const Candidate& pair, const std::vector<double>& displacements);
 
 // All pairs of sheets that touch each other, without a common node, that are within `reach` at x:
 // vertices and triangles first, sorted by (first, second). By a grid of cells about as large as a
 // triangle. `farther`: of each sheet, how much larger the reach is of pairs with it, m; other than
-// 0 of skeletons only.
+// 0 of medial axes only.
 std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
                                   const std::vector<double>& farther = {});
 
 // Knows which pairs are near: all that can come within `thickness`, the largest, or `farther` than
-// that by sheet, of skeletons, while no node has moved further than `margin` from where it was,
-// whatever common way all have come.
-class Neighbourhood {
+// that by sheet, of medial axes, while no node has moved further than `margin` from where it was,
+// whatever common displacement all have come.
+class CandidateSet {
  public:
-  Neighbourhood(Surface surface, double thickness, double margin, const PathSettings& settings = {},
-                std::vector<double> farther = {});
+  CandidateSet(Surface surface, double thickness, double margin, const PathSettings& settings = {},
+               std::vector<double> farther = {});
 
   const Surface surface;
   const double thickness;
 
   // What a pair keeps apart at most, m.
-  double apart(const Candidate& pair) const;
+  double rest_distance(const Candidate& pair) const;
 
   // The pairs, for positions x. Of each, `distance` is at most its distance there.
   std::vector<Candidate>& pairs(const Buffer<double>& x);
 
   // Moves `to` back towards `from` where a pair would come nearer than half its distance or half
-  // the thickness, so that nothing crosses on the straight ways between: each node by as much as
-  // its pairs demand. Returns whether nothing was moved. Ways of more than `hops_max` times two
-  // margins end there: pairs are looked for anew on each hop.
-  bool cap(const Buffer<double>& from, Buffer<double>& to, int hops_max = 64);
+  // the thickness, so that nothing crosses on the straight paths between: each node by as
+  // much as its pairs demand. Returns whether nothing was moved. Ways of more than `hops_max` times
+  // two margins end there: pairs are looked for anew on each hop.
+  bool limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, int hops_max = 64);
 
-  // The share of the straight way from `from` to `to` that all nodes can go together, so that every
-  // pair that is near at `from` keeps half its distance or half the thickness.
-  double common_share(const Buffer<double>& from, const Buffer<double>& to);
+  // The share of the straight path from `from` to `to` that all nodes can go together, so
+  // that every pair that is near at `from` keeps half its distance or half the thickness.
+  double collision_free_fraction(const Buffer<double>& from, const Buffer<double>& to);
 
   double margin() const { return margin_; }
 
-  // Of each vertex the length of its way but for a common one, which it returns: the middle of the
-  // box of all ways.
+  // Of each vertex the length of its displacement but for a common one, which it returns: the
+  // middle of the box of all displacements.
   Eigen::Vector3d measure(const Buffer<double>& from, const Buffer<double>& to,
-                          std::vector<double>& ways) const;
+                          std::vector<double>& displacements) const;
 
  private:
-  // What bounds all ways from there to one of two places, or between them, but for a common one, m.
+  // What bounds all displacements from there to one of two places, or between them, but for a
+  // common one, m.
   double moved(const Buffer<double>& from, const Buffer<double>& to,
                const Buffer<double>* or_to = nullptr) const;
   void rebuild(const Buffer<double>& x);
-  Leaves leaves(const Candidate& pair) const;
-  bool cap_near(const Buffer<double>& from, Buffer<double>& to);
+  MinDistanceRule rule_of(const Candidate& pair) const;
+  bool limit_listed(const Buffer<double>& from, Buffer<double>& to);
 
   double margin_;
   PathSettings settings_;
   std::vector<double> farther_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
-  std::vector<double> share_, drift_, way_;
+  std::vector<double> share_, drift_, displacement_;
 };
 
 }  // namespace sim_core

@@ -12,15 +12,15 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-// Newton's method for a foot ends at changes of its barycentric coordinates that square to below
-// rounding. More iterations than these mean that there is no foot.
+// Newton's method for a projection ends at changes of its barycentric coordinates that square to
+// below rounding. More iterations than these mean that there is no projection.
 constexpr int iterations_max = 12;
 constexpr double converged = 1e-12;
 
 // Rounding of barycentric coordinates: they count as inside from here.
 constexpr double inside = -1e-9;
-// Triangles that a foot may move over in a search, which starts from the nearest: a bound against
-// cycles.
+// Triangles that a projection may move over in a search, which starts from the nearest: a bound
+// against cycles.
 constexpr int hops_max = 100;
 
 }  // namespace
@@ -186,15 +186,15 @@ PNPatch PNTriangles::patch(const PatchShape& shape, int t) const {
   return out;
 }
 
-std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p, int t,
-                                      double side) const {
+std::optional<Projection> PNTriangles::projection(const PatchShape& shape, const Vector3d& p, int t,
+                                                  double side) const {
   int before = -1;
   for (int hop = 0; hop < hops_max; ++hop) {
     const PNRoot root(patch(shape, t), p, settings_);
     int out = 0;
     const double least = root.b.minCoeff(&out);
     if (root.found && least >= inside)
-      return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
+      return Projection{t, root.b, root.point, side * root.normal, side * root.height, true};
     if (!root.found && least >= inside) return std::nullopt;
     if (mesh_.sharp[t][out] && root.b[next(out)] < inside && !mesh_.sharp[t][next(out)])
       out = next(out);
@@ -203,7 +203,7 @@ std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p
     if (mesh_.sharp[t][out]) return foot_around(shape, p, t, side);
     const int beyond = mesh_.across[t][out];
     if (beyond == before && root.found && least >= -settings_.between) {
-      return Foot{t, root.b, root.point, side * root.normal, side * root.height, true};
+      return Projection{t, root.b, root.point, side * root.normal, side * root.height, true};
     }
     before = std::exchange(t, beyond);
   }
@@ -212,8 +212,8 @@ std::optional<Foot> PNTriangles::foot(const PatchShape& shape, const Vector3d& p
 
 // The closest of all feet in the triangles around one, on their sharp edges and at the ends of
 // these.
-std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p, int t,
-                                             double side) const {
+std::optional<Projection> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p,
+                                                   int t, double side) const {
   std::vector<int> some;
   for (int node : mesh_.triangles[t]) {
     some.insert(some.end(), mesh_.around.begin() + mesh_.around_begin[node],
@@ -221,9 +221,9 @@ std::optional<Foot> PNTriangles::foot_around(const PatchShape& shape, const Vect
   }
   std::sort(some.begin(), some.end());
   some.erase(std::unique(some.begin(), some.end()), some.end());
-  std::optional<Foot> best;
-  const auto take = [&](const Foot& foot) {
-    if (!best || foot.height < best->height) best = foot;
+  std::optional<Projection> best;
+  const auto take = [&](const Projection& projection) {
+    if (!best || projection.height < best->height) best = projection;
   };
   for (int q : some) {
     const PNPatch one = patch(shape, q);

@@ -14,15 +14,15 @@
 //     N = sum N_i b_i^2 + sum_{i != j} Q_ij b_i b_j,    Q_ij = Q_ji = 2 m - (N_i + N_j)/2
 //
 // Along an edge both depend on that edge alone: so patch and normals are continuous, and so is the
-// foot (b, height) of a point p, the root of y(b) + height N/|N| = p [after the Phong projection of
-// Panozzo et al. 2013], as long as p is nearer than the centres of curvature. The patch misses a
-// sphere by the fourth power of the edges' length over its radius, and N misses the direction in
-// which the height grows by their second, times the change of curvature.
+// projection (b, height) of a point p, the root of y(b) + height N/|N| = p [after the Phong
+// projection of Panozzo et al. 2013], as long as p is nearer than the centres of curvature. The
+// patch misses a sphere by the fourth power of the edges' length over its radius, and N misses the
+// direction in which the height grows by their second, times the change of curvature.
 //
 // Edges stay sharp where they are borders, where the triangles on both sides meet at more than an
 // angle that is given, where there are more than two, or where both sides cannot be oriented alike.
 // There the normals of the two sides are different ones, the edge's tangents are their vector
-// products, and points between them have their foot on the edge or at its end.
+// products, and points between them have their projection on the edge or at its end.
 #pragma once
 
 #include <Eigen/Core>
@@ -105,7 +105,7 @@ struct PatchShape {
   double bulge = 0.0;  // m: how far patches are from their triangles at most
 };
 
-struct Foot {
+struct Projection {
   int triangle;
   Eigen::Vector3d weights;  // barycentric
   Eigen::Vector3d point;    // y, m
@@ -125,8 +125,8 @@ class PNTriangles {
 
   // The foot of p on a side (1: where the triangles' normals point to, after orientation; or -1),
   // looked for from a triangle on. None where p is too far off.
-  std::optional<Foot> foot(const PatchShape& shape, const Eigen::Vector3d& p, int triangle,
-                           double side) const;
+  std::optional<Projection> projection(const PatchShape& shape, const Eigen::Vector3d& p,
+                                       int triangle, double side) const;
 
   // On which side p is of the triangles themselves, of which its closest point is this one of this
   // triangle [Baerentzen & Aanaes 2005].
@@ -145,8 +145,8 @@ class PNTriangles {
  private:
   PNPatch patch(const PatchShape& shape, int triangle) const;
   Eigen::Vector3d edge_handle(const PatchShape& shape, int triangle, int from, int to) const;
-  std::optional<Foot> foot_around(const PatchShape& shape, const Eigen::Vector3d& p, int triangle,
-                                  double side) const;
+  std::optional<Projection> foot_around(const PatchShape& shape, const Eigen::Vector3d& p,
+                                        int triangle, double side) const;
 
   CreasedTriangles mesh_;
   SmoothSettings settings_;

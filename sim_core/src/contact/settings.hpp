@@ -163,12 +163,12 @@ struct SmoothSettings {
   SIM_CORE_NAMED(reach, curvature_max, same_normal, beyond_edge, between, fold_over, body_first)
 };
 
-struct SkeletonSettings {
-  // Radius over the side of a cell below which a body has a skeleton. From there on vertices
+struct CapsuleSettings {
+  // Radius over the side of a cell below which a body has a medial axis. From there on vertices
   // suffice: a triangle between them sinks by a sixteenth of a cell at most.
   double radius_max = 2.0;
-  // Half of the shortest edge of a box over the side of a cell below which its skeleton is all that
-  // cloth feels: it then has faces, too, which cost more than those that vertices touch, but
+  // Half of the shortest edge of a box over the side of a cell below which its medial axis is all
+  // that cloth feels: it then has faces, too, which cost more than those that vertices touch, but
   // nothing jumps over it.
   double thickness_max = 2.0;
   // Distance over the diameter of the cloth at rest by which an endless body reaches beyond the

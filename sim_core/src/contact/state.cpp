@@ -30,6 +30,48 @@ bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double dista
                      [&](const Body& body) { return gap_of(body, p).distance < distance_max; });
 }
 
+// Round faces make corners of less than 66 degrees smaller and none below 53, for cloth comes out
+// of the cusp under a box's edge; flat ones below 26 degrees.
+double fillet_radius(const Gap& a, const Gap& b, double fillet) {
+  const double c = a.normal.dot(b.normal);
+  return fillet * std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
+}
+
+// Takes the fillet between three bodies, or two where the last two are one, for the contact if its
+// gap is smaller.
+//
+// With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way
+// out to where all gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two
+// bodies, n_3 = n_1 x n_2 and a_3 = 0. The gap of the fillet is the radius less |w|.
+void lay_fillet(const std::array<const BodyContact*, 3>& bodies, double fillet, BodyContact& on) {
+  constexpr double parallel = 1e-6;  // determinant of unit normals
+  const Gap& first = bodies[0]->gap;
+  const Gap& second = bodies[1]->gap;
+  const Gap& third = bodies[2]->gap;
+  const bool has_third = bodies[2] != bodies[1];
+  double radius = std::min(fillet_radius(first, second, fillet), fillet);
+  if (has_third) {
+    radius = std::min(
+        {radius, fillet_radius(first, third, fillet), fillet_radius(second, third, fillet)});
+  }
+  Matrix3d normals;
+  normals << first.normal, second.normal,
+      has_third ? third.normal : first.normal.cross(second.normal);
+  if (!(std::abs(normals.determinant()) > parallel)) return;
+  const Vector3d lacks(radius - first.distance, radius - second.distance,
+                       has_third ? radius - third.distance : 0.0);
+  const Matrix3d inverse = normals.inverse();
+  const Vector3d displacement = inverse.transpose() * lacks;
+  const Vector3d parts = inverse * displacement;
+  const Vector3d fraction = parts / parts.sum();
+  const Gap gap{radius - displacement.norm(), displacement.normalized()};
+  if (!(parts.head(has_third ? 3 : 2).minCoeff() > 0.0 && gap.distance < on.gap.distance)) return;
+  on = {gap,
+        bodies[0]->body,
+        {bodies[1]->body, has_third ? bodies[2]->body : -1},
+        {fraction[1], fraction[2]}};
+}
+
 }  // namespace
 
 SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles,
@@ -45,21 +87,22 @@ SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles,
                settings),
       tree_(patches_.triangles(), x),
       track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
-      kept_(track_),
-      feet_(radius.size()) {
+      history_(track_),
+      projections_(radius.size()) {
   for (const auto& corners : triangles)
     first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
 }
 
 void SmoothContact::restart() {
-  for (int& triangle : kept_.triangle) triangle = std::min(triangle, -1);
+  for (int& triangle : history_.triangle) triangle = std::min(triangle, -1);
 }
 
-void SmoothContact::keep(const std::vector<int>& mode) {
+void SmoothContact::store_history(const std::vector<int>& mode) {
   for (int i = 0; i < free_nodes_; ++i) {
-    const bool stays = track_.triangle[i] >= 0 && mode[i] != contact_open && feet_[i].on_patch;
-    kept_.triangle[i] = stays ? track_.triangle[i] : std::min(track_.triangle[i], -1);
-    kept_.side[i] = track_.side[i];
+    const bool stays =
+        track_.triangle[i] >= 0 && mode[i] != contact_open && projections_[i].on_patch;
+    history_.triangle[i] = stays ? track_.triangle[i] : std::min(track_.triangle[i], -1);
+    history_.side[i] = track_.side[i];
   }
 }
 
@@ -87,7 +130,7 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   const double spread = 0.5 * ways.diagonal().norm();
   const double thickness =
       *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
-  track_ = kept_;
+  track_ = history_;
   for (int i = 0; i < free_nodes_; ++i) {
     const Vector3d p = at_node(start, i);
     const bool came = track_.triangle[i] == left_to_pairs,
@@ -103,53 +146,57 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
     track_.triangle[i] = found.triangle;
     if (found.triangle < 0) continue;
     track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
-    if (came && !forced(i, p, 0.0).isZero()) track_.triangle[i] = left_to_pairs;
+    if (came && !depenetration(i, p, 0.0).isZero()) track_.triangle[i] = left_to_pairs;
   }
 }
 
 std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (track_.triangle[node] < 0) return std::nullopt;
-  const std::optional<Foot> found =
-      patches_.foot(end_, p, track_.triangle[node], track_.side[node]);
+  const std::optional<Projection> found =
+      patches_.projection(end_, p, track_.triangle[node], track_.side[node]);
   if (!found) return std::nullopt;
   if (found->on_patch) track_.triangle[node] = found->triangle;
-  feet_[node] = *found;
-  return SmoothTouch{found->height - apart(end_, node, *found), found->normal,
+  projections_[node] = *found;
+  return SmoothTouch{found->height - rest_distance(end_, node, *found), found->normal,
                      surface_of(found->triangle) - materials_.sheets};
 }
 
 // What a node keeps, m: pairs stay idle as long as the triangles around it lie on the surface.
-double SmoothContact::apart(const PatchShape& shape, int node, const Foot& foot) const {
-  const int sheet = sheet_of_node_[node], surface = surface_of(foot.triangle);
+double SmoothContact::rest_distance(const PatchShape& shape, int node,
+                                    const Projection& projection) const {
+  const int sheet = sheet_of_node_[node], surface = surface_of(projection.triangle);
   const double r = radius_[node];
   const double curvature =
-      patches_.curvature(shape, foot.triangle, foot.weights, track_.side[node]);
+      patches_.curvature(shape, projection.triangle, projection.weights, track_.side[node]);
   const double sinking = 0.5 * r * r * std::min(curvature, settings_.curvature_max / r);
-  return std::max(materials_.mean(sheet, surface), materials_.apart(sheet, surface) + sinking);
+  return std::max(materials_.mean(sheet, surface),
+                  materials_.rest_distance(sheet, surface) + sinking);
 }
 
-Vector3d SmoothContact::forced(int node, const Vector3d& before, double allowed) const {
+Vector3d SmoothContact::depenetration(int node, const Vector3d& before, double allowed) const {
   if (track_.triangle[node] < 0) return Vector3d::Zero();
-  const std::optional<Foot> foot =
-      patches_.foot(start_, before, track_.triangle[node], track_.side[node]);
-  const double depth = foot ? apart(start_, node, *foot) - foot->height : 0.0;
-  return depth > allowed ? depth * foot->normal : Vector3d::Zero().eval();
+  const std::optional<Projection> projection =
+      patches_.projection(start_, before, track_.triangle[node], track_.side[node]);
+  const double depth =
+      projection ? rest_distance(start_, node, *projection) - projection->height : 0.0;
+  return depth > allowed ? depth * projection->normal : Vector3d::Zero().eval();
 }
 
 // The cloth is at p = y + (p - y) over the point y of the surface, and at the start of the step was
 // somewhere, while that place was at y0 + Q^T (p - y); Q turns the surface's axes from then to now.
 Vector3d SmoothContact::slip(int node, const Vector3d& before, const Vector3d& p) const {
-  const Foot& foot = feet_[node];
-  const Matrix3d turn = patches_.axes(end_, foot.triangle, foot.weights) *
-                        patches_.axes(start_, foot.triangle, foot.weights).transpose();
-  return p - foot.point + turn * (patches_.point(start_, foot.triangle, foot.weights) - before);
+  const Projection& projection = projections_[node];
+  const Matrix3d turn = patches_.axes(end_, projection.triangle, projection.weights) *
+                        patches_.axes(start_, projection.triangle, projection.weights).transpose();
+  return p - projection.point +
+         turn * (patches_.point(start_, projection.triangle, projection.weights) - before);
 }
 
 double SmoothContact::mu(int node) const {
-  return materials_.mu(sheet_of_node_[node], surface_of(feet_[node].triangle));
+  return materials_.mu(sheet_of_node_[node], surface_of(projections_[node].triangle));
 }
 
-void Norms::count(double force_squared) {
+void ForceNorms::count(double force_squared) {
   squared += force_squared;
   if (!std::isnan(largest) && !(force_squared <= largest * largest))
     largest = std::sqrt(force_squared);
@@ -162,7 +209,7 @@ ContactState::ContactState(int free_nodes, const ContactSettings& settings)
       stiffness(free_nodes, 0.0),
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
-      mu(free_nodes, 0.0f),
+      coupling(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
       correction(4 * free_nodes + 64, 0.0f),
@@ -171,7 +218,7 @@ ContactState::ContactState(int free_nodes, const ContactSettings& settings)
       fillet_(settings.fillet) {}
 
 ContactRows ContactState::rows() const {
-  return {mode.data(), normal.data(), direction.data(), mu.data(), turning.data()};
+  return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
 }
 
 void ContactState::penalty(int node, double own, float* out) const {
@@ -191,63 +238,38 @@ void ContactState::penalty(int node, double own, float* out) const {
   }
 }
 
-// With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way
-// out to where all gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two
-// bodies, n_3 = n_1 x n_2 and a_3 = 0. The gap of the fillet is the radius less |w|, and the
-// smallest gap counts. Round faces make corners of less than 66 degrees smaller and none below 53,
-// for cloth comes out of the cusp under a box's edge; flat ones below 26 degrees.
-Bearing ContactState::bearing(const std::vector<Body>& bodies, const Vector3d& p) const {
-  Bearing on{{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()}};
-  std::array<Bearing, 6> near;  // those whose fillets may reach here, the nearest first
+BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Vector3d& p) const {
+  BodyContact on{{std::numeric_limits<double>::infinity(), Vector3d::UnitZ()}};
+  std::array<BodyContact, 6> near;  // the bodies whose fillets may reach here, the nearest first
   int count = 0;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     if (by_pairs(b)) continue;
-    Bearing one{gap_of(bodies[b], p), static_cast<int>(b)};
-    if (one.gap.distance < on.gap.distance) on = one;
-    if (!(one.gap.distance < 2.0 * fillet_)) continue;
+    BodyContact candidate{gap_of(bodies[b], p), static_cast<int>(b)};
+    if (candidate.gap.distance < on.gap.distance) on = candidate;
+    if (!(candidate.gap.distance < 2.0 * fillet_)) continue;
     for (int k = 0; k < count; ++k) {
-      if (one.gap.distance < near[k].gap.distance) std::swap(one, near[k]);
+      if (candidate.gap.distance < near[k].gap.distance) std::swap(candidate, near[k]);
     }
-    if (count < static_cast<int>(near.size())) near[count++] = one;
+    if (count < static_cast<int>(near.size())) near[count++] = candidate;
   }
-  const auto radius_of = [&](const Gap& a, const Gap& b) {
-    const double c = a.normal.dot(b.normal);
-    return fillet_ * std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
-  };
-  const auto lay = [&](int i, int j, int k) {
-    const Gap &one = near[i].gap, &two = near[j].gap, &other = near[k].gap;
-    const bool all = k != j;
-    const double radius =
-        std::min(radius_of(one, two),
-                 all ? std::min(radius_of(one, other), radius_of(two, other)) : fillet_);
-    Matrix3d normals;
-    normals << one.normal, two.normal, all ? other.normal : one.normal.cross(two.normal);
-    if (!(std::abs(normals.determinant()) > 1e-6)) return;  // parallel
-    const Vector3d lacks(radius - one.distance, radius - two.distance,
-                         all ? radius - other.distance : 0.0);
-    const Matrix3d inverse = normals.inverse();
-    const Vector3d way = inverse.transpose() * lacks, parts = inverse * way,
-                   share = parts / parts.sum();
-    const Gap laid{radius - way.norm(), way.normalized()};
-    if (!(parts.head(all ? 3 : 2).minCoeff() > 0.0 && laid.distance < on.gap.distance)) return;
-    on = {laid, near[i].body, {near[j].body, all ? near[k].body : -1}, {share[1], share[2]}};
-  };
+  // The fillets of each two bodies, and of each three.
   for (int k = 1; k < count; ++k) {
     for (int j = 1; j <= k; ++j) {
-      for (int i = 0; i < j; ++i) lay(i, j, k);
+      for (int i = 0; i < j; ++i) lay_fillet({&near[i], &near[j], &near[k]}, fillet_, on);
     }
   }
   return on;
 }
 
-Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start,
-                         const Buffer<double>& residual, const std::vector<Body>& at_start,
-                         const std::vector<Body>& at_end) {
-  Norms norms;
+ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer<double>& start,
+                                           const Buffer<double>& residual,
+                                           const std::vector<Body>& at_start,
+                                           const std::vector<Body>& at_end) {
+  ForceNorms norms;
   const int free_nodes = static_cast<int>(mode.size());
   for (int i = 0; i < free_nodes; ++i) {
     const Vector3d p = at_node(x, i);
-    Bearing on = bearing(at_end, p);
+    BodyContact on = body_contact(at_end, p);
     const Vector3d r = at_node(residual, i);
     const auto bears = [&] {
       return on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
@@ -272,33 +294,33 @@ Norms ContactState::sort(const Buffer<double>& x, const Buffer<double>& start,
     const bool reversed = slipped && law.mode == contact_slip &&
                           at_node(direction, i).cast<double>().dot(law.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
-    const LawResponse& chosen = hold_reversed && reversed ? sticking(contact) : law;
+    const LawResponse& chosen = stick_on_reversal && reversed ? sticking(contact) : law;
     write(i, node_row(contact, chosen, turning_max_));
     norms.count(missed_squared(contact, law));
   }
   return norms;
 }
 
-void ContactState::keep(double dt) {
-  kept_ = {mode, touched, direction, turning, dt};
-  if (surfaces) surfaces->keep(mode);
+void ContactState::store_history(double dt) {
+  history_ = {mode, touched, direction, turning, dt};
+  if (surfaces) surfaces->store_history(mode);
 }
 
-void ContactState::forget() {
-  kept_.dt = 0.0;
+void ContactState::clear_history() {
+  history_.dt = 0.0;
   if (surfaces) surfaces->restart();
 }
 
-bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start,
-                          const Buffer<double>& residual, const std::vector<Body>& at_start,
-                          const std::vector<Body>& at_end, double dt) {
-  if (!(kept_.dt > 0.0)) return false;
+bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& start,
+                              const Buffer<double>& residual, const std::vector<Body>& at_start,
+                              const std::vector<Body>& at_end, double dt) {
+  if (!(history_.dt > 0.0)) return false;
   for (std::size_t i = 0; i < mode.size(); ++i) {
-    const int node = static_cast<int>(i), body = kept_.touched[i];
-    if (kept_.mode[i] == contact_open || body < 0) continue;
-    Bearing on;
+    const int node = static_cast<int>(i), body = history_.touched[i];
+    if (history_.mode[i] == contact_open || body < 0) continue;
+    BodyContact on;
     if (body < static_cast<int>(at_end.size())) {
-      on = bearing(at_end, at_node(x, node));
+      on = body_contact(at_end, at_node(x, node));
       if (on.body != body) on = {gap_of(at_end[body], at_node(x, node)), body};
     } else {
       const std::optional<SmoothTouch> one = surfaces->touch(node, at_node(x, node));
@@ -310,24 +332,24 @@ bool ContactState::resume(const Buffer<double>& x, const Buffer<double>& start,
     at_node(normal, node) = on.gap.normal.cast<float>();
     // Friction turns the more easily the further a node slips, and it slips in proportion to dt.
     const LawResponse law =
-        kept_.mode[i] == contact_stick
+        history_.mode[i] == contact_stick
             ? sticking(contact)
-            : slipping_along(contact, at_node(kept_.direction, node).cast<double>(),
-                             static_cast<double>(kept_.turning[i]) * kept_.dt / dt);
+            : slipping_along(contact, at_node(history_.direction, node).cast<double>(),
+                             static_cast<double>(history_.turning[i]) * history_.dt / dt);
     // The turning of the last step is not bounded again.
     write(node, node_row(contact, law, std::numeric_limits<double>::infinity()));
   }
   return true;
 }
 
-Vector3d ContactState::slip(const Bearing& on, const Vector3d& before, const Vector3d& p,
+Vector3d ContactState::slip(const BodyContact& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
   const Vector3d u =
       on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
-Contact ContactState::contact_at(int node, const Bearing& on, const Buffer<double>& x,
+Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<double>& x,
                                  const Buffer<double>& start, const Buffer<double>& residual,
                                  const std::vector<Body>& at_start,
                                  const std::vector<Body>& at_end) const {
@@ -347,7 +369,7 @@ void ContactState::write(int node, const NodeRow& row) {
   at_node(direction, node) = row.direction.cast<float>();
   at_node(force, node) = row.force.cast<float>();
   at_node(correction, node) = row.correction.cast<float>();
-  mu[node] = static_cast<float>(row.coupling);
+  coupling[node] = static_cast<float>(row.coupling);
   turning[node] = static_cast<float>(row.turning);
 }
 

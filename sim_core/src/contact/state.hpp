@@ -54,25 +54,25 @@ class SmoothContact {
   void begin(const Buffer<double>& start, const Buffer<double>& ends, const Buffer<double>& guess,
              const std::vector<Body>& at_start);
   // A step ended, with these nodes in contact.
-  void keep(const std::vector<int>& mode);
+  void store_history(const std::vector<int>& mode);
 
   // What a node sees at p, if a surface is near.
   std::optional<SmoothTouch> touch(int node, const Eigen::Vector3d& p);
   // How far a node that was at `before` when the step began was too near then, if by more than
   // `allowed`, m.
-  Eigen::Vector3d forced(int node, const Eigen::Vector3d& before, double allowed) const;
+  Eigen::Vector3d depenetration(int node, const Eigen::Vector3d& before, double allowed) const;
   // Of what the node saw last: its way over the surface since it was at `before` when the step
-  // began, m; friction; and the foot.
+  // began, m; friction; and the projection.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
   double mu(int node) const;
-  const Foot& foot(int node) const { return feet_[node]; }
+  const Projection& projection(int node) const { return projections_[node]; }
   const std::vector<std::array<int, 3>>& triangles() const { return patches_.triangles(); }
 
  private:
   void take_shapes(const Buffer<double>& start, const Buffer<double>& ends);
   int surface_of(int triangle) const { return sheet_of_node_[patches_.triangles()[triangle][0]]; }
 
-  double apart(const PatchShape& shape, int node, const Foot& foot) const;
+  double rest_distance(const PatchShape& shape, int node, const Projection& projection) const;
 
   std::vector<int> sheet_of_node_;
   std::vector<double> radius_;
@@ -87,19 +87,19 @@ class SmoothContact {
     std::vector<int> triangle;  // (free nodes): -1: none is near; -2: left to pairs
     std::vector<double> side;
   };
-  Track track_, kept_;
-  std::vector<Foot> feet_;
+  Track track_, history_;
+  std::vector<Projection> projections_;
 };
 
 // How far an iterate is from the solution: the largest force that a node lacks [N], and the sum of
 // their squares.
-struct Norms {
+struct ForceNorms {
   double largest = 0.0, squared = 0.0;
   void count(double force_squared);
 };
 
 // What a node sees of the bodies: the nearest, or, in a corner, the fillet between two or three.
-struct Bearing {
+struct BodyContact {
   Gap gap;
   int body = -1;                      // -1: none
   std::array<int, 2> others{-1, -1};  // the same
@@ -122,41 +122,43 @@ class ContactState {
       touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<int> sheet;         // (free nodes): to which they belong
   std::vector<double> stiffness;  // (free nodes): k of the law, N/m
-  Buffer<float> normal, direction, mu, turning;
+  Buffer<float> normal, direction, coupling, turning;
   Buffer<float> force,
       correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
-  std::vector<char> whole_skeletons;  // (bodies): those that nodes do not feel; none: all are felt
+  std::vector<char> replaced_bodies;  // (bodies): those that nodes do not feel; none: all are felt
   bool by_pairs(std::size_t body) const {
-    return body < whole_skeletons.size() && whole_skeletons[body];
+    return body < replaced_bodies.size() && replaced_bodies[body];
   }
   std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear
   // problem. Newton's method may else go to and fro between the two ways of slipping, where the law
   // has it that they stick.
-  bool hold_reversed = false;
+  bool stick_on_reversal = false;
 
-  Bearing bearing(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
+  BodyContact body_contact(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
   // Way over the bodies of a node that was at `before` when the step began, in the plane of
   // contact, m.
-  static Eigen::Vector3d slip(const Bearing& on, const Eigen::Vector3d& before,
+  static Eigen::Vector3d slip(const BodyContact& on, const Eigen::Vector3d& before,
                               const Eigen::Vector3d& p, const std::vector<Body>& at_start,
                               const std::vector<Body>& at_end);
 
-  // Sorts the free nodes at `x`, which were at `start` when the step began and need `residual` from
-  // contact.
-  Norms sort(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
-             const std::vector<Body>& at_start, const std::vector<Body>& at_end);
+  // Classifies the contacts of the free nodes at `x`, which were at `start` when the step began and
+  // need `residual` from contact.
+  ForceNorms classify_contacts(const Buffer<double>& x, const Buffer<double>& start,
+                               const Buffer<double>& residual, const std::vector<Body>& at_start,
+                               const std::vector<Body>& at_end);
 
   // Puts the nodes that were in contact at the end of the last step back into the mode and
   // direction they had, for the first linear problem of a step of dt: at a predicted state the law
   // would sort many of them wrongly.
-  bool resume(const Buffer<double>& x, const Buffer<double>& start, const Buffer<double>& residual,
-              const std::vector<Body>& at_start, const std::vector<Body>& at_end, double dt);
+  bool warm_start(const Buffer<double>& x, const Buffer<double>& start,
+                  const Buffer<double>& residual, const std::vector<Body>& at_start,
+                  const std::vector<Body>& at_end, double dt);
   // Keeps the modes, directions and stiffnesses of a step that ended, for the next; or none.
-  void keep(double dt);
-  void forget();
+  void store_history(double dt);
+  void clear_history();
 
   ContactRows rows() const;
 
@@ -166,17 +168,17 @@ class ContactState {
   void penalty(int node, double own, float* out) const;
 
  private:
-  Contact contact_at(int node, const Bearing& on, const Buffer<double>& x,
+  Contact contact_at(int node, const BodyContact& on, const Buffer<double>& x,
                      const Buffer<double>& start, const Buffer<double>& residual,
                      const std::vector<Body>& at_start, const std::vector<Body>& at_end) const;
   void write(int node, const NodeRow& row);
 
-  struct Kept {
+  struct History {
     std::vector<int> mode, touched;
     Buffer<float> direction, turning;
     double dt = 0.0;  // 0: nothing is kept
   };
-  Kept kept_;
+  History history_;
   double penalty_, turning_max_, fillet_;
 };
 

@@ -24,16 +24,16 @@ Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
 }  // namespace
 
 Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in,
-                 CollisionMask collides_in, const Bones& bones)
+                 CollisionMask collides_in, const CapsulePieces& capsules)
     : triangles(std::move(triangles_in)),
       around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
-      bone_triangles(static_cast<int>(triangles.size())),
+      capsule_triangles(static_cast<int>(triangles.size())),
       collides(std::move(collides_in)),
       last_collider(collides.rows(), -1) {
-  triangles.insert(triangles.end(), bones.triangles.begin(), bones.triangles.end());
-  const int first_bone =
-      bones.points.empty() ? static_cast<int>(sheet_of_node.size()) : bones.points.front();
+  triangles.insert(triangles.end(), capsules.triangles.begin(), capsules.triangles.end());
+  const int first_capsule =
+      capsules.points.empty() ? static_cast<int>(sheet_of_node.size()) : capsules.points.front();
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (sheet_of_node[i] < 0) continue;
     for (Eigen::Index sheet = 0; sheet < collides.rows(); ++sheet) {
@@ -47,7 +47,7 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       if (c == 0 || corners[c] != corners[c - 1]) ++around_begin[corners[c] + 1];
     }
   }
-  edges.insert(edges.end(), bones.segments.begin(), bones.segments.end());
+  edges.insert(edges.end(), capsules.segments.begin(), capsules.segments.end());
   std::sort(edges.begin(), edges.end());
   edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
   triangles_of_edge.assign(edges.size(), 0);
@@ -64,7 +64,7 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
     triangle_edges.push_back(own);
   }
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
-    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_bone)
+    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_capsule)
       vertices.push_back(static_cast<int>(i));
     around_begin[i + 1] += around_begin[i];
   }
@@ -76,11 +76,11 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       if (c == 0 || corners[c] != corners[c - 1]) around[next[corners[c]]++] = static_cast<int>(t);
     }
   }
-  bone_edges = static_cast<int>(
-      std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_bone, -1}) -
+  capsule_edges = static_cast<int>(
+      std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_capsule, -1}) -
       edges.begin());
-  bone_vertices = static_cast<int>(std::lower_bound(vertices.begin(), vertices.end(), first_bone) -
-                                   vertices.begin());
+  capsule_vertices = static_cast<int>(
+      std::lower_bound(vertices.begin(), vertices.end(), first_capsule) - vertices.begin());
 }
 
 void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes) {

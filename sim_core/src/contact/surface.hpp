@@ -13,13 +13,13 @@
 namespace sim_core {
 
 // What cloth touches of a body by pairs alone, or besides its vertices.
-struct Bone {
+struct Capsule {
   int body;
-  double radius;  // m: what pairs keep apart
-  bool whole;     // see Skeleton
+  double radius;        // m: what pairs keep apart
+  bool replaces_nodes;  // see MedialAxis
 };
 
-// Of sheets and, after them, surfaces and skeletons.
+// Of sheets and, after them, surfaces and medial axes.
 struct ContactMaterials {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
   Eigen::MatrixXd mu;             // of each two; negative: they do not touch each other
@@ -31,38 +31,38 @@ struct ContactMaterials {
   double edge_share = 1.0, second_share = 1.0;
   double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
   double cell = 0.0;            // m: side of a cell, of the coarsest sheet
-  std::vector<Bone> bones;
+  std::vector<Capsule> capsules;
 
-  int first_bone() const { return static_cast<int>(thickness.size()); }
-  // Of two sheets, surfaces and skeletons: the skeleton, or null.
-  const Bone* bone_of(int a, int b) const {
-    const int last = std::max(a, b) - first_bone();
-    return last < 0 ? nullptr : &bones[last];
+  int first_capsule() const { return static_cast<int>(thickness.size()); }
+  // Of two sheets, surfaces and medial axes: the medial axis, or null.
+  const Capsule* capsule_of(int a, int b) const {
+    const int last = std::max(a, b) - first_capsule();
+    return last < 0 ? nullptr : &capsules[last];
   }
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
   // (contact/state.hpp): pairs only hold what comes nearer between the nodes.
-  double apart(int a, int b) const {
-    if (const Bone* bone = bone_of(a, b)) return bone->radius;
+  double rest_distance(int a, int b) const {
+    if (const Capsule* capsule = capsule_of(a, b)) return capsule->radius;
     return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
   }
   // The same by kind of pair; `first` and `second`: sheets of its pieces.
-  double apart(PairKind kind, int first, int second) const {
+  double rest_distance(PairKind kind, int first, int second) const {
     const bool other = first != second && std::max(first, second) < sheets;
     const double share = !other                        ? 1.0
                          : kind == PairKind::edge_edge ? edge_share
                          : first > second              ? second_share
                                                        : 1.0;
-    return share * apart(first, second);
+    return share * rest_distance(first, second);
   }
-  // The largest of these without skeletons; without any, the largest thickness of a sheet.
+  // The largest of these without medial axes; without any, the largest thickness of a sheet.
   double farthest() const {
     double out = 0.0;
-    if ((mu.topLeftCorner(first_bone(), first_bone()).array() < 0.0).all()) {
+    if ((mu.topLeftCorner(first_capsule(), first_capsule()).array() < 0.0).all()) {
       return *std::max_element(thickness.begin(), thickness.begin() + sheets);
     }
-    for (int a = 0; a < first_bone(); ++a) {
-      for (int b = 0; b <= a; ++b) out = mu(a, b) < 0.0 ? out : std::max(out, apart(a, b));
+    for (int a = 0; a < first_capsule(); ++a) {
+      for (int b = 0; b <= a; ++b) out = mu(a, b) < 0.0 ? out : std::max(out, rest_distance(a, b));
     }
     return out;
   }
@@ -70,8 +70,8 @@ struct ContactMaterials {
 
 using CollisionMask = Eigen::Matrix<bool, Eigen::Dynamic, Eigen::Dynamic>;
 
-// Points, segments and triangles of skeletons, by node. Their nodes are the last.
-struct Bones {
+// Points, segments and triangles of medial axes, by node. Their nodes are the last.
+struct CapsulePieces {
   std::vector<int> points;
   std::vector<std::array<int, 2>> segments;
   std::vector<std::array<int, 3>> triangles;
@@ -86,12 +86,12 @@ struct Surface {
   std::vector<int> triangles_of_edge;              // counts
   std::vector<int> around_begin, around;           // triangles around each node, ascending
   std::vector<int> sheet_of_node;
-  int bone_triangles, bone_edges, bone_vertices;  // where those of skeletons begin
-  CollisionMask collides;                         // whether two sheets touch each other
-  std::vector<int> last_collider;                 // by sheet: the last node that it touches
+  int capsule_triangles, capsule_edges, capsule_vertices;  // where those of medial axes begin
+  CollisionMask collides;                                  // whether two sheets touch each other
+  std::vector<int> last_collider;  // by sheet: the last node that it touches
 
   Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
-          CollisionMask collides, const Bones& bones = {});
+          CollisionMask collides, const CapsulePieces& capsules = {});
   bool may_touch(int node, int other) const {
     return collides(sheet_of_node[node], sheet_of_node[other]);
   }

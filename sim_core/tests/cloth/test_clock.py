@@ -112,7 +112,10 @@ def watched(
 @pytest.mark.physics
 @pytest.mark.parametrize("frequency", [4.0, 8.0, 16.0, 32.0, 37.3])
 def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> None:
-    """It moves as a rigid block does: with the floor, or with |v'| = mu g, which a step takes to begin at its end."""
+    """It moves as a rigid block does: with the floor, or with |v'| = mu g.
+
+    A step takes the latter to begin at its end.
+    """
     begin, size, dt = 0.5, 2e-3, 1e-5
 
     def floor(time: float) -> float:

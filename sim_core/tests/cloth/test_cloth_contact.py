@@ -1,4 +1,4 @@
-"""Sheets on bodies: exact Coulomb friction, balances of momentum and energy, and what is refused."""
+"""Sheets on bodies: exact Coulomb friction, balances of momentum and energy, refusals."""
 
 from collections.abc import Sequence
 from dataclasses import replace

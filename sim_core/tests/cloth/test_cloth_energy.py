@@ -163,7 +163,7 @@ def test_homogeneous_stretch(name: str) -> None:
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3])
 def test_pure_bending(poisson: float) -> None:
-    """A narrow strip under end curvature: W per area between D (1 - nu^2) and D, times kappa^2/2."""
+    """A narrow strip under end curvature: W per area is D (1 - nu^2) ... D, times kappa^2/2."""
     mesh = meshes.unstructured(0.02, 0.1, 0.004, 0)
     cloth = Cloth(mesh, isotropic(0.2, 50.0, 1e-5, poisson), preset_named("certified"))
     at = flat(mesh)

@@ -153,7 +153,7 @@ def crumpled(seed: int, size: float = 0.03) -> tuple[Floats, NDArray[np.int32]]:
 
 @pytest.fixture(scope="module")
 def apart() -> dict[tuple[int, ...], float]:
-    """The distance of each pair of a crumpled sheet: (0, vertex, triangle), then (1, edge, edge)."""
+    """The distance of each pair of a crumpled sheet: (0, vertex, triangle), (1, edge, edge)."""
     x, triangles = crumpled(5)
     edges = np.unique(
         np.sort(np.concatenate([triangles[:, p] for p in ([0, 1], [1, 2], [2, 0])]), axis=1), axis=0

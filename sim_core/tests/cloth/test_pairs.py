@@ -66,7 +66,7 @@ def corners(
 
 
 def force_after(cloth: Cloth, inward: float, height: float) -> Floats:
-    """Move the upper corner in a step, and return the force of pairs on the free corner (3,) [N]."""
+    """Move the upper corner in a step; return the force of pairs on the free corner (3,) [N]."""
     assert cloth.step(0.02, held=places(inward, height)[HELD], damping=5.0).converged
     pairs = cloth.pair_forces
     force: Floats = (pairs.weights * (pairs.vertices == CORNER)).sum(axis=1) @ pairs.forces

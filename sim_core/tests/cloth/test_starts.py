@@ -74,7 +74,10 @@ CORNER_UP = Rotation.align_vectors([[0.0, 0.0, 1.0]], [[1.0, 1.0, 1.0]])[0].as_m
 )
 def test_starts_through_a_body_that_is_between_vertices_are_refused(body: Body) -> None:
     """They would be accepted, and cost minutes, for no step leads out of them."""
-    message = r"positions: triangles must not start more than [0-9.]+ mm inside a body, and that of vertices \d+, .* is"
+    message = (
+        r"positions: triangles must not start more than [0-9.]+ mm inside a body, "
+        r"and that of vertices \d+, .* is"
+    )
     sheet, start = cloth(0.0)
     with pytest.raises(ValueError, match=message):
         sheet.set_state(start, bodies=[body])

@@ -23,7 +23,7 @@ class Sheet:
         self.cloth = Cloth(MESH, fabric(name), preset_named("certified"))
 
     def at(self, strain: Floats) -> tuple[float, Floats]:
-        """Energy per area and second Piola-Kirchhoff stress (2, 2) [N/m] at Green's strain (2, 2)."""
+        """Energy per area, and second Piola-Kirchhoff stress [N/m] at Green's strain (2, 2)."""
         values, axes = np.linalg.eigh(np.eye(2) + 2.0 * strain)
         gradient = axes @ np.diag(np.sqrt(values)) @ axes.T
         energy, _, forces = self.cloth._solver.energies(

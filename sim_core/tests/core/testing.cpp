@@ -152,8 +152,8 @@ NB_MODULE(_testing, m) {
       [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness,
          double margin) {
         Buffer<double> end = buffer_of(to);
-        Neighbourhood near(surface_of(triangles, from), thickness, margin);
-        near.cap(buffer_of(from), end);
+        CandidateSet near(surface_of(triangles, from), thickness, margin);
+        near.limit_by_ccd(buffer_of(from), end);
         Points3 out(to.rows(), 3);
         for (int i = 0; i < to.rows(); ++i) out.row(i) = at_node(end, i).transpose();
         return out;
@@ -175,17 +175,18 @@ NB_MODULE(_testing, m) {
           const Eigen::Vector3d p = points.row(i).transpose();
           const Nearest near = tree.nearest(p, 1e300, [](int) { return true; });
           const double side = patches.side_of(shape, p, near.triangle, near.weights);
-          const std::optional<Foot> foot = patches.foot(shape, p, near.triangle, side);
-          if (!foot) continue;
-          height[i] = side * foot->height;
-          normal.row(i) = side * foot->normal.transpose();
-          point.row(i) = foot->point.transpose();
-          triangle[i] = foot->on_patch ? foot->triangle : -1;
+          const std::optional<Projection> projection =
+              patches.projection(shape, p, near.triangle, side);
+          if (!projection) continue;
+          height[i] = side * projection->height;
+          normal.row(i) = side * projection->normal.transpose();
+          point.row(i) = projection->point.transpose();
+          triangle[i] = projection->on_patch ? projection->triangle : -1;
         }
         return std::make_tuple(height, normal, point, triangle);
       },
       "triangles"_a, "x"_a, "crease"_a, "points"_a,
-      "height, normal, foot and triangle (-1: an edge) of points over a smooth surface; see "
+      "height, normal, projection and triangle (-1: an edge) of points over a smooth surface; see "
       "contact/pn_triangles.hpp.");
   m.def(
       "coulomb_law",

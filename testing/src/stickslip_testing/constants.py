@@ -41,7 +41,7 @@ COUNTS = frozenset(
             )
         ),
         *("newton.halving_iterations", "newton.longest", "path.rounds_max", "factor.pool"),
-        *("stepping.strained_soon", "stepping.strained_long", "stepping.smooth_iterations"),
+        *("stepping.stalled_soon", "stepping.stalled_long", "stepping.smooth_iterations"),
         *("control.halvings", "control.looks"),
     }
 )

@@ -65,10 +65,12 @@ CHECKS = (
     ),
     Check(
         "jumps",
-        "distance of a body, holder or surface from an even motion within a step, over the preset's step error",
+        "distance of a body, holder or surface from an even motion within a step, over the "
+        "preset's step error",
         lambda seen: seen.total.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
         1.0,
-        "steps are halved until it is 0.25; where the shortest are not enough, something jumps or is shaken by 40 g",
+        "steps are halved until it is 0.25; where the shortest are not enough, something "
+        "jumps or is shaken by 40 g",
     ),
     Check(
         "unconverged",
@@ -81,7 +83,8 @@ CHECKS = (
     ),
     Check(
         "budget",
-        "most iterations of Newton's method in a second of scene time, over the 50,000 at which the run ends",
+        "most iterations of Newton's method in a second of scene time, over the 50,000 at "
+        "which the run ends",
         lambda seen: seen.cloth.spent,
         1.0,
         "where holders, bodies and cloth cannot all have their way, steps take ever more",
@@ -95,23 +98,28 @@ CHECKS = (
     ),
     Check(
         "contact_gain",
-        "sum over steps and vertices of max(0, R_n (g_1 - g_0) + R_t . u) over the flow of energy: work that bodies do "
-        "on the motion against them, with the force R, the gap g at the start and end of the step, and the slip u",
+        "sum over steps and vertices of max(0, R_n (g_1 - g_0) + R_t . u) over the flow of "
+        "energy: work that bodies do "
+        "on the motion against them, with the force R, the gap g at the start and end of the "
+        "step, and the slip u",
         lambda seen: _ratio(seen.total.seen.contact_work, seen.total.seen.flow),
         1e-3,
-        "contact takes energy from the motion against a body and never gives any; a body that pushes out what is in it "
+        "contact takes energy from the motion against a body and never gives any; a body that "
+        "pushes out what is in it "
         "does",
     ),
     Check(
         "energy_gain",
-        "largest energy gained beyond the work of gravity, holders and bodies, over the flow of energy",
+        "largest energy gained beyond the work of gravity, holders and bodies, over the flow "
+        "of energy",
         lambda seen: _ratio(seen.total.seen.gain, seen.total.seen.flow),
         None,
         "recorded: good runs reach 0.9 %, and bad ones begin at 1 %",
     ),
     Check(
         "penetration",
-        "largest depth in a body at the end of a step, beyond the sagitta of flat triangles on its round face, over "
+        "largest depth in a body at the end of a step, beyond the sagitta of flat triangles "
+        "on its round face, over "
         "the side of a cell",
         lambda seen: seen.total.seen.depth,
         0.1,
@@ -120,7 +128,8 @@ CHECKS = (
     ),
     Check(
         "passages",
-        "triangles that pass the core of a body in a step: the centre of a ball, the axis of a rod, the middle plane "
+        "triangles that pass the core of a body in a step: the centre of a ball, the axis of "
+        "a rod, the middle plane "
         "of a box",
         lambda seen: float(seen.total.seen.passages),
         0.0,
@@ -142,13 +151,15 @@ CHECKS = (
     ),
     Check(
         "missed",
-        "shortest steps that are further off than twice the preset's step error, over those that fit the scene",
+        "shortest steps that are further off than twice the preset's step error, over those "
+        "that fit the scene",
         lambda seen: _ratio(
             seen.total.missed * seen.cloth.preset.longest_step,
             seen.cloth.preset.finest * seen.cloth.time,
         ),
         0.5,
-        "drags reach 0, falls 0.13 and tumbles 0.352 with `certified`; a preset too coarse for its scene reaches 1",
+        "drags reach 0, falls 0.13 and tumbles 0.352 with `certified`; a preset too coarse "
+        "for its scene reaches 1",
     ),
 )
 """All checks. The first that fails is the reason: causes come before what follows from them."""
@@ -164,15 +175,14 @@ def values(seen: Seen) -> Mapping[str, float]:
 
 
 def failed(worst: Mapping[str, float]) -> tuple[str, str]:
-    """Return the code and the text of the reason why a run with these values is not valid, or empty
-    texts.
-    """
+    """Return the code and the text of the first check that fails, or empty texts."""
     for check in CHECKS:
         value = worst[check.name]
         if check.limit is not None and not value <= check.limit:
             unit = "" if check.unit == "1" else f" {check.unit}"
             return (
                 check.name,
-                f"{check.name}: must be at most {check.limit:g}{unit}, got {value:.4g} ({check.formula})",
+                f"{check.name}: must be at most {check.limit:g}{unit}, got {value:.4g} "
+                f"({check.formula})",
             )
     return "", ""

@@ -88,8 +88,10 @@ class Body:
 
 
 def check_friction(mu: ArrayLike) -> None:
-    """Raise ValueError unless a coefficient of friction, or those with several sheets, are in
-    range.
+    """Check a coefficient of friction, or one for each of several sheets.
+
+    Raises:
+        ValueError: A coefficient is out of range.
     """
     values = np.asarray(mu, float)
     if values.ndim > 1 or not values.size or not ((values >= 0.0) & (values <= MU_MAX)).all():
@@ -101,8 +103,9 @@ def check_friction(mu: ArrayLike) -> None:
 def plane(
     mu: ArrayLike, *, normal: ArrayLike = (0.0, 0.0, 1.0), origin: ArrayLike = ORIGIN
 ) -> Body:
-    """Return the half-space below a plane, with the axes of the world in the shortest turn from z
-    to the normal.
+    """Return the half-space below a plane.
+
+    Its axes are those of the world after the shortest turn from z to the normal.
     """
     n = np.asarray(normal, float)
     if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
@@ -198,8 +201,9 @@ faces of the earlier: see `SelfContact.bearing`."""
 
 @dataclass(frozen=True, eq=False)
 class SelfContact:
-    """Contact of cloth with itself and other cloth, without crossings and with exact Coulomb
-    friction.
+    """Contact of cloth with itself and with other cloth.
+
+    Nothing crosses, and friction is exactly that of Coulomb's law.
 
     Raises:
         ValueError: A number breaks its rule.
@@ -300,7 +304,8 @@ class Surface:
         corners = self.at(0.0)
         if triangles.min() < 0 or triangles.max() >= len(corners):
             raise ValueError(
-                f"triangles: must index {len(corners)} vertices, got {triangles.min()} ... {triangles.max()}"
+                f"triangles: must index {len(corners)} vertices, "
+                f"got {triangles.min()} ... {triangles.max()}"
             )
         a, b, c = np.moveaxis(corners[triangles], 1, 0)
         flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) == 0.0)

@@ -55,12 +55,14 @@ class Fabric:
         k, d = np.asarray(self.stretching, float), np.asarray(self.rigidity, float)
         if k.shape != (6, 4) or not ((k >= 0.0) & (k <= STRETCHING_MAX)).all():
             raise ValueError(
-                f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, got {k.tolist()}"
+                f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, "
+                f"got {k.tolist()}"
             )
         if not (k[:, 1] ** 2 < k[:, 0] * k[:, 2]).all():
             row = int(np.argmin(k[:, 0] * k[:, 2] - k[:, 1] ** 2))
             raise ValueError(
-                f"stretching: must have k1^2 < k0 k2 in every row, and row {row} is {k[row].tolist()}"
+                f"stretching: must have k1^2 < k0 k2 in every row, "
+                f"and row {row} is {k[row].tolist()}"
             )
         if (
             d.shape != (3, 3)
@@ -110,8 +112,9 @@ def custom_fabric(
     bending: ArrayLike | None = None,
     damping: float = 0.0,
 ) -> Fabric:
-    """Return a fabric from measured numbers: a stretching table with bending, or Young's modulus
-    with thickness.
+    """Return a fabric from measured numbers.
+
+    Give a stretching table with bending, or Young's modulus with the thickness.
 
     Args: name: For messages. density: Mass per area [kg/m^2]. stretching: (6, 4) [N/m], as
         `Fabric.stretching`; or `young`. young: Young's modulus [Pa], of an isotropic fabric with
@@ -166,6 +169,7 @@ def isotropic(
         stretching: Y, Young's modulus times thickness [N/m].
         rigidity: D of plates, E h^3 / (12 (1 - poisson^2)) [N m].
         poisson: Poisson's ratio, in [0, 0.5].
+        name: For messages.
 
     Raises:
         ValueError: A number breaks its rule.

@@ -46,8 +46,9 @@ def grid(
     diagonals: Diagonals = "alternating",
     seed: int = 0,
 ) -> Mesh:
-    """Triangulate [-width/2, width/2] x [-length/2, length/2] by columns x rows cells, each cut
-    along a diagonal.
+    """Triangulate a rectangle by columns x rows cells, each of which is cut along a diagonal.
+
+    The rectangle is [-width/2, width/2] x [-length/2, length/2].
 
     Raises:
         ValueError: A size is not positive, or there is no such pattern.
@@ -105,10 +106,10 @@ def together(*parts: Mesh) -> Mesh:
 def unstructured(
     width: float, length: float, spacing: float, seed: int = 0, *, aligned: int = 0
 ) -> Mesh:
-    """Triangulate [-width/2, width/2] x [-length/2, length/2] by a Delaunay mesh of scattered
-    vertices.
+    """Triangulate a rectangle by a Delaunay mesh of scattered vertices.
 
-    Rows of a triangular lattice with edges of about `spacing` are displaced at random by up to 0.3
+    The rectangle is [-width/2, width/2] x [-length/2, length/2]. Rows of a triangular lattice with
+    edges of about `spacing` are displaced at random by up to 0.3
     spacings, and edges are flipped until every circumcircle is empty [Lawson 1977]. The first
     `aligned` rows of cells along the length are squares of side `spacing` instead.
 
@@ -119,7 +120,8 @@ def unstructured(
     start = aligned * spacing
     if not start < length:
         raise ValueError(
-            f"aligned: rows of {spacing} m must be shorter than the length of {length} m, got {aligned}"
+            f"aligned: rows of {spacing} m must be shorter than the length of {length} m, "
+            f"got {aligned}"
         )
     rng = np.random.default_rng(seed)
     columns = max(1, round(width / spacing))

@@ -73,8 +73,9 @@ class SolverSettings:
     """
 
     def numbers(self) -> dict[str, Any]:
-        """Return all numbers that the preset stands for, by name, those of the C++ solver as
-        "group.name".
+        """Return all numbers that the preset stands for, by name.
+
+        Constants of the C++ solver are named "group.name".
         """
         own = {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"

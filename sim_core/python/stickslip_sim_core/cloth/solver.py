@@ -1,5 +1,6 @@
-"""Time stepping of cloth in contact with bodies, itself and surfaces: a thin layer over the C++
-solver.
+"""Time stepping of cloth in contact with bodies, itself and surfaces.
+
+A thin layer over the C++ solver.
 """
 
 import os
@@ -197,14 +198,17 @@ class Cloth:
 
     @property
     def reactions(self) -> Floats:
-        """(V, 3) [N]: force of a body or a smooth surface on a free vertex, of its holder on a held
-        one, by M a = forces."""
+        """Forces on the vertices (V, 3) [N], by M a = forces.
+
+        On a free vertex that of a body or a smooth surface, on a held one that of its holder.
+        """
         return np.asarray(self._solver.reactions())
 
     @property
     def contacts(self) -> NDArray[np.int32]:
-        """(V,): body that a vertex touches, or surface, which are counted after the bodies; -1
-        where none.
+        """The body that each vertex touches (V,), or -1.
+
+        Surfaces are counted after the bodies.
         """
         return np.asarray(self._solver.contacts(), dtype=np.int32)
 
@@ -215,14 +219,17 @@ class Cloth:
 
     @property
     def pair_forces(self) -> PairForces:
-        """Forces of pairs of closest points, of cloth and cloth and of cloth and triangles of
-        surfaces, at the end of the last step."""
+        """Forces of pairs of closest points at the end of the last step.
+
+        Of cloth and cloth, and of cloth and triangles of surfaces.
+        """
         return self._solver.pair_forces()
 
     @property
     def surface_forces(self) -> list[Floats]:
-        """Forces of the cloth on the vertices of each surface at the end of the last step: (N, 3)
-        [N].
+        """Forces of the cloth on the vertices of each surface (N, 3) [N].
+
+        At the end of the last step.
         """
         return np.split(
             np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1]
@@ -249,8 +256,7 @@ class Cloth:
         )
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
-        """Prescribe the positions of these vertices (K,) from now on, in place of those held so
-        far.
+        """Prescribe the positions of these vertices (K,) from now on, and let go of all others.
 
         Positions and velocities stay: what is let go flies on as it was moved. `bodies` are those
         of this time.
@@ -298,8 +304,9 @@ class Cloth:
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
     ) -> None:
-        """Take steps until one ends at `end` [s] or later: those of the controller, or of the
-        preset's length.
+        """Take steps until one ends at `end` [s] or later.
+
+        They are those of the controller, or of the preset's length.
 
         Steps depend on where the cloth is, not on how often this is called: `positions_at` has it
         at any time of the last step. Gravity and damping are those at the ends of steps. Where held
@@ -389,7 +396,8 @@ class Cloth:
         return np.asarray(self._solver.momentum_rate() - weight - holders)
 
     def softest(self) -> float:
-        """Return the smallest eigenvalue of stiffness over mass in this state, without contact
-        [1/s^2]; > 0: stable.
+        """Return the smallest eigenvalue of stiffness over mass in this state [1/s^2].
+
+        Contact does not count. The state is stable where it is > 0.
         """
         return float(self._solver.softest(self.positions))

@@ -110,7 +110,7 @@ inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact,
       const float normal = dot3(n, *at);
       *at -= spread(normal) * n;
       *at += spread(contact.turning[i]) * (own - spread(dot3(t, own)) * t) -
-             spread(contact.mu[i] * normal) * t;
+             spread(contact.coupling[i] * normal) * t;
     }
   }
 }

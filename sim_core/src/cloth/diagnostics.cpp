@@ -22,7 +22,7 @@ double sagitta(double radius, double circle) {
 
 }  // namespace
 
-Watch::Watch(const ClothMesh& mesh, const Assembly& assembly)
+StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly)
     : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
   std::vector<int> around(mesh.rest.rows(), 0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
@@ -45,20 +45,20 @@ Watch::Watch(const ClothMesh& mesh, const Assembly& assembly)
   for (std::size_t v = 0; v < cell_.size(); ++v) cell_[v] = std::sqrt(cell_[v] / around[v]);
 }
 
-Observed Watch::see(const StepTaken& step, const Newton& newton) {
-  Observed out;
+DiagnosticExtremes StepDiagnostics::measure(const StepTaken& step, const Newton& newton) {
+  DiagnosticExtremes out;
   out.stretch = largest_stretch(step.x);
   for (std::size_t b = 0; b < step.at_end.size(); ++b) {
     out.depth = std::max(out.depth, depth_in(step.at_end[b], step.x));
     out.passages += passages(step.at_start[b], step.at_end[b], step);
   }
-  see_contacts(step, newton, out);
-  see_energy(step, newton, out);
+  measure_contacts(step, newton, out);
+  measure_energy(step, newton, out);
   return out;
 }
 
 // The larger principal value of F^T F, and its root.
-double Watch::largest_stretch(const Buffer<double>& x) const {
+double StepDiagnostics::largest_stretch(const Buffer<double>& x) const {
   double largest = 0.0;
   const int* node = nodes_.data();
   for (const double* inverse = inverse_.data(); inverse != inverse_.data() + inverse_.size();
@@ -75,7 +75,7 @@ double Watch::largest_stretch(const Buffer<double>& x) const {
 
 // Where a body is rounder than the triangles, its depth is that of the vertices; else between them,
 // too.
-double Watch::depth_in(const Body& body, const Buffer<double>& x) const {
+double StepDiagnostics::depth_in(const Body& body, const Buffer<double>& x) const {
   double deepest = 0.0;
   const Numbering& numbering = assembly_.numbering;
   for (int i = 0; i < numbering.vertices; ++i) {
@@ -98,8 +98,8 @@ double Watch::depth_in(const Body& body, const Buffer<double>& x) const {
   return deepest;
 }
 
-void Watch::refuse_inside(const Body& body, int number, double inside,
-                          const Buffer<double>& x) const {
+void StepDiagnostics::refuse_inside(const Body& body, int number, double inside,
+                                    const Buffer<double>& x) const {
   const Numbering& numbering = assembly_.numbering;
   for (std::size_t t = 0; t < nodes_.size(); t += 3) {
     const int* node = &nodes_[t];
@@ -115,7 +115,7 @@ void Watch::refuse_inside(const Body& body, int number, double inside,
 }
 
 // No triangle comes to a core unless it is as large as the body is thick, or goes as far in a step.
-int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) const {
+int StepDiagnostics::passages(const Body& begin, const Body& end, const StepTaken& step) const {
   const Core core = core_of(end);
   if (!std::isfinite(core.radius)) return 0;
   const Numbering& numbering = assembly_.numbering;
@@ -124,9 +124,10 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
   for (int i = 0; i < numbering.vertices; ++i) {
     const Vector3d from = at_node(step.start, numbering.node[i]),
                    to = at_node(step.x, numbering.node[i]);
-    double way = (to - from - shift).squaredNorm();
-    if (turned > 0.0) way = std::pow(std::sqrt(way) + turned * (from - begin.origin).norm(), 2);
-    farthest = std::max(farthest, way);
+    double displacement = (to - from - shift).squaredNorm();
+    if (turned > 0.0)
+      displacement = std::pow(std::sqrt(displacement) + turned * (from - begin.origin).norm(), 2);
+    farthest = std::max(farthest, displacement);
   }
   if (std::sqrt(farthest) + circle_ < core.radius) return 0;
   const Matrix3d before = (begin.rotation * core.axes).transpose(),
@@ -145,55 +146,58 @@ int Watch::passages(const Body& begin, const Body& end, const StepTaken& step) c
 
 // Of each node that touches a body, the work R . (change of gap n + slip): contact only takes
 // energy from the motion against a body. The gap's change stands for the normal part of the motion,
-// for a round face turns on the way. On a fillet, n = sum w_i n_i, it is sum w_i times those of the
-// gaps.
-void Watch::see_contacts(const StepTaken& step, const Newton& newton, Observed& out) const {
+// for a round face turns on the way. On a fillet, n = sum w_i n_i, it is sum w_i times
+// those of the gaps.
+void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newton,
+                                       DiagnosticExtremes& out) const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const int b = newton.contact.touched[i];
     if (b < 0 || b >= static_cast<int>(step.at_end.size())) continue;
     const Vector3d from = at_node(step.start, i), to = at_node(step.x, i),
                    force = at_node(newton.residual, i);
-    Bearing on = newton.contact.bearing(step.at_end, to);
+    BodyContact on = newton.contact.body_contact(step.at_end, to);
     if (on.body != b) on = {gap_of(step.at_end[b], to), b};
     if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
     // The change of a gap, and the share of its normal.
-    const Vector2d way = on.mean([&](int body) -> Vector2d {
+    const Vector2d displacement = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
       return {gap.distance - gap_of(step.at_start[body], from).distance,
               gap.normal.dot(on.gap.normal)};
     });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
-    out.contact_work += std::max(0.0, force.dot(way[0] / way[1] * on.gap.normal + slip));
+    out.contact_work +=
+        std::max(0.0, force.dot(displacement[0] / displacement[1] * on.gap.normal + slip));
   }
 }
 
 // What the energy of motion and strain gains beyond the work of gravity and of what holds, bears
 // and rubs the cloth.
-void Watch::see_energy(const StepTaken& step, const Newton& newton, Observed& out) {
+void StepDiagnostics::measure_energy(const StepTaken& step, const Newton& newton,
+                                     DiagnosticExtremes& out) {
   const Numbering& numbering = assembly_.numbering;
   double kinetic = 0.0, weight = 0.0, forces = 0.0, sizes = 0.0;
   const auto add = [&](double work) { forces += work, sizes += std::abs(work); };
-  const auto way_of = [&](int node) -> Vector3d {
+  const auto displacement_of = [&](int node) -> Vector3d {
     return at_node(step.x, node) - at_node(step.start, node);
   };
-  for (int i = 0; i < numbering.nodes - numbering.bones; ++i) {
-    const Vector3d way = way_of(i);
-    add(way.dot(at_node(newton.residual, i)));
+  for (int i = 0; i < numbering.nodes - numbering.capsule_points; ++i) {
+    const Vector3d displacement = displacement_of(i);
+    add(displacement.dot(at_node(newton.residual, i)));
     const int vertex = numbering.vertex[i];
     if (vertex >= numbering.vertices) continue;
     kinetic += 0.5 * assembly_.mass[i] * at_node(step.v, i).squaredNorm();
-    weight += assembly_.mass[i] * step.gravity.row(vertex).dot(way);
+    weight += assembly_.mass[i] * step.gravity.row(vertex).dot(displacement);
   }
   if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts
                        // is what cloth gets
     for (const Pair& pair : newton.pairs->list()) {
-      if (!newton.pairs->bone_of(pair.who)) continue;
-      Vector3d way = Vector3d::Zero();
+      if (!newton.pairs->capsule_of(pair.stencil)) continue;
+      Vector3d displacement = Vector3d::Zero();
       for (int c = 0; c < 4; ++c) {
-        if (pair.who.node[c] < numbering.nodes - numbering.bones)
-          way += pair.weights[c] * way_of(pair.who.node[c]);
+        if (pair.stencil.node[c] < numbering.nodes - numbering.capsule_points)
+          displacement += pair.weights[c] * displacement_of(pair.stencil.node[c]);
       }
-      add(way.dot(pair.contact.force));
+      add(displacement.dot(pair.contact.force));
     }
   }
   const double energy = kinetic + assembly_.membrane_energy + assembly_.bending_energy;
