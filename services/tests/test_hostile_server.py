@@ -335,7 +335,7 @@ def test_a_file_of_a_hidden_folder(
     [
         (2**31, True, "is larger than 32 bytes can be"),
         (2**24, True, "decodes to 16777216 bytes, and 32 are expected"),
-        (2**24, False, "decodes to None bytes, and 32 are expected"),
+        (2**24, False, "decodes to an unstated number of bytes, and 32 are expected"),
     ],
 )
 def test_a_label_that_decodes_to_gigabytes(

@@ -84,7 +84,10 @@ def decode_chunk(chunk: bytes, out: np.ndarray | None = None) -> bytes | np.ndar
     size = _content_size(frame)
     # The decoder would fill a part of `out` and leave the rest as it was, without a word.
     if out is not None and size != out.nbytes:
-        raise CorruptChunkError(f"the chunk decodes to {size} bytes, and {out.nbytes} are expected")
+        stated = "an unstated number of" if size is None else size
+        raise CorruptChunkError(
+            f"the chunk decodes to {stated} bytes, and {out.nbytes} are expected"
+        )
     return Zstd().decode(frame, out)  # type: ignore[no-any-return]  # untyped library
 
 
