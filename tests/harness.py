@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import zarr
-from stickslip_workers.cluster import own_directory
+from stickslip_workers.cluster import head_directory
 from zarr.abc.store import Store as ZarrStore
 
 T = TypeVar("T")
@@ -143,7 +143,7 @@ class Service:
         """Return all processes that hold a file below the data directory open, or name it: ours,
         alive or orphaned.
         """
-        places = (str(self.data), str(own_directory(self.data)))
+        places = (str(self.data), str(head_directory(self.data)))
         return [
             pid
             for pid in pids()

@@ -26,7 +26,7 @@ from stickslip_schemas.kinds.rod_hang import RodHangSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.store import DirectoryStore
 from stickslip_testing.samples import samples
-from stickslip_workers.cluster import Place, own_directory
+from stickslip_workers.cluster import RayCluster, head_directory
 from stickslip_workers.stages.pack import pack
 from stickslip_workers.stages.publish import publish
 from stickslip_workers.stages.run import encode_records
@@ -161,7 +161,7 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
     return make
 
 
-class Connected(Place):
+class Connected(RayCluster):
     """A place of which this process is a driver already."""
 
     def connect(self) -> None:
@@ -169,9 +169,9 @@ class Connected(Place):
 
 
 @pytest.fixture(scope="session")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayCluster]:
     """A Ray of two CPUs for all tests, with `fake_renderer` in reach of its processes."""
-    directory = own_directory(tmp_path_factory.mktemp("ray"))
+    directory = head_directory(tmp_path_factory.mktemp("ray"))
     command = "from pathlib import Path; from stickslip_workers.cluster import run_head; "
     command += f"run_head(Path('{directory}'), 2)"
     with pytest.MonkeyPatch.context() as patch:
@@ -179,7 +179,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
         with subprocess.Popen([sys.executable, "-c", command], stdout=subprocess.DEVNULL) as head:
             try:
                 place = Connected(directory)
-                Place.connect(place)
+                RayCluster.connect(place)
                 yield place
             finally:
                 import ray

@@ -17,7 +17,7 @@ from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTas
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
 from stickslip_schemas.store import DirectoryStore
-from stickslip_workers.cluster import Place
+from stickslip_workers.cluster import RayCluster
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.lease_client import CoordinatorError
 from stickslip_workers.ray_calls import StartError
@@ -32,7 +32,7 @@ pytestmark = [
 class Running:
     """A dispatcher in a thread."""
 
-    def __init__(self, settings: Settings, cluster: Place) -> None:
+    def __init__(self, settings: Settings, cluster: RayCluster) -> None:
         self.dispatcher = Dispatcher(settings, cluster)
         self.error: BaseException | None = None
         self._thread = threading.Thread(target=self._run)
@@ -80,7 +80,7 @@ def _settings(double: CoordinatorDouble, store: DirectoryStore, **changes: Any) 
 
 
 @pytest.fixture
-def start(double: CoordinatorDouble, store: DirectoryStore, cluster: Place) -> Iterator[Start]:
+def start(double: CoordinatorDouble, store: DirectoryStore, cluster: RayCluster) -> Iterator[Start]:
     """Start a dispatcher; it is stopped after the test."""
     store.root.mkdir()
     started: list[Running] = []

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import httpx
 import pytest
 import zarr
-from stickslip_workers.cluster import own_directory
+from stickslip_workers.cluster import head_directory
 from stickslip_workers.settings import default_blender_python
 
 pytest.importorskip("stickslip_services")
@@ -117,7 +117,7 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 def _processes() -> list[int]:
     """Return the processes of the Ray of the dispatchers."""
-    place, found = str(own_directory(Path(NAME))), []
+    place, found = str(head_directory(Path(NAME))), []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
             if entry.name.isdigit() and place in (entry / "cmdline").read_text(errors="replace"):

@@ -16,7 +16,7 @@ from stickslip_schemas.documents.worker_api import (
     WorkerSession,
 )
 from stickslip_schemas.kinds.rod_hang import RodHangSimulation
-from stickslip_workers.lease_client import Backoff, CoordinatorError, LeaseBook, Session
+from stickslip_workers.lease_client import Backoff, CoordinatorError, LeaseTable, Session
 
 
 def test_the_back_off_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,45 +85,45 @@ def _lease(token: int) -> Lease:
 
 
 def test_a_late_drop_spares_a_newer_lease() -> None:
-    book = LeaseBook()
-    book.add([_lease(1)])
-    said = book.states()
-    book.add([_lease(2)])
-    book.remove(said)
-    assert book.holds(_lease(2))
-    assert not book.holds(_lease(1))
-    book.remove(book.states())
-    assert book.states() == ()
+    table = LeaseTable()
+    table.add([_lease(1)])
+    said = table.states()
+    table.add([_lease(2)])
+    table.remove(said)
+    assert table.holds(_lease(2))
+    assert not table.holds(_lease(1))
+    table.remove(table.states())
+    assert table.states() == ()
 
 
 def test_started_is_said_and_a_reported_lease_forgotten() -> None:
-    book = LeaseBook()
-    book.add([_lease(1)])
-    assert [state.started for state in book.states()] == [False]
-    book.note([_lease(1)], started=True)
-    assert [state.started for state in book.states()] == [True]
-    book.note([_lease(7)], started=False)
-    book.remove([_lease(7)])
-    assert [state.started for state in book.states()] == [True]
-    book.remove([_lease(1)])
-    book.note([_lease(1)], started=True)
-    assert book.states() == ()
+    table = LeaseTable()
+    table.add([_lease(1)])
+    assert [state.started for state in table.states()] == [False]
+    table.update([_lease(1)], started=True)
+    assert [state.started for state in table.states()] == [True]
+    table.update([_lease(7)], started=False)
+    table.remove([_lease(7)])
+    assert [state.started for state in table.states()] == [True]
+    table.remove([_lease(1)])
+    table.update([_lease(1)], started=True)
+    assert table.states() == ()
 
 
 def test_a_result_goes_with_its_lease() -> None:
-    book, result = (
-        LeaseBook(),
+    table, result = (
+        LeaseTable(),
         TaskResult(outcome="failed", reason=Reason.internal_error, message=""),
     )
-    book.add([_lease(1)])
-    book.settle(_lease(7), result)  # not held
-    assert book.reports() == ()
-    book.settle(_lease(1), result)
-    book.give_back(started=True)  # it has a result
-    assert [(report.token, report.result) for report in book.reports()] == [(1, result)]
-    book.add([_lease(2)])
-    assert book.reports() == ()
-    book.give_back(started=False)
-    assert [(report.token, report.result) for report in book.reports()] == [(2, None)]
-    book.remove(book.reports())
-    assert book.states() == ()
+    table.add([_lease(1)])
+    table.put_result(_lease(7), result)  # not held
+    assert table.reports() == ()
+    table.put_result(_lease(1), result)
+    table.return_unfinished(started=True)  # it has a result
+    assert [(report.token, report.result) for report in table.reports()] == [(1, result)]
+    table.add([_lease(2)])
+    assert table.reports() == ()
+    table.return_unfinished(started=False)
+    assert [(report.token, report.result) for report in table.reports()] == [(2, None)]
+    table.remove(table.reports())
+    assert table.states() == ()

@@ -116,9 +116,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _head(options: argparse.Namespace) -> int:
-    from stickslip_workers.cluster import own_directory, run_head
+    from stickslip_workers.cluster import head_directory, run_head
 
-    run_head(own_directory(options.ray_data), options.cpus)
+    run_head(head_directory(options.ray_data), options.cpus)
     return 0
 
 
@@ -167,7 +167,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         # Not resolved: a virtual environment is known by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
-    from stickslip_workers.cluster import Place, own_directory
+    from stickslip_workers.cluster import RayCluster, head_directory
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.ray_calls import StartError
 
@@ -179,9 +179,9 @@ def _dispatch(options: argparse.Namespace) -> int:
         # It ends after this process: Ray aborts a driver whose head ends at the same time.
         subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
     if data is None:
-        place = Place(address or "")
+        cluster = RayCluster(address or "")
     else:
-        place = Place(own_directory(data), log=data / "logs" / "ray.log")
+        cluster = RayCluster(head_directory(data), log=data / "logs" / "ray.log")
     dispatcher: Dispatcher | None = None
 
     def stop(number: int, _frame: object) -> None:
@@ -191,7 +191,7 @@ def _dispatch(options: argparse.Namespace) -> int:
             raise SystemExit(0)
 
     try:
-        dispatcher = Dispatcher(settings, place)
+        dispatcher = Dispatcher(settings, cluster)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, stop)
         dispatcher.run()

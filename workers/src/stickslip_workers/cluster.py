@@ -1,6 +1,4 @@
-"""The Ray cluster, of which the dispatcher is a driver, and a head for one machine, as `stickslip
-up` has it.
-"""
+"""The Ray cluster that the dispatcher drives, and a head for one machine, for `stickslip up`."""
 
 import contextlib
 import logging
@@ -30,10 +28,10 @@ RETRY_SECONDS = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a cluster is: at an address, or that of the head which `run_head` runs in a directory."""
+class RayCluster:
+    """A cluster at an address, or the one whose head `run_head` runs in a directory."""
 
-    where: str | Path
+    location: str | Path
     log: Path | None = None
     """Log of the head, if `stickslip up` runs it."""
 
@@ -43,10 +41,10 @@ class Place:
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_ENABLE_AUTO_CONNECT": "0",
         }  # a late call starts no cluster
-        if isinstance(self.where, Path):
+        if isinstance(self.location, Path):
             # With 0, Ray does not take another address of this machine for loopback.
             os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
-            os.environ["RAY_AUTH_TOKEN_PATH"] = str(self.where / "token")
+            os.environ["RAY_AUTH_TOKEN_PATH"] = str(self.location / "token")
             seconds = OWN_RECONNECT_SECONDS
         else:  # `ray start` infers the mode from a token, `ray.init` does not
             has_token = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys()
@@ -58,9 +56,9 @@ class Place:
         while True:
             try:
                 address = (
-                    self.where
-                    if isinstance(self.where, str)
-                    else (self.where / "address").read_text()
+                    self.location
+                    if isinstance(self.location, str)
+                    else (self.location / "address").read_text()
                 )
                 host, _, port = address.rpartition(":")
                 if host:  # Ray itself would wait for long where nobody listens
@@ -73,22 +71,22 @@ class Place:
                     )  # Ray has put its own in place, which exits at once
                 return
             except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-                log.info("no Ray at %s yet: %s", self.where, error)
+                log.info("no Ray at %s yet: %s", self.location, error)
                 ray.shutdown()
                 time.sleep(RETRY_SECONDS)
 
-    def trouble(self) -> str:
-        """Return what its files say about a head that does not answer, or where it should be."""
-        if isinstance(self.where, str):
-            return f"none answers at {self.where}"
-        logs = self.where / "session_latest" / "logs"
+    def describe_problem(self) -> str:
+        """Return what the files of a head that does not answer say, or the address."""
+        if isinstance(self.location, str):
+            return f"none answers at {self.location}"
+        logs = self.location / "session_latest" / "logs"
         # A head that does not even start its processes says why in its own output only.
         paths = [logs / name for name in ("raylet.err", "raylet.out", "gcs_server.out")]
         for path in [*paths, *filter(None, [self.log])]:
             with contextlib.suppress(OSError):  # a head that starts again removes them
                 if lines := path.read_text(errors="replace").split("\n")[:-1]:
                     return f"last line of {path}: {lines[-1][:300]}"
-        return f"it has not written to {self.where} yet"
+        return f"it has not written to {self.location} yet"
 
 
 SETTINGS = {
@@ -113,7 +111,7 @@ SETTINGS = {
 """Settings of a head for one machine."""
 
 
-def own_directory(data: Path) -> Path:
+def head_directory(data: Path) -> Path:
     """Return the directory of the head of a data directory.
 
     Sockets below it must have paths of at most 107 bytes.

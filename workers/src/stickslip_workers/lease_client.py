@@ -1,6 +1,4 @@
-"""The client of the worker API: requests and the back-off between them, the leases held, and their
-heartbeat.
-"""
+"""The client of the worker API: requests, the back-off, the leases held and their heartbeat."""
 
 import contextlib
 import logging
@@ -24,17 +22,22 @@ log = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer", bound=BaseModel)
 
-PROMPT = httpx.Timeout(30, connect=5)
-PATIENT = httpx.Timeout(300, connect=5)
-"""Timeout of a lease and a report: for a version of a million samples, the coordinator lists or
-checks all files.
-"""
+SHORT_TIMEOUT = httpx.Timeout(30, connect=5)
+"""Timeout of a registration and a heartbeat [s], which do little."""
+
+LONG_TIMEOUT = httpx.Timeout(300, connect=5)
+"""Timeout of a lease and a report [s].
+
+For a version of a million samples, the coordinator lists or checks all files."""
 
 REPORTS_A_REQUEST = 512
+"""The most results in a request: a few MB, which the coordinator stores in one transaction."""
 
 REPORT_SECONDS = 1.0
-"""How long a result waits for others to be reported with, while there is other work to go on with.
-"""
+"""How long a result waits for others to be reported with, while there is other work [s]."""
+
+HEARTBEATS_A_LEASE = 3
+"""Heartbeats in the duration of a lease: two may be lost before it ends."""
 
 START_BEAT_SECONDS = 2.0
 """Time between two heartbeats of a dispatcher that starts, which tell how far it is [s]."""
@@ -44,8 +47,9 @@ LAST_BEAT_SECONDS = 5.0
 
 
 class CoordinatorError(Exception):
-    """The coordinator refuses this dispatcher: a newer one has its name, or a request would fail
-    every time.
+    """The coordinator refuses this dispatcher.
+
+    A newer one has its name, or a request would fail every time.
     """
 
 
@@ -71,26 +75,30 @@ class CoordinatorClient:
     def __init__(
         self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None
     ) -> None:
+        headers = {"Content-Type": "application/json"}
+        if key is not None:
+            headers["Authorization"] = f"Bearer {key}"
         # trust_env=False: the coordinator is not reached through a proxy of the environment.
-        headers = {"Content-Type": "application/json"} | (
-            {} if key is None else {"Authorization": f"Bearer {key}"}
-        )
         verify = True if tls_certificate is None else pinned(tls_certificate)
         self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
         self._urls = deque(url.rstrip("/") for url in urls)
         """Of coordinators with one database; the first one is asked."""
 
     def register(self, registration: api.WorkerRegistration) -> api.WorkerSession:
+        """Open a session; raise CoordinatorError."""
         return self._post("/v1/workers", registration, api.WorkerSession)
 
     def lease(self, request: api.LeaseRequest) -> api.LeaseBatch:
-        return self._post("/v1/worker/lease", request, api.LeaseBatch, timeout=PATIENT)
+        """Lease tasks; raise CoordinatorError."""
+        return self._post("/v1/worker/lease", request, api.LeaseBatch, timeout=LONG_TIMEOUT)
 
     def heartbeat(self, heartbeat: api.Heartbeat) -> api.HeartbeatAnswer:
+        """Renew leases; raise CoordinatorError."""
         return self._post("/v1/worker/heartbeat", heartbeat, api.HeartbeatAnswer)
 
     def report(self, reports: api.ReportBatch) -> api.ReportAnswer:
-        return self._post("/v1/worker/report", reports, api.ReportAnswer, timeout=PATIENT)
+        """Report results; raise CoordinatorError."""
+        return self._post("/v1/worker/report", reports, api.ReportAnswer, timeout=LONG_TIMEOUT)
 
     def close(self) -> None:
         self._http.close()
@@ -101,7 +109,7 @@ class CoordinatorClient:
         document: BaseModel,
         answer: type[Answer],
         *,
-        timeout: httpx.Timeout = PROMPT,
+        timeout: httpx.Timeout = SHORT_TIMEOUT,
     ) -> Answer:
         url = self._urls[0]
         try:
@@ -109,7 +117,8 @@ class CoordinatorClient:
                 url + path, content=document.model_dump_json(), timeout=timeout
             )
         except httpx.TransportError as error:
-            if self._urls[0] == url:  # no other thread has turned from it
+            # The next one is asked, unless another thread has turned from this one already.
+            if self._urls[0] == url:
                 self._urls.rotate(-1)
             raise UnreachableError(f"{url}{path}: {type(error).__name__}: {error}") from error
         if response.status_code >= 500 or response.status_code == 429:
@@ -122,35 +131,69 @@ class CoordinatorClient:
 
 
 class Backoff:
-    """Doubles the wait after each failure, with jitter so that many dispatchers do not return at
-    once.
+    """Doubles the wait after each failure.
+
+    It has jitter, so that many dispatchers do not return at once.
     """
 
     def __init__(self, *, first: float = 0.2, most: float = 5.0) -> None:
-        self._first, self._most, self._delay = first, most, first
+        self._first = first
+        self._most = most
+        self._delay = first
         self.next_try = 0.0
         """Earliest time of the next attempt, on the monotonic clock [s]."""
 
     def failed(self) -> float:
-        """Note a failure and double the wait; return it [s]."""
+        """Record a failure and double the wait; return it [s]."""
         delay = self._delay * random.uniform(0.5, 1.0)
         self._delay = min(2 * self._delay, self._most)
         self.next_try = time.monotonic() + delay
         return delay
 
     def succeeded(self) -> None:
-        self._delay, self.next_try = self._first, 0.0
+        """Allow the next attempt at once."""
+        self._delay = self._first
+        self.next_try = 0.0
 
 
-class LeaseBook:
-    """The leases that the dispatcher holds, and the results that wait to be reported. Thread-safe."""
+class Outbox:
+    """The results that wait to be reported, by task. `LeaseTable` locks it."""
+
+    def __init__(self) -> None:
+        self._reports: dict[str, api.Report] = {}
+        self.report_at = math.inf
+        """When to report at the latest, on the monotonic clock [s]; inf without a result."""
+
+    def put(self, report: api.Report) -> None:
+        """Add a report, in place of an older one of the same task."""
+        self.report_at = min(self.report_at, time.monotonic() + REPORT_SECONDS)
+        self._reports[report.task_id] = report
+
+    def drop(self, task_id: str) -> None:
+        """Remove the report of a task, if there is one."""
+        self._reports.pop(task_id, None)
+
+    def has_report(self, task_id: str) -> bool:
+        """Return whether a report of a task waits."""
+        return task_id in self._reports
+
+    def reports(self) -> tuple[api.Report, ...]:
+        """Return all reports that wait."""
+        return tuple(self._reports.values())
+
+
+class LeaseTable:
+    """The leases that the dispatcher holds, and the outbox of their results. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._states: dict[str, api.LeaseState] = {}
-        self._reports: dict[str, api.Report] = {}
-        self.due = math.inf
-        """When to report at the latest."""
+        self._outbox = Outbox()
+
+    @property
+    def report_at(self) -> float:
+        """When to report at the latest, on the monotonic clock [s]; inf without a result."""
+        return self._outbox.report_at
 
     def add(self, leases: Iterable[api.Lease]) -> None:
         """Add leases; they take the place of older ones of the same tasks."""
@@ -159,10 +202,11 @@ class LeaseBook:
                 self._states[lease.task_id] = api.LeaseState(
                     task_id=lease.task_id, token=lease.token, started=False
                 )
-                self._reports.pop(lease.task_id, None)
+                # A result of the older lease would be refused as stale.
+                self._outbox.drop(lease.task_id)
 
-    def note(self, leases: Iterable[api.Lease], **changes: object) -> None:
-        """Note that tasks have `started`, or their `frames`: (frames done, frames total)."""
+    def update(self, leases: Iterable[api.Lease], **changes: object) -> None:
+        """Record that tasks have `started`, or their `frames`: (frames done, frames total)."""
         with self._lock:
             for lease in leases:
                 if self.holds(lease):
@@ -170,20 +214,20 @@ class LeaseBook:
                         update=changes
                     )
 
-    def settle(self, lease: api.Lease | api.LeaseState, result: TaskResult | None) -> None:
-        """Keep the result of a lease that is still held, or its return, until it is reported."""
+    def put_result(self, lease: api.Lease | api.LeaseState, result: TaskResult | None) -> None:
+        """Put the result of a lease that is still held, or its return, into the outbox."""
         with self._lock:
             if self.holds(lease):
-                self.due = min(self.due, time.monotonic() + REPORT_SECONDS)
-                self._reports[lease.task_id] = api.Report(
-                    task_id=lease.task_id, token=lease.token, result=result
+                self._outbox.put(
+                    api.Report(task_id=lease.task_id, token=lease.token, result=result)
                 )
 
-    def give_back(self, *, started: bool) -> None:
+    def return_unfinished(self, *, started: bool) -> None:
         """Return the leases that have no result, those of started tasks only if `started`."""
         for state in self.states():
-            if state.task_id not in self._reports and (started or not state.started):
-                self.settle(state, None)
+            is_returned = started or not state.started
+            if is_returned and not self._outbox.has_report(state.task_id):
+                self.put_result(state, None)
 
     def remove(self, leases: Iterable[api.Lease | api.LeaseState | api.Report]) -> None:
         """Remove leases; newer ones of the same tasks stay."""
@@ -191,26 +235,34 @@ class LeaseBook:
             for lease in leases:
                 if self.holds(lease):
                     del self._states[lease.task_id]
-                    self._reports.pop(lease.task_id, None)
+                    self._outbox.drop(lease.task_id)
+
+    def remove_reported(self, reports: Iterable[api.Report]) -> None:
+        """Remove the leases of reports that the coordinator has answered."""
+        self.remove(reports)
+        self._outbox.report_at = math.inf
 
     def holds(self, lease: api.Lease | api.LeaseState | api.Report) -> bool:
+        """Return whether a lease is held, and no newer one of its task."""
         state = self._states.get(lease.task_id)
         return state is not None and state.token == lease.token
 
     def states(self) -> tuple[api.LeaseState, ...]:
+        """Return the states of all leases."""
         with self._lock:
             return tuple(self._states.values())
 
     def reports(self) -> tuple[api.Report, ...]:
+        """Return the results that wait to be reported."""
         with self._lock:
-            return tuple(self._reports.values())
+            return self._outbox.reports()
 
 
 class Session(threading.Thread):
-    """Registers the dispatcher, and renews its leases three times in the duration of a lease, and
-    more often at the start.
+    """Registers the dispatcher, and renews its leases by heartbeats.
 
-    It is a daemon and never keeps the process alive.
+    It sends three heartbeats in the duration of a lease, and more at the start. It is a daemon and
+    never keeps the process alive.
     """
 
     def __init__(
@@ -219,11 +271,13 @@ class Session(threading.Thread):
         super().__init__(name="session", daemon=True)
         self._coordinator = coordinator
         self._registration = registration
-        self.book = LeaseBook()
+        self.leases = LeaseTable()
         self._worker_id = ""
         self._interval = 0.0
-        self._wanted, self._opened = 1, 0
-        """How many sessions there should have been, and the number of the one that is open."""
+        self._requested_sessions = 1
+        """How many sessions there should have been."""
+        self._open_session = 0
+        """The number of the session that is open; 0 before the first."""
         self._ended = False
         self._wake = threading.Event()
         self.error: CoordinatorError | None = None
@@ -234,57 +288,58 @@ class Session(threading.Thread):
         """The worker that this dispatcher is to the coordinator; None while no session is open."""
         if self.error is not None:
             raise self.error
-        return self._worker_id if self._opened == self._wanted else None
+        is_open = self._open_session == self._requested_sessions
+        return self._worker_id if is_open else None
 
-    def renew(self) -> None:
-        """Register anew: the coordinator does not know the session, or the dispatcher has more to
-        say about itself.
+    def register_again(self) -> None:
+        """Register anew at the next heartbeat.
+
+        The coordinator does not know the session, or the dispatcher has more to say about itself.
         """
-        self._wanted += 1
+        self._requested_sessions += 1
         self._wake.set()
 
-    def beat(self) -> float:
-        """Send one heartbeat; return when the next one is due [s]."""
-        states, condition = self.book.states(), self._registration().condition
+    def send_heartbeat(self) -> float:
+        """Send one heartbeat; return the time until the next one [s]."""
+        states = self.leases.states()
+        condition = self._registration().condition
         message = api.Heartbeat(worker_id=self._worker_id, leases=states, condition=condition)
-        if drop := set(self._coordinator.heartbeat(message).drop):
-            log.info("dropping %d tasks", len(drop))
-            self.book.remove(state for state in states if state.task_id in drop)
-        return (
-            self._interval
-            if condition.state == "ready"
-            else min(START_BEAT_SECONDS, self._interval)
-        )
+        dropped = set(self._coordinator.heartbeat(message).drop)
+        if dropped:
+            log.info("dropping %d tasks", len(dropped))
+            self.leases.remove(state for state in states if state.task_id in dropped)
+        # People watch a worker that starts, so it tells more often how far it is.
+        if condition.state == "ready":
+            return self._interval
+        return min(START_BEAT_SECONDS, self._interval)
 
     def report(self, worker_id: str) -> bool:
         """Send all results that wait; return whether there were any."""
-        reports = self.book.reports()
+        reports = self.leases.reports()
         for first in range(0, len(reports), REPORTS_A_REQUEST):
             batch = reports[first : first + REPORTS_A_REQUEST]
-            for verdict in self._coordinator.report(
-                api.ReportBatch(worker_id=worker_id, reports=batch)
-            ).verdicts:
+            answer = self._coordinator.report(api.ReportBatch(worker_id=worker_id, reports=batch))
+            for verdict in answer.verdicts:
                 if verdict.verdict == "stale":
                     log.warning(
                         "the report of task %s came too late and was refused", verdict.task_id
                     )
-            self.book.remove(batch)
-        self.book.due = math.inf
+            self.leases.remove(batch)
+        self.leases.remove_reported(reports)
         return bool(reports)
 
-    def tell(self) -> None:
-        """Let the coordinator know at once how the dispatcher is."""
+    def wake_heartbeat(self) -> None:
+        """Send the next heartbeat at once: the coordinator should know how the dispatcher is."""
         self._wake.set()
 
     def close(self) -> None:
-        """Give all leases back and say why it ends, if the coordinator listens, and end the
-        session.
-        """
-        self.book.give_back(started=True)
+        """End the session: return all leases and say why, if the coordinator answers."""
+        self.leases.return_unfinished(started=True)
         with contextlib.suppress(CoordinatorError):
-            if (worker_id := self.worker_id) is not None:
+            worker_id = self.worker_id
+            if worker_id is not None:
                 self.report(worker_id)
-                self.beat()
+                self.send_heartbeat()
         self._ended = True
         self._wake.set()
         self.join(LAST_BEAT_SECONDS)  # a heartbeat in progress may end first
@@ -295,18 +350,19 @@ class Session(threading.Thread):
         backoff = Backoff()
         while not self._ended:
             try:
-                if self._opened != self._wanted:
+                if self._open_session != self._requested_sessions:
                     self._open()
-                wait = self.beat()
+                wait = self.send_heartbeat()
                 backoff.succeeded()
             except UnknownWorkerError:
-                self.renew()
+                self.register_again()
                 continue
             except UnreachableError as error:
                 log.warning("the coordinator is away: %s", error)
                 wait = backoff.failed()
+            # The dispatcher finds it in `error`, which `worker_id` raises.
             except CoordinatorError as error:
-                log.error("the coordinator refuses this dispatcher: %s", error)
+                log.exception("the coordinator refuses this dispatcher")
                 self.error = error
                 return
             self._wake.wait(wait)
@@ -315,14 +371,13 @@ class Session(threading.Thread):
     def _open(self) -> None:
         """Register.
 
-        What was leased in an earlier session is lost; the coordinator gives it out again.
+        The leases of an earlier session are lost; the coordinator gives their tasks out again.
         """
-        wanted = self._wanted
+        # Another thread may ask for yet another session meanwhile, which is opened next.
+        requested = self._requested_sessions
         session = self._coordinator.register(self._registration())
-        self.book.remove(self.book.states())
-        self._worker_id, self._interval, self._opened = (
-            session.worker_id,
-            session.lease_seconds / 3,
-            wanted,
-        )
+        self.leases.remove(self.leases.states())
+        self._worker_id = session.worker_id
+        self._interval = session.lease_seconds / HEARTBEATS_A_LEASE
+        self._open_session = requested
         log.info("registered as %s", session.worker_id)
