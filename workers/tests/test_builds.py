@@ -72,7 +72,9 @@ from stickslip_workers.builds import kind
 for name in KINDS:
     kind(name)
 import stickslip_sim_core
-print("\\n".join(m.__file__ for n, m in list(sys.modules.items()) if n.startswith("stickslip_") and m.__file__))
+for name, module in list(sys.modules.items()):
+    if name.startswith("stickslip_") and module.__file__:
+        print(module.__file__)
 """
 
 

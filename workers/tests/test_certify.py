@@ -20,7 +20,7 @@ LITTLE = {"rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512}}
 
 @pytest.fixture
 def presets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two presets that are quick to certify: one that passes, one whose second protocol breaks off."""
+    """Two presets that are quick to certify; the second protocol of one breaks off."""
     made = {
         "good": Certification(
             ("rod-lateral-buckling", "rod-cantilever"),

@@ -178,15 +178,16 @@ def test_a_run_that_is_not_valid_is_rejected_with_the_reason_of_the_core(
     assert (result.outcome, result.reason) == ("rejected", Reason.stretch)
     worst = ", ".join(f"{check.name} 0" for check in checks.CHECKS)
     assert result.message == (
-        f"stretch: must be at most 1.25, got 2.5; worst values: {worst} at material = gray-interlock, density = 1, "
-        "bending = 1, stretching = 1, mu = 0.25, preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
+        f"stretch: must be at most 1.25, got 2.5; worst values: {worst} at "
+        "material = gray-interlock, density = 1, bending = 1, stretching = 1, mu = 0.25, "
+        "preset = fast, mesh = 5, frames = 300, seed = 7, self_friction = 0.5"
     )
     assert not (store.root / "artifacts").exists()
 
 
 @dataclass
 class Clips:
-    """A dataset of 3 trajectories x 2 textures before it is packed, and what its arrays must hold."""
+    """A dataset of 3 trajectories x 2 textures before it is packed, and its expected arrays."""
 
     spec: ClothDragSpec
     pack_tasks: list[PackTask]

@@ -1,5 +1,6 @@
 """The dispatcher on Ray, with a coordinator and a renderer of test doubles."""
 
+import logging
 import os
 import signal
 import sys
@@ -34,23 +35,24 @@ class Running:
 
     def __init__(self, settings: Settings, cluster: RayCluster) -> None:
         self.dispatcher = Dispatcher(settings, cluster)
-        self.error: BaseException | None = None
+        self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
         try:
             self.dispatcher.run()
-        except BaseException as error:
+        # A test reads the error in another thread.
+        except Exception as error:
+            logging.getLogger(__name__).exception("the dispatcher failed")
             self.error = error
 
     def stop(self) -> None:
         self.dispatcher.stop()
         self.join()
-        for one in (
-            self.dispatcher._calls or ()
-        ):  # another driver would end, and with it what it runs
-            ray.cancel(one.reference, force=True)
+        # Another driver would end, and with it what it runs.
+        for call in self.dispatcher._calls or ():
+            ray.cancel(call.reference, force=True)
 
     def join(self) -> None:
         self._thread.join(timeout=180)

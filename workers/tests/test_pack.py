@@ -52,7 +52,7 @@ def test_packing_again_gives_the_same_files(make_dataset: Callable[..., Any]) ->
 
 
 def test_a_rejected_slot_keeps_its_labels(make_dataset: Callable[..., Any]) -> None:
-    """What stages found before the rejection is kept, too; only what no stage could add is missing."""
+    """Labels of stages before the rejection are kept; only those of later stages are missing."""
     made = make_dataset(count=4, per_shard=4, rejected=(2,))
     (task,) = made.pack_tasks
     slots = list(task.slots)

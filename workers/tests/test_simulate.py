@@ -1,4 +1,4 @@
-"""Simulate: one artifact a batch, numbers that do not depend on the batch, rejections that say why."""
+"""Simulate: one artifact a batch, the same numbers in any batch, rejections with reasons."""
 
 import io
 from typing import Any

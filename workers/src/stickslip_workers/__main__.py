@@ -19,6 +19,8 @@ from stickslip_schemas.store import open_store, store_place
 from stickslip_workers.lease_client import Backoff, CoordinatorError
 from stickslip_workers.settings import Settings, default_blender_python
 
+log = logging.getLogger(__name__)
+
 FRAMES_SECONDS = 5.0
 """Between two reports of a replay's progress [s]."""
 STEADY_SECONDS = 60.0
@@ -26,25 +28,60 @@ STEADY_SECONDS = 60.0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    blender_python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
-    blender, stored = (
-        argparse.ArgumentParser(add_help=False),
-        argparse.ArgumentParser(add_help=False),
-    )
-    blender.add_argument(
-        "--blender-python", type=Path, default=blender_python, help="default: %(default)s"
-    )
-    stored.add_argument(
-        "--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX"
-    )
+    """Run a command; return its exit status."""
+    options = _parser().parse_args(arguments)
+    if options.command == "dispatch" and not options.once:
+        words = sys.argv[1:] if arguments is None else arguments
+        command = [sys.executable, "-m", "stickslip_workers", *words, "--once"]
+        return run_for_ever(command, Backoff(first=1.0, most=30.0))
+    return int(options.run(options))
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m stickslip_workers", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    both = [stored, blender]
+    _add_dispatch(commands)
 
-    dispatch = commands.add_parser(
-        "dispatch", help="lease tasks from a coordinator and run them on Ray", parents=both
+    head = commands.add_parser(
+        "head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`"
     )
-    urls = "base URL of the coordinator; repeatable, the next where one is away"
+    head.add_argument("--ray-data", type=Path, required=True, help="data directory that it is for")
+    head.add_argument("--cpus", type=int, help="CPUs to use (default: all)")
+    head.set_defaults(run=_head)
+
+    replay = commands.add_parser("replay", help="run one task here, without Ray and coordinator")
+    _add_store_and_blender(replay)
+    replay.add_argument("task", type=Path, help="the task as JSON")
+    replay.set_defaults(run=_replay)
+
+    certify = commands.add_parser(
+        "certify", help="run the physical protocols of a preset with this build"
+    )
+    certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
+    certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json")
+    few = "measure a few points only; such a certificate does not count"
+    certify.add_argument("--quick", action="store_true", help=few)
+    certify.set_defaults(run=_certify)
+
+    preview = commands.add_parser(
+        "preview", help="draw a scene, as `stickslip scene preview` hands it over"
+    )
+    _add_store_and_blender(preview)
+    preview.add_argument("scene", type=Path, help="the scene as JSON")
+    preview.add_argument("--out", type=Path, required=True, help="directory for the pictures")
+    preview.set_defaults(run=_preview)
+
+    describe = commands.add_parser("describe", help="print the builds of this environment")
+    describe.set_defaults(run=_describe)
+    return parser
+
+
+def _add_dispatch(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    dispatch = commands.add_parser(
+        "dispatch", help="lease tasks from a coordinator and run them on Ray"
+    )
+    _add_store_and_blender(dispatch)
+    urls = "base URL of the coordinator; repeatable, the next if one is away"
     dispatch.add_argument("--url", required=True, action="append", help=urls)
     dispatch.add_argument("--name", required=True, help="name of this dispatcher, one per cluster")
     dispatch.add_argument(
@@ -59,60 +96,24 @@ def main(arguments: list[str] | None = None) -> int:
     dispatch.add_argument(
         "--render-gpus", type=float, default=1.0, help="GPUs for a render (default: %(default)s)"
     )
-    where = dispatch.add_mutually_exclusive_group()
-    where.add_argument(
+    cluster = dispatch.add_mutually_exclusive_group()
+    cluster.add_argument(
         "--ray-address",
         help="the Ray cluster (default: RAY_ADDRESS, else one for this machine alone)",
     )
-    where.add_argument(
+    cluster.add_argument(
         "--ray-data", type=Path, help="use the head that `head` runs for this data directory"
     )
     dispatch.add_argument("--once", action="store_true", help="end when the cluster is gone")
     dispatch.set_defaults(run=_dispatch)
 
-    head = commands.add_parser(
-        "head", help="run a Ray of one machine, on loopback, for `dispatch --ray-data`"
-    )
-    head.add_argument("--ray-data", type=Path, required=True, help="data directory that it is for")
-    head.add_argument("--cpus", type=int, help="CPUs to use (default: all)")
-    head.set_defaults(run=_head)
 
-    replay = commands.add_parser(
-        "replay", help="run one task here, without Ray and coordinator", parents=both
+def _add_store_and_blender(parser: argparse.ArgumentParser) -> None:
+    python = Path(os.environ.get("STICKSLIP_BLENDER_PYTHON") or default_blender_python())
+    parser.add_argument(
+        "--store", type=_store, required=True, help="directory of the store, or s3://BUCKET/PREFIX"
     )
-    replay.add_argument("task", type=Path, help="the task as JSON")
-    replay.set_defaults(run=_replay)
-
-    certify = commands.add_parser(
-        "certify", help="run the physical protocols of a preset with this build"
-    )
-    certify.add_argument("--preset", required=True, help="name of the preset; rods: the rod solver")
-    certify.add_argument("--out", type=Path, required=True, help="folder for certificate.json")
-    few = "measure a few points only; such a certificate does not count"
-    certify.add_argument("--quick", action="store_true", help=few)
-    certify.set_defaults(run=_certify)
-
-    drawn = commands.add_parser(
-        "preview", help="draw a scene, as `stickslip scene preview` hands it over", parents=both
-    )
-    drawn.add_argument("scene", type=Path, help="the scene as JSON")
-    drawn.add_argument("--out", type=Path, required=True, help="directory for the pictures")
-    drawn.set_defaults(run=_preview)
-
-    commands.add_parser("describe", help="print the builds of this environment").set_defaults(
-        run=_describe
-    )
-
-    options = parser.parse_args(arguments)
-    if options.command == "dispatch" and not options.once:
-        command = [
-            sys.executable,
-            "-m",
-            "stickslip_workers",
-            *(sys.argv[1:] if arguments is None else arguments),
-        ]
-        return run_for_ever([*command, "--once"], Backoff(first=1.0, most=30.0))
-    return int(options.run(options))
+    parser.add_argument("--blender-python", type=Path, default=python, help="default: %(default)s")
 
 
 def _head(options: argparse.Namespace) -> int:
@@ -144,12 +145,12 @@ def _dispatch(options: argparse.Namespace) -> int:
     )
     logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
     if not options.blender_python.exists():
-        logging.error(
+        log.error(
             "blender-python must be an interpreter; %s does not exist", options.blender_python
         )
         return 2
     if options.key_file is not None and not options.key_file.is_file():
-        logging.error(
+        log.error(
             "key-file must be a file with the coordinator's worker key; %s does not exist",
             options.key_file,
         )
@@ -196,7 +197,7 @@ def _dispatch(options: argparse.Namespace) -> int:
             signal.signal(number, stop)
         dispatcher.run()
     except (StartError, CoordinatorError) as error:
-        logging.error("%s: %s", type(error).__name__, error)
+        log.exception("the dispatcher has ended: %s", error)
         return 1
     return 0
 

@@ -23,8 +23,8 @@ def scene_module(name: str) -> str:
 
 def kind(name: str) -> "Kind":
     """Return how a kind is simulated; raise UnknownKindError."""
-    found: Kind = import_module(scene_module(name)).KIND
-    return found
+    simulated: Kind = import_module(scene_module(name)).KIND
+    return simulated
 
 
 _STAGES = "stickslip_workers.stages"
@@ -32,6 +32,7 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
 def roots(stage: str, name: str) -> tuple[str, ...]:
+    """Return the modules that a stage of a kind starts from; raise ValueError for another stage."""
     if stage == "simulate":
         return (f"{_STAGES}.run", scene_module(name))
     if stage == "pack":
@@ -57,9 +58,9 @@ def build(stage: str, name: str) -> str:
 
 
 def solver_build(module: str) -> str:
-    """Return the digest of a solver: a module of sim_core, all that it imports, and the compiled
-    core.
+    """Return the digest of a solver.
 
+    It covers a module of sim_core, all that it imports, and the compiled core.
     The level of its kernels is not part of it: levels differ by less than a certificate can see.
     """
     return content_key(
@@ -81,5 +82,6 @@ def _core(kernel: str = "") -> str:
 
 
 def versions() -> dict[str, str]:
+    """Return the versions of the packages that people ask for first, by name."""
     names = ("stickslip-workers", "stickslip-schemas", "stickslip-sim-core", "ray", "zarr")
     return {name: metadata.version(name) for name in names}

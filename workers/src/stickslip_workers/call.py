@@ -1,4 +1,4 @@
-"""What a Ray task does.
+"""The remote function that Ray runs.
 
 Ray gets this module by value, so that it also runs in Blender's environment, which does not have
 stickslip_workers: it may import nothing of ours.
@@ -12,8 +12,8 @@ from typing import Any
 FRAMES_SECONDS = 2.0
 """Time between two messages about how far a simulation is [s]."""
 
-_held: dict[tuple[str, str], tuple[Any, Any]] = {}
-"""What factories made in this process, with its builds."""
+_objects: dict[tuple[str, str], tuple[Any, Any]] = {}
+"""Objects that factories have made in this process, by factory and store, with their builds."""
 
 _used: set[str] = set()
 """Factories that have run tasks in this process."""
@@ -25,38 +25,43 @@ def run(
     builds: dict[str, Any],
     method: str,
     arguments: list[Any],
-    tells_frames: bool,
+    reports_frames: bool,
 ) -> Iterator[Any]:
-    """Yield where the call runs, perhaps (frames done, frames in total), and at last the list of
-    answers.
+    """Yield the messages of a call: its node, perhaps its progress, and its answers.
 
-    What `factory` (`module:Class`) makes stays in the process for the calls that follow. Where its
-    builds are not `builds`, the call ends after the first message.
+    The first message is a dict: the node, whether the builds of the process are `foreign`, and
+    whether it is `cold`. Progress is a tuple (frames done, frames in total). The last message is
+    the list of answers. A call on foreign builds ends after the first message.
+
+    The object that `factory` (`module:Class`) makes stays in the process for later calls.
     """
     import ray
 
-    if (held := _held.get((factory, store))) is None:
+    if (factory, store) not in _objects:
         module, name = factory.split(":")
-        made = getattr(importlib.import_module(module), name)(store)
-        held = _held[factory, store] = made, made.describe()["builds"]
-    inner, own_builds = held
+        new = getattr(importlib.import_module(module), name)(store)
+        _objects[factory, store] = (new, new.describe()["builds"])
+    actor, process_builds = _objects[factory, store]
     # The first tasks of a process also import what their kind needs.
     is_cold = bool(arguments) and factory not in _used
     if arguments:
         _used.add(factory)
     node = ray.get_runtime_context().get_node_id()
-    yield {"node": node, "foreign": own_builds != builds, "cold": is_cold}
-    if own_builds != builds:
+    is_foreign = process_builds != builds
+    yield {"node": node, "foreign": is_foreign, "cold": is_cold}
+    if is_foreign:
         return
 
     def work() -> list[Any]:
-        return [getattr(inner, method)(argument) for argument in arguments]
+        return [getattr(actor, method)(argument) for argument in arguments]
 
-    if tells_frames:
-        done = ThreadPoolExecutor(1).submit(work)
-        while wait([done], FRAMES_SECONDS).not_done:
-            if (frames := inner.frames()) is not None:
-                yield tuple(frames)
-        yield done.result()
-    else:
+    if not reports_frames:
         yield work()
+        return
+    # The work runs in a thread, so that this one can look at its progress.
+    answers = ThreadPoolExecutor(1).submit(work)
+    while wait([answers], FRAMES_SECONDS).not_done:
+        frames = actor.frames()
+        if frames is not None:
+            yield tuple(frames)
+    yield answers.result()

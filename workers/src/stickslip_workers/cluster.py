@@ -8,7 +8,6 @@ import shutil
 import signal
 import socket
 import stat
-import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -126,68 +125,83 @@ def head_directory(data: Path) -> Path:
     return root / sha256(str(data).encode())[:8]
 
 
+OBJECT_STORE_BYTES = 128 * 2**20
+"""Memory for the objects of Ray [bytes]: tasks and results are small, and files go elsewhere."""
+
+AGENT_PORTS = (
+    "dashboard-agent-listen-port",
+    "dashboard-agent-grpc-port",
+    "runtime-env-agent-port",
+    "metrics-export-port",
+)
+"""Options of `ray start` for the ports of a raylet's agents."""
+
+
 def run_head(directory: Path, cpus: int | None) -> None:
     """Run `ray start --head --block` on loopback, with a token.
 
     Write `token` and `address` to a directory before.
-
-    The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then
-    (ray-project/ray#65983). It does not wait for ports that it already knows. One of them is no
-    option of `ray start`, so a private function of Ray adds it. It also ends the head with its
-    raylet: a raylet that has lost an agent exits with 0, which `--block` takes for an ordinary end.
     """
     shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
     directory.mkdir(exist_ok=True)
-    (directory / "token").touch(mode=0o600)
-    (directory / "token").write_text(secrets.token_hex(32))
-    os.environ |= SETTINGS | {
-        "RAY_AUTH_MODE": "token",
-        "RAY_AUTH_TOKEN_PATH": str(directory / "token"),
-    }
-    from ray._private import services
-    from ray.scripts.scripts import main as ray
+    token = directory / "token"
+    token.touch(mode=0o600)
+    token.write_text(secrets.token_hex(32))
+    os.environ |= SETTINGS | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
+    from ray.scripts.scripts import cli
 
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(5)]
-    port, *ports = (free.getsockname()[1] for free in sockets)
-    for free in sockets:
-        free.close()
-    start = services.start_ray_process
-
-    def start_ray_process(command: list[str], *arguments: object, **options: object) -> Any:
-        if is_raylet := command[0] == services.RAYLET_EXECUTABLE:
-            command = [*command, f"--dashboard_agent_listen_port={ports[0]}"]
-        started = start(command, *arguments, **options)
-        if is_raylet:  # this process ends with it, and the kernel ends its other children then
-            threading.Thread(
-                target=lambda: os._exit(started.process.wait() or 1), daemon=True
-            ).start()
-        return started
-
-    services.start_ray_process = start_ray_process
-    told = (
-        "dashboard-agent-listen-port",
-        "dashboard-agent-grpc-port",
-        "runtime-env-agent-port",
-        "metrics-export-port",
-    )
+    port, *agent_ports = _free_ports(1 + len(AGENT_PORTS))
+    _prepare_raylet(agent_ports[0])
     options = {
         "port": port,
         "num-cpus": cpus or len(os.sched_getaffinity(0)),
         "node-ip-address": "127.0.0.1",
         "temp-dir": directory,
-        "object-store-memory": 128
-        * 2**20,  # tasks and results are small: bulk data goes through the store
+        "object-store-memory": OBJECT_STORE_BYTES,
         "include-dashboard": "false",
         "include-log-monitor": "false",
-        **dict(zip(told, ports, strict=True)),
+        **dict(zip(AGENT_PORTS, agent_ports, strict=True)),
     }
     (directory / "address").write_text(f"127.0.0.1:{port}")
-    sys.argv = [
-        "ray",
-        "start",
-        "--head",
-        "--block",
-        "--no-monitor",
-        *(f"--{o}={v}" for o, v in options.items()),
-    ]
-    ray()
+    words = [f"--{name}={value}" for name, value in options.items()]
+    cli.main(["start", "--head", "--block", "--no-monitor", *words], prog_name="ray")
+
+
+def _free_ports(count: int) -> list[int]:
+    """Return ports of loopback on which nothing listens."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [int(listening.getsockname()[1]) for listening in sockets]
+    for listening in sockets:
+        listening.close()
+    return ports
+
+
+def _prepare_raylet(agent_port: int) -> None:
+    """Let `ray start` of this process tell the raylet a port, and end with the raylet.
+
+    Ray has no public way for either, so its private function that starts processes is wrapped:
+
+    - The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then
+      (ray-project/ray#65983). It does not wait for ports that it knows already. `ray start` passes
+      all of them on but this one.
+    - A raylet that has lost an agent exits with 0, which `--block` takes for an ordinary end.
+    """
+    from ray._private import services
+
+    start = services.start_ray_process
+
+    def start_ray_process(command: list[str], *arguments: object, **options: object) -> Any:
+        if command[0] != services.RAYLET_EXECUTABLE:
+            return start(command, *arguments, **options)
+        raylet = start(
+            [*command, f"--dashboard_agent_listen_port={agent_port}"], *arguments, **options
+        )
+
+        # This process ends with the raylet, and the kernel ends its other children then.
+        def end_with_raylet() -> None:
+            os._exit(raylet.process.wait() or 1)
+
+        threading.Thread(target=end_with_raylet, daemon=True).start()
+        return raylet
+
+    services.start_ray_process = start_ray_process

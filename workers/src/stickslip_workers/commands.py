@@ -1,6 +1,7 @@
-"""What a command does without Ray and coordinator: replay a task, draw a scene, certify a preset."""
+"""Commands that need no Ray and no coordinator: replay a task, draw a scene, certify a preset."""
 
 import json
+import logging
 import os
 import platform
 import subprocess
@@ -33,6 +34,8 @@ from stickslip_sim_core.scenes.scene import ClothRun
 from stickslip_workers.builds import solver_build
 from stickslip_workers.settings import RENDER_ACTOR
 from stickslip_workers.stages.run import failed, run_tasks
+
+log = logging.getLogger(__name__)
 
 # Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what
 # it likes.
@@ -162,7 +165,9 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
                 )
             report = ProtocolReport.model_validate(document)
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
-        except Exception as error:  # any error becomes part of the certificate
+        # Any error becomes part of the certificate, and the other protocols run all the same.
+        except Exception as error:
+            log.exception("the protocol %s broke off", name)
             report = _broken_off(name, error)
         reports.append(report)
         spent = time.process_time() - cpu
@@ -186,10 +191,12 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
 
 
 def verdict(report: ProtocolReport) -> str:
+    """Return one line that says whether a protocol passed, and by how much."""
     if report.message:
         return f"broke off: {report.message}"
     error = "infinite" if report.error is None else f"{report.error:.1e}"
-    return f"{'passed' if report.passed else 'FAILED'}, largest error {error} of {report.tolerance:g} allowed"
+    word = "passed" if report.passed else "FAILED"
+    return f"{word}, largest error {error} of {report.tolerance:g} allowed"
 
 
 def _broken_off(name: str, error: Exception) -> ProtocolReport:

@@ -1,7 +1,6 @@
-"""The dataset card, `README.md` of a dataset version, and its preview: some of its samples in one
-picture.
+"""The dataset card, `README.md` of a dataset version, and its preview.
 
-The card is for people who find only the directory.
+The card is for people who find only the directory. The preview has some samples in one picture.
 """
 
 import json
@@ -20,14 +19,24 @@ from stickslip_schemas.spec.jobs import JobSpec
 CARD_NAME = "README.md"
 PREVIEW_NAME = "preview.webp"
 SHOWN_VALUES = 12
-SHOWN_SAMPLES, FRAMES = 12, 20
-"""Samples and instants in the preview, at most."""
+"""Values of an axis that the card lists, at most."""
+
+SHOWN_SAMPLES = 12
+"""Samples in the preview, at most."""
+
+FRAMES = 20
+"""Instants in the preview, at most."""
+
 _COLUMNS = 4
-_SIDE = 120  # of a picture [px]
+_SIDE = 120
+"""Side of a picture in the preview [px]."""
 
 
 def card(manifest: Manifest) -> bytes:
-    """Return the card of a version: what it holds, how it was made, how to read, check and cite it."""
+    """Return the card of a version.
+
+    It says what the version holds, how it was made, and how to read, check and cite it.
+    """
     spec = manifest.spec
     name = f"{manifest.dataset}:v{manifest.version}"
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
@@ -41,7 +50,8 @@ def card(manifest: Manifest) -> bytes:
     sections = [
         f"# {spec.name or manifest.dataset}",
         f"{(type(spec).__doc__ or spec.kind).strip().splitlines()[0]}",
-        f"Dataset `{name}`, made by stickslip: {manifest.sample_count} samples, {manifest.valid_count} of them valid.",
+        f"Dataset `{name}`, made by stickslip: {manifest.sample_count} samples, "
+        f"{manifest.valid_count} of them valid.",
         *(
             [f"![Some of the samples]({PREVIEW_NAME})"]
             if PREVIEW_NAME in {file.path for file in manifest.files}
@@ -75,14 +85,16 @@ def card(manifest: Manifest) -> bytes:
         f"```json\n{json.dumps(document, indent=2)}\n```",
         "## How to read it",
         "Any Zarr v3 reader opens this directory:",
-        f'```python\nimport zarr\n\ngroup = zarr.open_group(".", mode="r")\nvalid = group["valid"][:]\n'
-        f'sample = group["{told.name}"][int(valid.argmax())]\n```',
-        "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of stickslip checks "
-        "every file against `manifest.json` and raises an error where one is missing or damaged:",
-        '```python\nfrom stickslip_training.data.samples import Samples\n\ntrain = Samples(".", "train")\n```',
+        '```python\nimport zarr\n\ngroup = zarr.open_group(".", mode="r")\n'
+        f'valid = group["valid"][:]\nsample = group["{told.name}"][int(valid.argmax())]\n```',
+        "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of "
+        "stickslip checks every file against `manifest.json` and raises an error where one is "
+        "missing or damaged:",
+        "```python\nfrom stickslip_training.data.samples import Samples\n\n"
+        'train = Samples(".", "train")\n```',
         "## How to check it",
-        "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every other file"
-        f"{where}. `stickslip verify .` checks all files.",
+        "`sha256sum --check manifest.sha256` checks the manifest, which lists the SHA-256 of every "
+        f"other file{where}. `stickslip verify .` checks all files.",
         "## How to cite it",
         f"Write `{name}` and the SHA-256 of `manifest.json`, which stands in `manifest.sha256`.",
     ]
@@ -130,7 +142,10 @@ def _certificate(manifest: Manifest) -> str:
     if manifest.certificate is None:
         return "No certificate vouches for the physics of this build and preset."
     preset = manifest.spec.certified_preset
-    return f"The certificate `{manifest.certificate}` vouches for this build and the preset `{preset}`."
+    return (
+        f"The certificate `{manifest.certificate}` vouches for this build and the preset "
+        f"`{preset}`."
+    )
 
 
 def _pictures(manifest: Manifest) -> list[str]:
@@ -141,10 +156,11 @@ def _pictures(manifest: Manifest) -> list[str]:
     if pictures.device != "cpu":
         text += f" They were rendered on a GPU ({pictures.device})."
     if pictures.psnr:
-        regions = "; ".join(
-            f"{region} {psnr.median:.1f} ({psnr.worst:.1f}) with a deviation of {psnr.deviation:.1f}"
-            for region, psnr in pictures.psnr.items()
-        )
+        numbers = []
+        for region, psnr in pictures.psnr.items():
+            deviation = f"with a deviation of {psnr.deviation:.1f}"
+            numbers.append(f"{region} {psnr.median:.1f} ({psnr.worst:.1f}) {deviation}")
+        regions = "; ".join(numbers)
         text += f" PSNR of its clips [dB], the median, and in brackets what 99 % exceed: {regions}."
     if pictures.frame_share is not None:
         text += f" The cloth fills {100 * pictures.frame_share:.1f} % of a frame, in the mean."
@@ -198,6 +214,7 @@ def preview(
 
 
 def text_of(values: Mapping[str, object]) -> str:
+    """Return the values of axes as a label of a picture."""
     return " ".join(
         f"{value:.3g}" if isinstance(value, float) else str(value) for value in values.values()
     )

@@ -1,7 +1,7 @@
-"""Pack: the files of one shard group, one for each array, byte for byte as zarr-python would write
-them.
+"""Pack: the files of one shard group, one for each array.
 
-Labels are no files yet: the task that publishes writes those of many shard groups into one file.
+They are byte for byte those of zarr-python. Labels are no files yet: the task that publishes writes
+those of many shard groups into one file.
 """
 
 import numpy as np
@@ -69,6 +69,7 @@ class _Shard:
         self._trajectories: dict[tuple[str, RecordRef], bytes] = {}
 
     def fill(self, row: int, slot: PackSlot) -> None:
+        """Put a sample into its row; raise ValueError if parts of it are missing."""
         self._check_labels(slot)
         for array in self._arrays:
             if not array.per_sample and not array.is_recorded:
@@ -87,12 +88,14 @@ class _Shard:
         columns = {
             array.name for array in self._arrays if not array.per_sample and not array.is_recorded
         }
-        if unknown := set(slot.labels) - columns:
+        unknown = sorted(set(slot.labels) - columns)
+        if unknown:
             raise ValueError(
-                f"labels of slot {slot.slot} must have an array each; there is none for {sorted(unknown)}"
+                f"labels of slot {slot.slot} must have an array each; there is none for {unknown}"
             )
 
     def encode(self, array: ArrayLayout) -> bytes:
+        """Return the file of an array, or the chunk of a label."""
         if array.per_sample:
             return encode_shard(self._chunks[array.name])
         return encode_chunk(self._columns[array.name])
@@ -103,8 +106,8 @@ class _Shard:
             raise ValueError(
                 f"chunks of slot {slot.slot} must have {array.name!r}; got {sorted(slot.chunks)}"
             )
-        where = slot.chunks[array.name]
-        chunk = self._store.read(where.digest, offset=where.offset, length=where.length)
+        part = slot.chunks[array.name]
+        chunk = self._store.read(part.digest, offset=part.offset, length=part.length)
         check_chunk(chunk)
         return chunk
 
@@ -123,8 +126,9 @@ class _Shard:
             or record.row >= len(values)
         ):
             raise ValueError(
-                f"{array.name!r} of artifact {record.digest} must be {array.dtype} of shape (n, *{array.shape}) "
-                f"with n > {record.row}; got {values.dtype} of shape {values.shape}"
+                f"{array.name!r} of artifact {record.digest} must be {array.dtype} of shape "
+                f"(n, *{array.shape}) with n > {record.row}; got {values.dtype} of shape "
+                f"{values.shape}"
             )
         row: Array = values[record.row]
         return row

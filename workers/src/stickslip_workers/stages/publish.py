@@ -7,7 +7,7 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,9 @@ from stickslip_schemas.store import CorruptArtifactError, Store, in_parallel
 from stickslip_workers.settings import CPU, RENDER_DEVICE
 from stickslip_workers.stages.card import CARD_NAME, PREVIEW_NAME, card, pictured, preview
 
+WORST_QUANTILE = 0.01
+"""Quantile of the PSNR that stands for the worst clips: 99 % of them are better."""
+
 
 def metadata_files(
     spec: JobSpec, *, dataset: str, version: int, sample_count: int
@@ -82,10 +85,10 @@ def create_array(
     group_shape = (samples_per_file, *array.shape)
     order = axes_order(array)
     compressor: object = ZstdCodec(level=ZSTD_LEVEL, checksum=False)
-    if (packed := packing(array)) is not None:
-        compressor = BloscCodec(
-            typesize=np.dtype(array.dtype).itemsize, blocksize=0, **packed._asdict()
-        )
+    blosc = packing(array)
+    if blosc is not None:
+        itemsize = np.dtype(array.dtype).itemsize
+        compressor = BloscCodec(typesize=itemsize, blocksize=0, **blosc._asdict())
     return group.create_array(  # type: ignore[attr-defined]  # zarr.Group; zarr is imported late
         array.name,
         shape=(sample_count, *array.shape),
@@ -105,21 +108,56 @@ def create_array(
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:
     """Make the shards a dataset version. Repeating it, also after a crash, gives the same bytes."""
-    given = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
-    _check_complete(task, given, store)
-    labels = _Labels(task, given, store)
+    parts = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
+    _check_complete(task, parts, store)
+    labels = _Labels(task, parts, store)
     metadata = metadata_files(
         task.spec, dataset=task.dataset, version=task.version, sample_count=labels.count
     )
+    # The group's metadata will have the digest of the manifest, so it is written after it.
     group = metadata.pop(GROUP_NAME)
+
+    # What the shards do not hold already: labels, metadata and the preview.
     files = labels.files()
     for path, data in metadata.items():
-        files.append(FileEntry(path=path, sha256=store.publish(data), size=len(data)))
-    if (picture := _preview(task, given, labels, store)) is not None:
-        files.append(FileEntry(path=PREVIEW_NAME, sha256=store.publish(picture), size=len(picture)))
-    sections = _sections(task, given, store)
-    rejections = [rejection for section in given for rejection in section.rejections]
-    manifest = Manifest(
+        files.append(_stored(store, path, data))
+    picture = _preview(task, parts, labels, store)
+    if picture is not None:
+        files.append(_stored(store, PREVIEW_NAME, picture))
+
+    # The card is made from the manifest, and listed in it.
+    sections = _sections(task, parts, store)
+    manifest = _manifest(task, parts, labels, files, sections)
+    files.append(_stored(store, CARD_NAME, card(manifest)))
+    of_shards = [file for part in parts for file in part.files]
+    # With sections, these list the files of the shards.
+    listed = files if sections else [*files, *of_shards]
+    in_order = tuple(sorted(listed, key=lambda file: file.path))
+    manifest = manifest.model_copy(update={"files": in_order})
+
+    everything = [*of_shards, *files, *sections]
+    seal = _show(task, store, everything, manifest, group)
+    total = sum(file.size for file in everything)
+    return PublishOutput(manifest=seal.manifest, group=seal.group, bytes=total + seal.size)
+
+
+def _stored(store: Store, path: str, data: bytes) -> FileEntry:
+    """Store a file of the version, and return its entry in the manifest."""
+    return FileEntry(path=path, sha256=store.publish(data), size=len(data))
+
+
+def _manifest(
+    task: PublishTask,
+    parts: Sequence[PublishSection],
+    labels: "_Labels",
+    files: Sequence[FileEntry],
+    sections: tuple[FileEntry, ...],
+) -> Manifest:
+    """Return the manifest; lists of samples are in the sections, if there are any."""
+    rejections = [rejection for part in parts for rejection in part.rejections]
+    counts = Counter(str(rejection.reason) for rejection in rejections)
+    sample_keys = [key for part in parts for key in part.sample_keys]
+    return Manifest(
         dataset=task.dataset,
         version=task.version,
         spec=task.spec,
@@ -131,53 +169,62 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
         valid_count=labels.count - len(rejections),
         pictures=_pictures(task, labels),
         split_counts=_split_counts(labels, rejections),
-        rejection_counts=dict(
-            sorted(Counter(str(rejection.reason) for rejection in rejections).items())
-        ),
+        rejection_counts=dict(sorted(counts.items())),
         sections=sections,
         rejections=() if sections else tuple(rejections),
-        sample_keys=()
-        if sections
-        else tuple(key for section in given for key in section.sample_keys),
+        sample_keys=() if sections else tuple(sample_keys),
         files=tuple(files),
     )
-    text = card(manifest)
-    files.append(FileEntry(path=CARD_NAME, sha256=store.publish(text), size=len(text)))
-    listed = [file for section in given for file in section.files]
-    own = files if sections else [*files, *listed]
-    manifest = manifest.model_copy(update={"files": tuple(sorted(own, key=lambda file: file.path))})
-    version = task.dataset, task.version
-    in_parallel(
-        lambda file: store.show(file.sha256, *version, file.path), [*listed, *files, *sections]
-    )
+
+
+class _Seal(NamedTuple):
+    """The files that make a version complete."""
+
+    manifest: str
+    """Digest of the manifest."""
+    group: str
+    """Digest of the group's metadata, which names the manifest."""
+    size: int
+    """Of these and of the seal [bytes]."""
+
+
+def _show(
+    task: PublishTask,
+    store: Store,
+    files: Sequence[FileEntry],
+    manifest: Manifest,
+    group: bytes,
+) -> _Seal:
+    """Put all files into the directory of the version; the manifest is last."""
+    version = (task.dataset, task.version)
+    in_parallel(lambda file: store.show(file.sha256, *version, file.path), files)
     data = canonical_json(manifest.model_dump(mode="json")).encode()
     digest = store.publish(data)
-    group = with_manifest_digest(group, digest)
-    group_digest = store.publish(group)
+    group_with_digest = with_manifest_digest(group, digest)
+    group_digest = store.publish(group_with_digest)
     seal = seal_text(digest, group_digest)
+    # A version with a manifest is complete, so nothing may follow it.
     store.show(group_digest, *version, GROUP_NAME)
     store.show(store.publish(seal), *version, SEAL_NAME)
     store.show(digest, *version, MANIFEST_NAME)
-    size = (
-        sum(file.size for file in [*listed, *files, *sections]) + len(data) + len(group) + len(seal)
-    )
-    return PublishOutput(manifest=digest, group=group_digest, bytes=size)
+    return _Seal(digest, group_digest, len(data) + len(group_with_digest) + len(seal))
 
 
-def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
+def _check_complete(task: PublishTask, parts: Sequence[PublishSection], store: Store) -> None:
     """Raise if the version lacks a file: a Zarr reader would silently return fill values."""
     if task.dataset != task.spec.dataset_id:
         raise ValueError(
             f"dataset must be the id of its spec, {task.spec.dataset_id}; got {task.dataset!r}"
         )
-    bounds = [0, *(section.end for section in given)]
-    if bounds[:-1] != [section.first for section in given] or bounds[-1] != task.spec.sample_count:
+    bounds = [0, *(section.end for section in parts)]
+    if bounds[:-1] != [section.first for section in parts] or bounds[-1] != task.spec.sample_count:
         raise ValueError(
-            f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at {bounds}"
+            f"sections must have the samples 0 to {task.spec.sample_count - 1}, and they end at "
+            f"{bounds}"
         )
     size = task.spec.samples_per_shard
     arrays = [array for array in layout(task.spec) if not array.is_label]
-    for section in given:
+    for section in parts:
         shards = range(section.first // size, -(-section.end // size))
         expected = {array.shard_path(shard) for array in arrays for shard in shards}
         paths = {file.path for file in section.files}
@@ -188,20 +235,22 @@ def _check_complete(task: PublishTask, given: Sequence[PublishSection], store: S
         ):
             odd = sorted(paths ^ expected) or ["one path twice, or labels"]
             raise ValueError(
-                f"files must be those of {len(shards)} shards; missing or unknown are {odd[:3]} and so on"
+                f"files must be those of {len(shards)} shards; missing or unknown are {odd[:3]} "
+                "and so on"
             )
         whole = in_parallel(lambda file: store.holds(file.sha256, size=file.size), section.files)
         for file, is_whole in zip(section.files, whole, strict=True):
             if not is_whole:
                 raise CorruptArtifactError(
-                    f"artifact {file.sha256} of {file.path} must have {file.size} bytes and the digest that names it"
+                    f"artifact {file.sha256} of {file.path} must have {file.size} bytes and the "
+                    "digest that names it"
                 )
 
 
 class _Labels:
     """The labels of all samples, by name, from what the shards have."""
 
-    def __init__(self, task: PublishTask, given: Sequence[PublishSection], store: Store) -> None:
+    def __init__(self, task: PublishTask, parts: Sequence[PublishSection], store: Store) -> None:
         self.count = task.spec.sample_count
         self._store = store
         self._spec = task.spec
@@ -210,7 +259,7 @@ class _Labels:
             array.name: np.empty((self.count, *array.shape), array.dtype) for array in self.arrays
         }
         size = task.spec.samples_per_shard
-        for section in given:
+        for section in parts:
             for number, data in enumerate(in_parallel(store.read, section.labels)):
                 first = section.first + number * size
                 slots = slice(first, min(first + size, self.count))
@@ -222,6 +271,7 @@ class _Labels:
         return self._columns[name]
 
     def files(self) -> list[FileEntry]:
+        """Store the files of all labels, and return their entries."""
         numbers = [
             (array, number)
             for array in self.arrays
@@ -229,41 +279,37 @@ class _Labels:
         ]
         return in_parallel(self._file, numbers)
 
-    def _file(self, which: tuple[ArrayLayout, int]) -> FileEntry:
-        array, number = which
+    def _file(self, array_and_number: tuple[ArrayLayout, int]) -> FileEntry:
+        array, number = array_and_number
         size = self._spec.samples_per_file(array)
         chunk = np.full((size, *array.shape), array.fill, array.dtype)  # a chunk is always whole
         values = self._columns[array.name][number * size : (number + 1) * size]
         chunk[: len(values)] = values
         data = encode_chunk(chunk)
-        return FileEntry(
-            path=array.shard_path(number), sha256=self._store.publish(data), size=len(data)
-        )
+        return _stored(self._store, array.shard_path(number), data)
 
 
 def _sections(
-    task: PublishTask, given: Sequence[PublishSection], store: Store
+    task: PublishTask, parts: Sequence[PublishSection], store: Store
 ) -> tuple[FileEntry, ...]:
     """Write the sections of the manifest; none where all of it has room in one file."""
     if not has_sections(task.spec):
         return ()
     size = section_samples(task.spec)
 
-    def write(section: PublishSection) -> FileEntry:
-        own = ManifestSection(
-            **{name: getattr(section, name) for name in ManifestSection.model_fields}
-        )
-        data = canonical_json(own.model_dump(mode="json")).encode()
-        return FileEntry(
-            path=section_path(section.first // size), sha256=store.publish(data), size=len(data)
-        )
+    def write(part: PublishSection) -> FileEntry:
+        fields = {name: getattr(part, name) for name in ManifestSection.model_fields}
+        section = ManifestSection(**fields)
+        data = canonical_json(section.model_dump(mode="json")).encode()
+        return _stored(store, section_path(part.first // size), data)
 
-    return tuple(in_parallel(write, given))
+    return tuple(in_parallel(write, parts))
 
 
 def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str, int]:
-    """Count the valid samples of each split from what the shards say, and check it against the
-    rejections.
+    """Count the valid samples of each split, from the labels in the shards.
+
+    Raises ValueError if they contradict the rejections.
     """
     valid = labels["valid"]
     rejected = sorted(rejection.slot for rejection in rejections)
@@ -279,51 +325,55 @@ def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
     """Return how good the pictures are, as each clip was measured; None if it has none."""
     if pictured(task.spec) is None:
         return None
-    share, psnr = None, {}
-    if (
-        any(array.name == "frame_share" for array in labels.arrays)
-        and (valid := labels["valid"]).any()
-    ):
-        share = round(float(labels["frame_share"][valid].mean()), 4)
-        for number, region in enumerate(REGIONS):
-            values, deviations = (
-                labels[f"psnr_{region}"][valid],
-                labels["psnr_deviation"][valid, number],
-            )
-            if (known := np.isfinite(values)).any():
-                psnr[region] = Psnr(
-                    clips=int(known.sum()),
-                    median=round(float(np.median(values[known])), 2),
-                    worst=round(float(np.quantile(values[known], 0.01)), 2),
-                    deviation=round(float(np.median(deviations[known])), 2),
-                )
+    valid = labels["valid"]
+    is_measured = any(array.name == "frame_share" for array in labels.arrays) and valid.any()
+    share = round(float(labels["frame_share"][valid].mean()), 4) if is_measured else None
     return Pictures(
         quality=task.spec.quality,
-        psnr=psnr,
+        psnr=_psnr_by_region(labels) if is_measured else {},
         frame_share=share,
-        device=os.environ.get(RENDER_DEVICE)
-        or CPU,  # all workers of this version's builds have the same
+        # All workers of this version's builds have the same device.
+        device=os.environ.get(RENDER_DEVICE) or CPU,
     )
 
 
+def _psnr_by_region(labels: _Labels) -> dict[str, Psnr]:
+    """Return the PSNR of the valid clips in each region in which some were measured."""
+    valid = labels["valid"]
+    psnr: dict[str, Psnr] = {}
+    for number, region in enumerate(REGIONS):
+        values = labels[f"psnr_{region}"][valid]
+        deviations = labels["psnr_deviation"][valid, number]
+        # NaN: the clip was not measured.
+        measured = np.isfinite(values)
+        if not measured.any():
+            continue
+        psnr[region] = Psnr(
+            clips=int(measured.sum()),
+            median=round(float(np.median(values[measured])), 2),
+            worst=round(float(np.quantile(values[measured], WORST_QUANTILE)), 2),
+            deviation=round(float(np.median(deviations[measured])), 2),
+        )
+    return psnr
+
+
 def _preview(
-    task: PublishTask, given: Sequence[PublishSection], labels: _Labels, store: Store
+    task: PublishTask, parts: Sequence[PublishSection], labels: _Labels, store: Store
 ) -> bytes | None:
-    """Return the picture of the version; None where nothing is rendered, or valid."""
+    """Return the picture of the version; None if nothing is rendered, or valid."""
     array = pictured(task.spec)
     if array is None:
         return None
-    size = task.spec.samples_per_shard
+    files = {file.path: file for part in parts for file in part.files}
+    samples_per_shard = task.spec.samples_per_shard
+    index_bytes = shard_index_size(samples_per_shard)
 
-    def chunk(slot: int) -> bytes:
-        path = array.shard_path(slot // size)
-        (section,) = (section for section in given if section.first <= slot < section.end)
-        (file,) = (file for file in section.files if file.path == path)
-        tail = shard_index_size(size)
-        index = decode_shard_index(
-            store.read(file.sha256, offset=file.size - tail, length=tail), size
-        )
-        offset, length = index[slot % size].tolist()
+    def read_chunk(slot: int) -> bytes:
+        # Only the index of a shard and one chunk are read: a shard may have gigabytes.
+        shard, row = divmod(slot, samples_per_shard)
+        file = files[array.shard_path(shard)]
+        tail = store.read(file.sha256, offset=file.size - index_bytes, length=index_bytes)
+        offset, length = decode_shard_index(tail, samples_per_shard)[row].tolist()
         return store.read(file.sha256, offset=offset, length=length)
 
-    return preview(task.spec, array, np.flatnonzero(labels["valid"]).tolist(), chunk)
+    return preview(task.spec, array, np.flatnonzero(labels["valid"]).tolist(), read_chunk)

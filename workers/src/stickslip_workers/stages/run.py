@@ -87,9 +87,7 @@ def _size(artifact: Mapping[str, Array]) -> int:
 
 
 class StageActor:
-    """Runs simulate, pack and publish in a process that holds it, with JSON on both sides, as the
-    renderer does.
-    """
+    """Runs simulate, pack and publish in a process that keeps it, with JSON on both sides."""
 
     def __init__(self, store: str) -> None:
         self._store = open_store(store)
@@ -115,12 +113,13 @@ class StageActor:
 
 
 def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    """Return one result a task: `tasks` are simulations of one kind, or a single task of another
-    stage.
+    """Return one result for each task.
 
-    The cost of simulations that were solved together is divided among them.
+    `tasks` are simulations of one kind, or a single task of another stage. The cost of simulations
+    that were solved together is divided among them.
     """
-    cpu, wall = time.process_time(), time.perf_counter()
+    cpu_begin = time.process_time()
+    wall_begin = time.perf_counter()
     try:
         results = _run(tasks, store)
     # Nothing that a task raises may end this process. It is logged with its traceback, and reported
@@ -128,18 +127,18 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     except Exception as error:
         log.exception("%s of %d tasks failed", tasks[0].stage, len(tasks))
         results = [with_damaged_inputs(failure(error), task, store) for task in tasks]
-    share = {
-        "cpu_seconds": (time.process_time() - cpu) / len(tasks),
-        "wall_seconds": (time.perf_counter() - wall) / len(tasks),
+    cost_of_each = {
+        "cpu_seconds": (time.process_time() - cpu_begin) / len(tasks),
+        "wall_seconds": (time.perf_counter() - wall_begin) / len(tasks),
     }
-    return [result.model_copy(update=share) for result in results]
+    return [result.model_copy(update=cost_of_each) for result in results]
 
 
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
-    """Return the result of a failed task with the digests of its damaged inputs, so that they are
-    recomputed at once.
+    """Return the result of a failed task with the digests of its damaged inputs.
 
-    All inputs are read. While the store is unavailable, they cannot be checked.
+    They are then recomputed at once. All inputs are read. While the store is unavailable, they
+    cannot be checked.
     """
     if result.reason is Reason.store_unavailable:
         return result
@@ -160,7 +159,7 @@ def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     return [TaskResult(outcome="succeeded", output=work(task, store)) for task in tasks]
 
 
-def _note(done: int, total: int) -> None:
+def _set_frames(done: int, total: int) -> None:
     global frames
     frames = done, total
 
@@ -173,14 +172,14 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     names = sorted({task.simulation.kind for task in tasks})
     if len(names) != 1:
         raise ValueError(f"tasks must be simulations of one kind; got {', '.join(names)}")
-    made = kind(names[0])
+    simulated_kind = kind(names[0])
     try:
         simulations = [task.simulation.inputs(store.read) for task in tasks]
     except UnfitStartError as error:
         # Only scenes have a start that may be impossible, and each is a batch of its own.
         return [_rejected(Reason.impossible_start, str(error))] * len(tasks)
-    outcomes = made.simulate(simulations, _note)
-    records = _stored(outcomes, made.batch, store)
+    outcomes = simulated_kind.simulate(simulations, _set_frames)
+    records = _store_records(outcomes, simulated_kind.batch, store)
     return [
         _rejection(physics, outcome)
         if outcome.reason
@@ -192,7 +191,7 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     ]
 
 
-def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
+def _store_records(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
     """Store the records of valid outcomes, at most `batch` of the same shapes in an artifact.
 
     Return where they are.
@@ -202,26 +201,29 @@ def _stored(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int
         if not outcome.reason:
             shapes = tuple((name, np.shape(values)) for name, values in outcome.record.items())
             alike.setdefault(shapes, []).append(number)
-    found: dict[int, RecordRef] = {}
+    records: dict[int, RecordRef] = {}
     for members in alike.values():
         for first in range(0, len(members), batch):
-            some = members[first : first + batch]
-            arrays = {
-                name: np.stack([outcomes[n].record[name] for n in some])
-                for name in outcomes[some[0]].record
-            }
+            numbers = members[first : first + batch]
+            # One array has the values of all members, row by row.
+            arrays: dict[str, Array] = {}
+            for name in outcomes[numbers[0]].record:
+                arrays[name] = np.stack([outcomes[number].record[name] for number in numbers])
             digest = store.publish(encode_records(arrays))
-            found |= {number: RecordRef(digest=digest, row=row) for row, number in enumerate(some)}
-    return found
+            for row, number in enumerate(numbers):
+                records[number] = RecordRef(digest=digest, row=row)
+    return records
 
 
 def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
-    shown = {
-        name: f"{value:g}" if isinstance(value, float) else value for name, value in physics.items()
-    }
-    numbers = ", ".join(
-        f"{name} = {value}" for name, value in shown.items() if isinstance(value, int | str)
-    )
+    # People look for the sample by its numbers and names; arrays say nothing in a sentence.
+    values = []
+    for name, value in physics.items():
+        if isinstance(value, float):
+            values.append(f"{name} = {value:g}")
+        elif isinstance(value, int | str):
+            values.append(f"{name} = {value}")
+    numbers = ", ".join(values)
     return _rejected(Reason(outcome.code), f"{outcome.reason} at {numbers}")
 
 
@@ -230,6 +232,7 @@ def _rejected(reason: Reason, message: str) -> TaskResult:
 
 
 def failed(reason: Reason, message: str) -> TaskResult:
+    """Return the result of a task that failed, for a reason of the infrastructure."""
     return TaskResult(outcome="failed", reason=reason, message=message[:MESSAGE_LENGTH])
 
 
