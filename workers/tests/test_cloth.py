@@ -118,7 +118,8 @@ def core(monkeypatch: pytest.MonkeyPatch) -> Core:
     """A core that answers at once, instead of the one that takes minutes."""
     core = Core()
     monkeypatch.setattr(cloth_drag, "KIND", cloth_kind(core.scene))
-    monkeypatch.setattr(Scene, "run", lambda scene, on_frame: core.run(scene, on_frame))
+    monkeypatch.setattr(Scene, "begin", lambda scene: None)
+    monkeypatch.setattr(Scene, "run", lambda scene, on_frame, begun: core.run(scene, on_frame))
     return core
 
 

@@ -221,8 +221,33 @@ FAULTS: list[tuple[dict[tuple[str, ...], Any], tuple[str, ...], str, Any]] = [
             },
         },
         ("bodies", "ball", "motion"),
-        "at 0.4 s the body goes 10 mm further than the cloth lets it",
+        "between this body and floor, and at 0.4 s it is 10 mm further than the cloth lets it",
         {"time": 0.4},
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.0405],
+            ("bodies", "thing"): {"type": "box", "size": [0.2, 0.2, 0.04], "origin": [0, 0, 0.02]},
+            ("bodies", "ball"): {
+                **BALL,
+                "origin": [0, 0, 0.09],
+                "motion": keys((0.0, [0, 0, 0]), (0.5, [0, 0, -0.03])),
+            },
+        },
+        ("bodies", "ball", "motion"),
+        "must leave room for the cloth between this body and thing",
+        {"time": 0.5},
+    ),
+    (
+        {
+            HOLDERS: {
+                "a": {"edge": "left"},
+                "b": {"edge": "right", "motion": keys((0.0, [0, 0, 0]), (0.5, [0.05, 0, 0]))},
+            }
+        },
+        (*HOLDERS, "b", "motion"),
+        "at 0.5 s it is 1.5 times as long",
+        {"time": 0.5},
     ),
 ]
 
@@ -256,6 +281,21 @@ def test_it_is_refused(
         {("bodies", "ball"): {**BALL, "origin": [0, 0, 0.0295]}},
         {("bodies", "thing"): {"type": "mesh", "file": "plate.obj"}, ORIGIN: [0.0, 0.0, 0.0605]},
         {HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, 0.1]))}}},
+        {
+            HOLDERS: {
+                "a": {"edge": "left"},
+                "b": {"edge": "right", "motion": keys((0.0, [0, 0, 0]), (0.5, [0.02, 0, 0]))},
+            }
+        },
+        {
+            ORIGIN: [0.0, 0.0, 0.002],
+            ("bodies", "ball"): {
+                "type": "box",
+                "size": [0.05, 0.05, 0.02],
+                "origin": [0, 0, 0.03],
+                "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.0195])),
+            },
+        },
         {HOLDERS: {"h": {"rim": True}}, ORIGIN: [0.0, 0.0, 0.03]},
         {
             (*CLOTH, "mesh"): {"type": "unstructured", "size": [0.1, 0.1], "spacing": 0.01},

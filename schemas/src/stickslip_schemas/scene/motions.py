@@ -133,15 +133,25 @@ class Track:
         key, sample = np.unravel_index(int(np.argmax(size)), size.shape)
         return float(windows[key, sample]), float(size[key, sample])
 
-    def moves_along(self, direction: Floats) -> tuple[Floats, Floats]:
-        """Return displacements since 0 s along a direction (3,) at all keys [m], and their times.
+    def moved(self, points: Floats, middle: Floats, time: float) -> Floats:
+        """Return points (K, 3) [m] of the start where the motion has taken them at a time [s].
 
-        A motion that turns has none: where its parts are depends on its shape.
+        `middle` is that of what moves. A spin does not take them anywhere here.
+        """
+        about = middle if self._about is None else np.array(self._about, float)
+        begin, now = self.at(np.array([0.0, time]))
+        # A holder takes its vertices where they are, so the motion at 0 s is undone first.
+        turn = rotation_matrix(now[3:]) @ rotation_matrix(begin[3:]).T
+        return np.asarray((points - about - begin[:3]) @ turn.T + about + now[:3])
+
+    def displacements(self) -> tuple[Floats, Floats]:
+        """Return displacements since 0 s at all keys (K, 3) [m], and the times (K,) they end [s].
+
+        A motion that turns has none: where its parts are depends on their shape.
         """
         if self._spin is not None or np.any(self.values[:, 3:]):
-            return np.empty(0), np.empty(0)
-        moves = (self.values[:, :3] - self.values[0, :3]) @ direction
-        return np.asarray(moves), self.times + self._ramp
+            return np.empty((0, 3)), np.empty(0)
+        return self.values[:, :3] - self.values[0, :3], self.times + self._ramp
 
 
 def _monotone_slopes(times: Floats, values: Floats) -> Floats:

@@ -8,10 +8,12 @@ without the core refuses a scene before anything is queued:
     holders     hold a vertex each, none twice, and leave one free
     start       no sheet inside a body, across another thing, or at no distance from it
     motions     no faster than the shortest steps of the preset can follow
-    presses     no body through a plane that carries cloth
+    holders     do not tear the cloth between them
+    presses     leave room for the cloth between two bodies (`presses`)
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,8 @@ from stickslip_schemas.scene.geometry import (
 )
 from stickslip_schemas.scene.motions import SHORTEST_STEPS, Track
 from stickslip_schemas.scene.parameters import Location
-from stickslip_schemas.scene.shapes import start_gap, unit_normal
+from stickslip_schemas.scene.presses import press_faults
+from stickslip_schemas.scene.shapes import start_gap
 from stickslip_schemas.scene.sheets import SheetStart, held_vertices, start_of
 from stickslip_schemas.spec.jobs import StartFault
 
@@ -49,6 +52,13 @@ MAX_UNEVENNESS = 4.0
 
 The solver rejects a run from 1 on. It may halve a step twice more where that step does not
 converge, so only from 4 on is the end certain."""
+
+
+MAX_STRETCH = 1.25
+"""Largest stretch of a triangle in a valid run: the solver's check `stretch`."""
+
+COMPARED_VERTICES = 12
+"""Vertices of each of two holders whose distances are compared."""
 
 
 def check_start(document: Mapping[str, Any]) -> None:
@@ -77,7 +87,9 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     if not faults:
         faults += _contact_faults(document, sheets)
     if not faults:
-        faults += _press_faults(document, sheets)
+        faults += _stretch_faults(document, sheets)
+    if not faults:
+        faults += press_faults(document, sheets, document_end(document))
     return faults
 
 
@@ -315,88 +327,59 @@ def _coordinates(point: Any) -> str:
     return "({}) m".format(", ".join(f"{value:.4g}" for value in point))
 
 
-# ---- Presses
+# ---- Holders that tear
 
 
-def _press_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
-    """Yield bodies that keyframes push through a plane on which cloth lies under them."""
-    planes = [body for body in document["bodies"].values() if body["type"] == "plane"]
-    for name, body in sorted(document["bodies"].items()):
-        if body["type"] == "plane" or body["type"] == "mesh" or body["motion"] is None:
-            continue
-        track = Track(body["motion"])
-        for plane in planes:
-            moves, times = track.moves_along(unit_normal(plane))
-            within = times <= document_end(document)
-            if not within.any():
-                continue
-            deepest = int(np.argmin(np.where(within, moves, np.inf)))
-            room = _room_under(document, name, plane, sheets)
-            if room is None or moves[deepest] + room >= 0.0:
+def _stretch_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
+    """Yield holders that pull two vertices further apart than the cloth between them reaches."""
+    end = document_end(document)
+    for sheet in sheets:
+        holders = document["sheets"][sheet.name]["holders"]
+        always = [key for key, holder in sorted(holders.items()) if holder["grasp"] is None]
+        for key, other in combinations(always, 2):
+            time, stretch = _largest_stretch(sheet, holders[key], holders[other], end)
+            if stretch <= MAX_STRETCH:
                 continue
             rule = (
-                f"must leave room for the cloth between the body and the plane, and at "
-                f"{times[deepest]:g} s the body goes {-1e3 * (moves[deepest] + room):.3g} mm "
-                "further than the cloth lets it; end the motion higher, by that and the thickness "
-                "of the cloth"
+                f"must not stretch the cloth between it and the holder {key} to more than "
+                f"{MAX_STRETCH:g} times its length, and at {time:g} s it is {stretch:.3g} times as "
+                "long; bring the two nearer to each other, or let one go with grasp"
             )
-            location = ("bodies", name, "motion")
-            yield StartFault(location, rule, {"time": float(times[deepest])})
-            break
+            location = ("sheets", sheet.name, "holders", other, "motion")
+            yield StartFault(location, rule, {"time": time})
 
 
-def _room_under(
-    document: Mapping[str, Any], name: str, plane: Mapping[str, Any], sheets: list[SheetStart]
-) -> float | None:
-    """Return how far a body can go towards a plane until it presses cloth into it [m].
+def _largest_stretch(
+    sheet: SheetStart, one: Mapping[str, Any], other: Mapping[str, Any], end: float
+) -> tuple[float, float]:
+    """Return when two holders stretch the cloth between them most [s], and the stretch there.
 
-    None if no cloth lies between them that must stay there: cloth further up may slide away, and
-    holders may pull it away.
+    It is a lower bound: the cloth between two vertices is no shorter than the distance of both.
     """
-    normal = unit_normal(plane)
-    rooms = []
-    for sheet in sheets:
-        holders = document["sheets"][sheet.name]["holders"].values()
-        is_pulled = any(holder["motion"] is not None for holder in holders)
-        heights = (sheet.positions - np.array(plane["origin"], float)) @ normal
-        lies = heights.min() >= 0.0 and heights.max() <= LYING * float(
-            np.ptp(sheet.rest, axis=0).max()
-        )
-        if sheet.is_hung or is_pulled or not lies:
-            continue
-        chosen = _spread(len(sheet.positions))
-        falls = _falls(document["bodies"][name], sheet.positions[chosen], normal)
-        rooms.append(float((falls + heights[chosen]).min()))
-    return min(rooms, default=None)
+    held = [_some(np.flatnonzero(held_vertices(sheet, holder))) for holder in (one, other)]
+    if sheet.jitter or not len(held[0]) or not len(held[1]):
+        return 0.0, 0.0
+    tracks = [None if h["motion"] is None else Track(h["motion"]) for h in (one, other)]
+    times = {time for track in tracks if track for time in track.times.tolist() if time <= end}
+    # The flat sheet is the longest that the cloth between two vertices can be without a stretch.
+    lengths = np.linalg.norm(sheet.rest[held[0]][:, None] - sheet.rest[held[1]][None], axis=2)
+    largest = (0.0, 0.0)
+    for time in sorted(times):
+        points = []
+        for vertices, track, holder in zip(held, tracks, (one, other), strict=True):
+            at_start = sheet.positions[vertices]
+            middle = sheet.positions[held_vertices(sheet, holder)].mean(axis=0)
+            points.append(at_start if track is None else track.moved(at_start, middle, time))
+        distances = np.linalg.norm(points[0][:, None] - points[1][None], axis=2)
+        stretch = float((distances / np.maximum(lengths, 1e-300)).max())
+        if stretch > largest[1]:
+            largest = (time, stretch)
+    return largest
 
 
-LYING = 0.1
-"""Height over a plane, over its own size, up to which a sheet counts as lying on it."""
-
-SPREAD_VERTICES = 400
-"""Vertices of a sheet that are compared with a press: evenly spread over all."""
-
-
-def _spread(count: int) -> npt.NDArray[np.int64]:
-    return np.unique(np.linspace(0, count - 1, min(count, SPREAD_VERTICES)).astype(np.int64))
-
-
-def _falls(body: Mapping[str, Any], points: Floats, normal: Floats) -> Floats:
-    """Return how far a body may fall along a normal until it meets points (N, 3) [m].
-
-    Infinity for points that it never meets.
-    """
-    travelled = np.zeros(len(points))
-    gaps = np.zeros(len(points))
-    # Steps of the distance to the body never pass its surface.
-    for _ in range(FALL_STEPS):
-        gaps = np.maximum(start_gap(body, points + travelled[:, None] * normal), 0.0)
-        travelled = travelled + gaps
-    return np.where((gaps < FALL_TOLERANCE) & (travelled < MAX_EXTENT), travelled, np.inf)
-
-
-FALL_STEPS = 64
-"""Steps along the distance after which a grazing fall counts as a miss."""
-
-FALL_TOLERANCE = 1e-6
-"""Distance at which a fall has met the body [m]."""
+def _some(vertices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return at most `COMPARED_VERTICES` of some vertices, evenly spread."""
+    count = min(len(vertices), COMPARED_VERTICES)
+    if not count:
+        return vertices
+    return vertices[np.linspace(0, len(vertices) - 1, count).astype(np.int64)]
