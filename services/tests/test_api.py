@@ -448,8 +448,8 @@ def test_metrics_tell_how_tasks_ended_and_what_is_stored(
     assert 'stickslip_task_seconds_count{outcome="succeeded",stage="simulate"} 2.0' in text
     assert 'stickslip_task_seconds_sum{outcome="rejected",stage="simulate"} 2.0' in text
     assert (
-        'stickslip_task_failures_total{outcome="rejected",reason="solver_diverged",stage="simulate"} 2.0'
-        in text
+        'stickslip_task_failures_total{outcome="rejected",reason="solver_diverged",'
+        'stage="simulate"} 2.0' in text
     )
     assert (
         'stickslip_task_failures_total{outcome="failed",reason="renderer_crash",stage="render"} 2.0'

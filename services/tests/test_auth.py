@@ -113,7 +113,7 @@ def test_only_its_owner_reads_the_key(app: FastAPI, client: httpx.Client) -> Non
 
 
 # --- keys
-# -------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -286,7 +286,7 @@ def test_keys_are_made_and_revoked_from_the_command_line(tmp_path: Path) -> None
 
 
 # --- off loopback
-# -----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def test_off_loopback_only_with_tls_or_a_proxy(tmp_path: Path) -> None:

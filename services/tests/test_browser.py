@@ -92,10 +92,11 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
     jobs = [f"/jobs/{job.id}" for job in (done, running)]
     samples = [f"{root}/samples/{slot}" for slot in (0, 3)]
     uploads = [certificate(extent) for extent in ("full", "quick")]
-    certificates = [
-        f"/certificates/{register_certificate(context.database, context.store, upload, context.clock()).digest}"
+    entries = [
+        register_certificate(context.database, context.store, upload, context.clock())
         for upload in uploads
     ]
+    certificates = [f"/certificates/{entry.digest}" for entry in entries]
     shown = [
         page
         for job, clip in clips

@@ -149,7 +149,7 @@ def test_too_many_connections_are_refused(quick: str, monkeypatch: pytest.Monkey
 def test_idle_connections_are_kept_longer_than_clients_keep_them(
     quick: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With equal times, a request now and then meets a connection that is being closed, and fails."""
+    """With equal times, a request sometimes meets a connection that is being closed, and fails."""
     assert protocol.IDLE_SECONDS >= 2 * (httpx.Limits().keepalive_expiry or 0.0) > 0.0
     monkeypatch.setattr(protocol, "IDLE_SECONDS", 0.3)
     begin = time.monotonic()

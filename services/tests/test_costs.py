@@ -51,7 +51,7 @@ def finish(
 
 
 # --- limits
-# -----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def timings(*durations: float) -> StageTimings:
@@ -153,7 +153,7 @@ def test_what_was_measured_long_ago_fades(context: Context, worker: PretendWorke
 
 
 # --- quarantine
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def poison_of(worker: PretendWorker, clock: ManualClock, context: Context, reason: Reason) -> str:
@@ -269,7 +269,7 @@ def test_a_lost_worker_charges_no_task_until_it_is_no_accident(
 
 
 # --- priorities
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def jobs_of(context: Context, leases: tuple[Lease, ...]) -> list[float]:

@@ -1,4 +1,4 @@
-"""The time that is left: every term of its mean and variance, against numbers worked out by hand."""
+"""The time that is left: each term of its mean and variance, against numbers worked by hand."""
 
 from math import sqrt
 

@@ -15,7 +15,10 @@ pytestmark = pytest.mark.databases
 
 INDEXES = {
     "sqlite": "SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name",
-    "postgresql": "SELECT indexname AS name, indexdef AS sql FROM pg_indexes WHERE schemaname = 'public' ORDER BY 1",
+    "postgresql": (
+        "SELECT indexname AS name, indexdef AS sql FROM pg_indexes "
+        "WHERE schemaname = 'public' ORDER BY 1"
+    ),
 }
 
 

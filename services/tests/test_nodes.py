@@ -192,5 +192,6 @@ def test_every_sample_once_whoever_is_killed(
     with capsys.disabled():
         print(f"\n{KILLS} kills ({dict(kills)}) in {(time.monotonic() - began) / 60:.1f} min")
         print(
-            f"{len(jobs)} jobs, each of {len(jobs) * SAMPLES} samples once; longest wait {longest:.1f} s"
+            f"{len(jobs)} jobs, each of {len(jobs) * SAMPLES} samples once; "
+            f"longest wait {longest:.1f} s"
         )

@@ -322,7 +322,7 @@ class QueueMachine(RuleBasedStateMachine):
         return held is not None and held[:2] == (worker.id, lease.token)
 
     def _forget_expired(self) -> None:
-        """Forget leases that have had their duration, of workers that have been silent for as long."""
+        """Forget leases that have had their duration, of workers that were silent for as long."""
         now, seconds = self.clock(), self.settings.lease_seconds
         self.holders = {
             task: held

@@ -30,7 +30,7 @@ from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 
 @pytest.fixture
 def made(settings: Settings) -> dict[str, object]:
-    """Two datasets, one with a rejected sample; then the database is lost. Return their listings."""
+    """Two datasets, one with a rejected sample; then the database is lost. Their listings."""
     context = Context.open(settings)
     start(context)
     worker = PretendWorker(DirectApi(context), context.store).register()
@@ -229,8 +229,8 @@ def test_the_directory_of_an_earlier_state_is_refused_and_not_touched(
     before = settings.database_path.read_bytes()
     sentence = one_sentence(settings, capsys)
     assert (
-        f"was made by an earlier state of this version of stickslip, whose tables were others (schema {revision})"
-        in sentence
+        "was made by an earlier state of this version of stickslip, whose tables were others "
+        f"(schema {revision})" in sentence
     )
     assert (
         f"move {settings.database_path} away and run `stickslip reindex --data {settings.data}`"

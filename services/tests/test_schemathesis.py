@@ -87,7 +87,7 @@ def make_datasets(context: Context) -> None:
 
 
 def cancel_jobs(context: Context, stop: threading.Event) -> None:
-    """End the jobs that are made: the event stream of one that waits for a worker would never end."""
+    """End the jobs that are made: the stream of one that waits for a worker would never end."""
     while not stop.wait(0.1):
         for job in list_jobs(context):
             if job.state.is_open:

@@ -1,4 +1,7 @@
-"""`stickslip up` with real processes; the dispatcher is a stub that prints its arguments and waits."""
+"""`stickslip up` with real processes.
+
+The dispatcher is a stub that prints its arguments and waits.
+"""
 
 import os
 import signal
@@ -110,7 +113,10 @@ def test_up_starts_all_once(up: Up) -> None:
     port = up.url.rsplit(":", 1)[1]
     assert port != "0"
     words = sorted(line.partition(" ")[2] for line in up.log.read_text().splitlines())
-    expected = f"dispatch --once --ray-data {up.data} --url {up.url} --store {up.data / 'store'} --name local"
+    expected = (
+        f"dispatch --once --ray-data {up.data} --url {up.url} --store {up.data / 'store'} "
+        "--name local"
+    )
     assert words == [
         f"{expected} --key-file {up.data / 'worker-key'}",
         f"head --ray-data {up.data} --cpus 3",

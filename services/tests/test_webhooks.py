@@ -1,4 +1,4 @@
-"""Webhooks: every event is delivered, in order and signed, whatever receivers and coordinators do."""
+"""Webhooks: every event is delivered, in order and signed, whatever its receivers do."""
 
 import json
 import socket

@@ -213,6 +213,7 @@ def _serve(settings: Settings, listener: socket.socket) -> int:
         ssl_keyfile=settings.tls_key,
     )
     protocol.allow_many_files()
+    # Event streams hold their connections for hours.
     server = _Server(config, settings.url)
     try:
         server.run(sockets=[listener])

@@ -64,6 +64,7 @@ def create_key(
     """
     if not 1 <= len(name) <= 100:
         raise CommandError(f"name must have 1 to 100 characters, and has {len(name)}")
+    # The prefix lets scanners of source code find a key that was committed by mistake.
     secret = f"sk_{secrets.token_urlsafe(32)}"
     key_id = _insert(connection, name, scopes, secret, now, project=check_project(project))
     scope_names = [scope for scope in Scope if scope in scopes]
@@ -80,6 +81,7 @@ def list_keys(connection: Connection) -> Sequence[Row[Any]]:
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:
     """Revoke a key; raise NotFoundError."""
+    # The row stays: the audit log names the key, and its first revocation counts.
     revoked = update(api_keys).values(revoked_at=func.coalesce(api_keys.c.revoked_at, now))
     if connection.execute(revoked.where(api_keys.c.id == key_id)).rowcount == 0:
         raise NotFoundError(f"there is no key {key_id[:100]!r}")
@@ -145,6 +147,8 @@ class KeyRing:
     def holder_of(self, secret: str) -> Principal | None:
         """Return the holder of a secret; None if it is unknown or revoked."""
         with self._lock:
+            # One request after the other reads the database once a second; the others use what it
+            # has read, so that a request costs no query.
             if not self.is_fresh:
                 with self._database.read() as connection:
                     rows = connection.execute(

@@ -126,6 +126,7 @@ def is_visible_version() -> ColumnElement[bool]:
     principal = current_principal()
     if principal.sees_all:
         return true()
+    # Jobs that specify the same samples have the same publish task.
     has_made = jobs.c.publish_task == dataset_versions.c.publish_task
     has_job = exists().where(has_made, is_visible_project(jobs.c.project))
     if principal.project:

@@ -30,6 +30,7 @@ def set_quota(
     connection: Connection, name: str, *, max_samples: int | None, max_jobs: int | None, now: float
 ) -> None:
     """Set the quota of a project from the next submission on; raise CommandError for a bad name."""
+    # A quota of None for both is that of a project that has no row.
     connection.execute(delete(projects).where(projects.c.name == check_project(name)))
     connection.execute(
         insert(projects).values(name=name, max_samples=max_samples, max_jobs=max_jobs)
@@ -41,6 +42,7 @@ def set_quota(
 
 def list_projects(connection: Connection) -> list[Project]:
     """Return the projects that have a quota, a key or a job, by name."""
+    # A project needs no entry of its own: its keys and jobs name it.
     names = {
         *connection.scalars(select(projects.c.name)),
         *connection.scalars(select(api_keys.c.project).distinct()),

@@ -64,6 +64,7 @@ def create_webhook(
     _check(url)
     secret = f"whsec_{b64encode(secrets.token_bytes(32)).decode()}"
     name = f"hook-{secrets.token_hex(8)}"
+    # Events before now are not delivered.
     last = connection.scalar(select(func.max(events.c.id))) or 0
     connection.execute(
         insert(webhooks).values(
@@ -123,6 +124,7 @@ class WebhookDelivery:
         Each webhook has a thread of its own, so a slow receiver holds up no other. The threads of
         slow ones go on when this returns.
         """
+        # A claim is a write, so only webhooks that have something to receive are claimed.
         with self._database.read() as connection:
             due = connection.scalars(select(webhooks.c.seq).where(_is_due(self._clock()))).all()
             behind = [seq for seq in due if _next_message(connection, seq) is not None]
@@ -178,11 +180,13 @@ class WebhookDelivery:
                 "make the webhook again"
             )
         now = self._clock()
+        # The position moves with each message that was received, so none is lost or skipped.
         if not fault:
             delivered = {"position": event, "failures": 0, "failing_since": None, "fault": ""}
             with self._database.write() as connection:
                 connection.execute(row_update.values(delivered | {"next_at": now + CLAIM_SECONDS}))
             return None
+        # The message stays the next one, which keeps events in order.
         wait = WAITS[min(row.failures, len(WAITS) - 1)]
         logger.warning("webhook %s: %s; it is tried again in %g s", row.id, fault, wait)
         failed = {
@@ -249,6 +253,7 @@ def _send(url: str, secret: str, message_id: str, body: str, now: float) -> str:
 
 async def _status(url: str, body: str, headers: dict[str, str]) -> int:
     """Post a message; return the status of the answer, whose body is not read."""
+    # The caller limits the whole delivery. A proxy of the environment is for clients.
     client = httpx.AsyncClient(timeout=None, trust_env=False)
     async with client, client.stream("POST", url, content=body, headers=headers) as response:
         return response.status_code

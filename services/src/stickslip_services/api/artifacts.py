@@ -56,6 +56,7 @@ def serve(
         "Accept-Ranges": "bytes",
         "Cache-Control": CACHE_CONTROL,
     }
+    # The digest is the tag, so a client that has it has the file.
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     if size is None:
@@ -70,6 +71,7 @@ def serve(
         span = _span(range_header, size, headers)
 
     first, last = (0, size - 1) if span is None else span
+    # With a length, a client notices a body that was cut off.
     headers["Content-Length"] = str(last - first + 1)
     if span is not None:
         headers["Content-Range"] = f"bytes {first}-{last}/{size}"

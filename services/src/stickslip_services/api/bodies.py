@@ -133,6 +133,7 @@ class JsonBody(Generic[T]):
 
     def _refusal(self, error: ValidationError, values: object) -> ProblemError:
         """Return the problem that lists the first wrong fields of a document."""
+        # A field error takes time, to find the name that was meant: the first ones suffice.
         fields = field_errors(error, values, self._type, at_most=SHOWN_ERRORS)
         sentences = [
             f"{field.pointer or 'the document'}: {field.rule}"

@@ -111,6 +111,7 @@ class OriginMiddleware:
             await refusal.answer(scope, receive, send)
 
     def _refusal(self, scope: HttpScope) -> ProblemError | None:
+        # By DNS rebinding, a page of another site reaches this machine under its own host name.
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name = _host_name(host)
@@ -202,6 +203,7 @@ def _unauthorized(reason: str) -> ProblemError:
 
 def needed_scope(method: str, path: str) -> Scope | None:
     """Return the scope that a request needs; None if it needs no key."""
+    # Probes and the scripts of the pages tell nothing.
     if path in ("/livez", "/readyz") or path.startswith(STATIC_PATH):
         return None
     if path.startswith("/v1/worker") and method not in _SAFE_METHODS:

@@ -62,6 +62,7 @@ def describe(app: FastAPI) -> dict[str, Any]:
         # Requests allow more forms than answers (short forms of axes), so their schema holds for
         # both.
         components.update(_body_components())
+        # A tag is the first word of a path, by which readers of the document find an operation.
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
                 operation["tags"] = [
@@ -86,6 +87,7 @@ def _tidy(operation: dict[str, Any]) -> None:
 
     Make a summary; remove null from parameters.
     """
+    # Our own 422 is a problem document; FastAPI adds another where it could refuse a parameter.
     content = operation["responses"].get("422", {}).get("content", {})
     if content.get("application/json", {}).get("schema") == {
         "$ref": "#/components/schemas/HTTPValidationError"
@@ -94,7 +96,8 @@ def _tidy(operation: dict[str, Any]) -> None:
     if "description" in operation:  # its first sentence
         sentence = re.split(r"(?<=[.;:]) |\n", operation["description"], maxsplit=1)[0]
         operation["summary"] = sentence.rstrip(".;:")
-    for parameter in operation.get("parameters", ()):  # an optional one is omitted
+    # An optional parameter is omitted, and never null.
+    for parameter in operation.get("parameters", ()):
         for kind in parameter["schema"].pop("anyOf", ()):
             parameter["schema"] |= {} if kind == {"type": "null"} else kind
 
@@ -128,6 +131,7 @@ def _name_by_title(document: dict[str, Any]) -> None:
     For example `ListAxisMu`.
     """
     components = document["components"]["schemas"]
+    # A title that is taken stays a derived name.
     for name in list(components):
         title = components[name].get("title", name)
         if title != name and title.isidentifier() and title not in components:

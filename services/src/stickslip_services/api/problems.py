@@ -131,6 +131,7 @@ def _answer(request: Request, error: Exception) -> Response:
 
 
 def _problem_of(request: Request, error: Exception) -> ProblemError:
+    # In the order of the table: an error may be of several of these types.
     for error_type, problem_of in _PROBLEMS.items():
         if isinstance(error, error_type):
             return problem_of(request, error)
@@ -145,6 +146,7 @@ def _as_it_is(_request: Request, error: ProblemError) -> ProblemError:
 
 
 def _of_refusal(request: Request, error: errors.StickslipError) -> ProblemError:
+    # Each error has a status of its own, so a new one without an entry is found by its first test.
     status, code = _STATUS[type(error)]
     if status >= 500:
         logger.error("%s %s: %s", request.method, request.url.path, error)
@@ -198,6 +200,7 @@ def _of_http(request: Request, error: HTTPException) -> ProblemError:
 
 def _of_database(request: Request, error: OperationalError) -> ProblemError:
     logger.error("%s %s: %s", request.method, request.url.path, error)
+    # SQLite and PostgreSQL have no common class for a lock that another process holds.
     if any(words in str(error) for words in ("locked", "busy", "lock timeout")):
         headers = {"Retry-After": "1"}
         detail = "the database is busy; try again"
@@ -229,6 +232,7 @@ _PROBLEMS: dict[type[Exception], Callable[..., ProblemError]] = {
 
 def _allowed_methods(request: Request) -> str:
     """Return the methods of a resource: those of the routes with the longest matching template."""
+    # Starlette answers with the first route that has the path, and other routes may have it, too.
     candidates = [
         route
         for route in request.app.state.routes

@@ -1,5 +1,6 @@
 """What jobs build on: certificates, and the uploaded files that specs name by digest."""
 
+from pydantic import TypeAdapter
 from sqlalchemy import Connection, Row, insert, select, update
 from stickslip_schemas.base import ARTIFACT, Sha256
 from stickslip_schemas.documents.certificate import Certificate
@@ -16,6 +17,8 @@ from stickslip_services.catalog.inspector import INSPECTOR
 from stickslip_services.database.database import Database, PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates, uploads
 from stickslip_services.errors import NotFoundError, UnknownFileError
+
+_FAULTS = TypeAdapter(list[FieldError])
 
 _NOT_UPLOADED = "must name a file that was uploaded; `stickslip upload FILE` does it"
 _NOT_RESOLVED = (
@@ -46,6 +49,8 @@ def register_certificate(
     database: Database, store: Store, certificate: Certificate, now: float
 ) -> CertificateEntry:
     """Store a certificate, and register it; a known one becomes the newest again."""
+    # The file is written first: a row without its file would be an error for ever, a file without
+    # a row is garbage that `stickslip gc` collects.
     artifact = store.publish(certificate.canonical())
     values = {
         "created_at": now,
@@ -137,7 +142,7 @@ def _start_faults(store: Store, spec: JobSpec) -> list[FieldError]:
     except UnfitFileError as error:
         rule = f"must be a scene whose start can be checked: {error}"
         return [FieldError(pointer="/scene", rule=rule, value="")]
-    return [FieldError.model_validate(fault) for fault in faults]
+    return _FAULTS.validate_python(faults)
 
 
 def _visible_uploads(database: Database, spec: JobSpec) -> set[Sha256]:
@@ -153,6 +158,7 @@ def _broken_rule(
     store: Store, spec: JobSpec, pointer: str, digest: Sha256, visible: set[Sha256]
 ) -> str:
     """Return the rule that a file at a pointer breaks; an empty text if it fits."""
+    # Everybody may use what comes with the distribution.
     built_in = built_in_files().get(digest)
     if built_in is not None and not store.exists(digest):
         store.publish(built_in)

@@ -33,9 +33,11 @@ def store_scene_file(database: Database, store: Store, file: IO[bytes]) -> FileU
 
 def _store(database: Database, store: Store, file: IO[bytes]) -> tuple[Sha256, int]:
     """Store an artifact for the project of the principal; return its digest and size [bytes]."""
+    # Only a file that was inspected is read into the coordinator, and at most two at a time.
     file.seek(0)
     data = file.read()
     row = {"project": current_principal().project, "digest": store.publish(data)}
+    # The row gives the project the right to name the file in its specs.
     with database.write() as connection:
         known = connection.scalar(select(uploads.c.digest).filter_by(**row))
         if known is None:

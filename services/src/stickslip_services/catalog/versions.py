@@ -51,6 +51,7 @@ def stored_contents(store: Store, manifest: Sha256) -> Contents:
 
     Sections are read on demand.
     """
+    # The store compares an artifact with its digest, so a damaged manifest raises here.
     document = Manifest.model_validate_json(store.read(manifest))
     return Contents(document, lambda file: store.read(file.sha256))
 
@@ -79,6 +80,8 @@ def read_version(store: Store, output: PublishOutput) -> Manifest:
         raise ValueError(
             f"the manifest's dataset is {manifest.dataset}, and its spec is that of another"
         )
+    # Sizes are looked up and not contents: the worker has just written them, and the scrub reads
+    # them later.
     files = list(contents.files())
     sizes = in_parallel(lambda file: store.size(file.sha256), files, at_once=HEADS_AT_ONCE)
     for file, size in zip(files, sizes, strict=True):
@@ -162,6 +165,7 @@ def commit_version(
     now: float,
 ) -> None:
     """Commit a version; with its first version a dataset gets its `name`."""
+    # The first version makes the dataset.
     if connection.scalar(select(datasets.c.seq).where(datasets.c.id == manifest.dataset)) is None:
         row = {
             "id": manifest.dataset,
@@ -266,6 +270,7 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
 
     Raises OSError or BrokenSectionError where the store has lost or damaged it, or what lists it.
     """
+    # The manifest cannot list itself, nor the seal that holds its digest.
     digests = sealed_digests(version.manifest, version.group)
     if path in digests:
         return FileEntry(path=path, sha256=digests[path], size=store.size(digests[path]))

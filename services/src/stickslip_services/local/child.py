@@ -83,8 +83,10 @@ class Child:
             return
         if not self.has_ended():
             return
+        # Its own children go with it.
         status = self._reap()
         lifetime = time.monotonic() - self.started_at
+        # One that has run for a while may die and start again as often as it likes.
         if lifetime < self.start_seconds:
             self.failed_starts += 1
         else:

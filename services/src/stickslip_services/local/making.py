@@ -165,6 +165,7 @@ def _written(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tuple[
 
     Yield the arguments that name them, and their store.
     """
+    # A store of its own, since a coordinator may be using that of the data directory.
     with tempfile.TemporaryDirectory(prefix="stickslip-scene-") as temporary:
         store = open_store(temporary)
         for data in (*files.values(), *built_in_files().values()):

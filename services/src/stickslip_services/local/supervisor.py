@@ -142,6 +142,7 @@ def run(
     data = settings.data
     (data / "logs").mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
+        # Before anything else: a second supervisor must not touch what the first has.
         lock = stack.enter_context(locked(data))
         signals = _stop_signals()
         # The supervisor owns the socket, so requests wait while the coordinator restarts.
@@ -161,8 +162,10 @@ def run(
             coordinator.start()
             if not _wait_until_ready(settings, coordinator, signals):
                 return 0
+            # Other commands find the service by this file, so it appears when requests are answered.
             write_durably(data / "url", f"{settings.url}\n".encode())
             on_ready(settings.url)
+            # Ray and the dispatcher start here, like children that have died.
             while not signals:
                 for child in children:
                     child.restart_if_dead()
@@ -190,6 +193,7 @@ def _coordinator(settings: Settings, lock: int, listener: socket.socket) -> Chil
     arguments = ["--data", str(settings.data), "--fd", str(socket_number)]
     command = [sys.executable, "-m", "stickslip_services.app", *arguments]
     child = _child("coordinator", settings.data, command)
+    # The coordinator keeps the lock if the supervisor is killed, until it has ended.
     child.inherited = (lock, socket_number)
     child.private = settings.variables
     child.never_gives_up = True

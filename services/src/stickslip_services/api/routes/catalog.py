@@ -107,6 +107,8 @@ def get_file(
 @router.get("/v1/previews/{digest}", **serves({"image/png": _BINARY, "image/webp": _BINARY}))
 def get_preview(digest: str, request: Request, context: ContextDep) -> Response:
     """Return the picture of a sample."""
+    # An artifact is served only if it is a preview of a sample that the principal sees: the store
+    # holds files of all projects.
     with context.database.read() as connection:
         if not (is_sha256(digest) and is_preview(connection, digest)):
             raise NotFoundError(f"there is no preview {digest[:100]!r}")

@@ -121,6 +121,7 @@ class Metrics:
         self._requests.labels(method, route, str(status)).observe(seconds)
 
     def count_reports(self, batch: ReportBatch, answer: ReportAnswer) -> None:
+        # A report that was refused, or accepted before, measures nothing new.
         for report, verdict in zip(batch.reports, answer.verdicts, strict=True):
             result = report.result
             if verdict.verdict != "accepted" or result is None:

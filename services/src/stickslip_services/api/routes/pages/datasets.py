@@ -164,6 +164,7 @@ def get_sample(
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.mp4")
 def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
     """Return a clip, or its ground truth, as MP4 with 10 frames a second."""
+    # The browser plays the film; without PyAV the page shows its frames.
     data = opened.data
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
