@@ -1,11 +1,13 @@
-"""Transactions on the database (SQLite in the data directory, or PostgreSQL at a URL), documents and
-pages.
+"""Transactions on the database, documents and pages.
+
+The database is SQLite in the data directory, or PostgreSQL at a URL.
 
 A write transaction excludes other writers from its first statement on, so it never conflicts at its
 end, and needs no retries.
 """
 
 import os
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,6 +21,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 from sqlalchemy import URL, Column, Connection, Engine, Row, Select, create_engine, event
+from sqlalchemy.pool import ConnectionPoolEntry
 from stickslip_schemas.documents.responses import Page
 
 Clock = Callable[[], float]
@@ -40,6 +43,8 @@ class Role(Enum):
 
 
 class Database:
+    """Transactions on a database: any number of reads, and one write at a time."""
+
     def __init__(self, reader: Engine, writer: Engine, *others: Engine) -> None:
         self._reader = reader
         self._writer = writer
@@ -77,9 +82,7 @@ class Database:
         return self.write()
 
     def analyse(self) -> None:
-        """Tell the database how large its tables have become, where it must know that to choose
-        plans.
-        """
+        """Tell the database how large its tables have become, if it needs that to choose plans."""
         return
 
     def is_alone(self, connection: Connection) -> bool:
@@ -113,10 +116,11 @@ class PageRequest:
 
 
 def as_datetime(seconds: float) -> datetime:
+    """Return a time in UTC [s since 1970]."""
     return datetime.fromtimestamp(seconds, UTC)
 
 
-def document_of(model: type[M], row: Any, **more: Any) -> M:
+def document_of(model: type[M], row: object, **more: object) -> M:
     """Return a document with the values of a row, or of an object, for its fields, and with `more`.
 
     Times, in seconds since 1970, become dates in UTC.
@@ -185,7 +189,9 @@ class SqliteDatabase(Database):
         super().__init__(reader, writer)
 
 
-def _prepare(pragmas: Iterable[str], connection: Any, _record: Any) -> None:
+def _prepare(
+    pragmas: Iterable[str], connection: sqlite3.Connection, _record: ConnectionPoolEntry
+) -> None:
     connection.isolation_level = None  # the listeners begin transactions, not the driver
     connection.text_factory = partial(
         str, encoding="utf-8", errors="replace"

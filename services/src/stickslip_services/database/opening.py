@@ -1,6 +1,4 @@
-"""Opening a coordinator's database and migrating it, or refusing it with one sentence on what to
-do.
-"""
+"""Opening a coordinator's database and migrating it, or refusing it with what to do."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -88,19 +86,23 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
         given = {"--store": settings.store, "--database": settings.database}
         same = " and ".join(option for option, value in given.items() if value is not None)
         raise DatabaseRefusedError(
-            f"{settings.store_place} holds datasets, and the database {name} is gone: run `stickslip reindex --data "
+            f"{settings.store_place} holds datasets, and the database {name} is gone: run "
+            "`stickslip reindex --data "
             f"{settings.data}`{same and f' with the same {same}'} to find them again"
         )
     known = {script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()}
     if revision is not None and revision.startswith("0001") and revision not in known:
         # The tables of 0.1.0 before its release: there is no migration from them.
         raise DatabaseRefusedError(
-            f"{name} was made by an earlier state of this version of stickslip, whose tables were others (schema "
-            f"{revision}). Its datasets are in the store {settings.store_place}: {_remedy(settings)}"
+            f"{name} was made by an earlier state of this version of stickslip, whose tables were "
+            "others (schema "
+            f"{revision}). Its datasets are in the store {settings.store_place}: "
+            f"{_remedy(settings)}"
         )
     if revision is not None and revision not in known:
         raise DatabaseRefusedError(
-            f"{name} has the schema {revision}, and this version of stickslip knows {max(known)}: install the version "
+            f"{name} has the schema {revision}, and this version of stickslip knows {max(known)}: "
+            "install the version "
             f"that made it again, or name another {settings.database_option}"
         )
     return revision is not None
@@ -110,22 +112,28 @@ def _remedy(settings: Settings) -> str:
     """Return how to find the datasets of a store again with a new database."""
     if settings.database_url is None:
         return (
-            f"move {settings.database_path} away and run `stickslip reindex --data {settings.data}`, which lists them "
+            f"move {settings.database_path} away and run `stickslip reindex --data "
+            f"{settings.data}`, which lists them "
             "again; results that no dataset has are computed again"
         )
     return (
-        "name an empty database with --database, and run `stickslip reindex` with it, which lists them again; "
+        "name an empty database with --database, and run `stickslip reindex` with it, which lists "
+        "them again; "
         "results that no dataset has are computed again"
     )
 
 
 def _has_versions(settings: Settings) -> bool:
-    """Return whether a store holds datasets; raise DatabaseRefusedError where it is out of reach."""
+    """Return whether a store holds datasets.
+
+    Raises DatabaseRefusedError where it is out of reach.
+    """
     try:
         return next(open_store(settings.store_place).versions(MANIFEST_NAME), None) is not None
     except OSError as error:
         raise DatabaseRefusedError(
-            f"the database {settings.database_name} is new, and the store {settings.store_place} cannot be asked "
+            f"the database {settings.database_name} is new, and the store {settings.store_place} "
+            "cannot be asked "
             f"whether it holds datasets: {error.strerror or error}"
         ) from error
 
@@ -166,7 +174,8 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
     name = settings.database_name
     if settings.database_path.exists():
         raise DatabaseRefusedError(
-            f"the queue must be in {name}, and {settings.database_path} holds another one: move that file away"
+            f"the queue must be in {name}, and {settings.database_path} holds another one: move "
+            "that file away"
         )
     database = connect(settings, role)
     try:
@@ -185,13 +194,15 @@ def _postgresql_revision(settings: Settings, role: Role) -> str | None:
                     text("SELECT has_schema_privilege(current_schema(), 'CREATE')")
                 ):
                     raise DatabaseRefusedError(
-                        f"its user may not make tables in the database {name}: make the user its owner, "
+                        f"its user may not make tables in the database {name}: make the user its "
+                        "owner, "
                         "for example with `createdb --owner`"
                     )
                 return None
             if "alembic_version" not in tables or "job_tasks" not in tables:
                 raise DatabaseRefusedError(
-                    f"{name} is not a database of stickslip: give it one of its own, which is empty, with --database"
+                    f"{name} is not a database of stickslip: give it one of its own, which is "
+                    "empty, with --database"
                 )
             return str(connection.scalar(text("SELECT version_num FROM alembic_version")))
     except DBAPIError as error:

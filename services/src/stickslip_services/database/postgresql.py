@@ -15,11 +15,15 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 import psycopg
+from psycopg.abc import Buffer
 from psycopg.types.string import StrDumper
 from sqlalchemy import URL, Connection, create_engine, event
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from stickslip_services.database.database import Database, Role
 from stickslip_services.errors import DatabaseRefusedError
+
+Driver = psycopg.Connection[tuple[object, ...]]
 
 logger = logging.getLogger(__name__)
 
@@ -59,13 +63,15 @@ _ENTER = {
     Role.visitor: "SELECT true",
 }
 _REFUSALS = {
-    Role.coordinator: "`stickslip rm`, `gc` or `reindex` is at work on the database {}: wait until it has ended",
-    Role.upkeep: "the database {} is in use by a coordinator, or by another `stickslip rm`, `gc` or `reindex`: "
-    "stop it first",
+    Role.coordinator: "`stickslip rm`, `gc` or `reindex` is at work on the database {}: wait until "
+    "it has ended",
+    Role.upkeep: "the database {} is in use by a coordinator, or by another `stickslip rm`, `gc` "
+    "or `reindex`: stop it first",
 }
 _OTHERS = (
-    f"SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid = {_LOCKS} AND objid = 2 AND objsubid = 2 "
-    "AND pid != pg_backend_pid() AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+    f"SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid = {_LOCKS} "
+    "AND objid = 2 AND objsubid = 2 AND pid != pg_backend_pid() "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
 )
 
 
@@ -151,37 +157,35 @@ class PostgresqlDatabase(Database):
                 logger.warning("no news of other coordinators from %s: %s", self._name, error)
                 await asyncio.sleep(1.0)
 
-    def _prepare_writer(self, connection: Any, _record: Any) -> None:
+    def _prepare_writer(self, connection: Driver, _record: ConnectionPoolEntry) -> None:
         for setting in _WRITER_SETTINGS:
             connection.execute(f"SET {setting}")
         if not self._durable:
             connection.execute("SET synchronous_commit = off")
-        (entered,) = connection.execute(_ENTER[self._role]).fetchone()
+        row = connection.execute(_ENTER[self._role]).fetchone()
         connection.commit()
-        if not entered:
+        if row is None or not row[0]:
             raise DatabaseRefusedError(_REFUSALS[self._role].format(self._name))
 
 
-def _leave(connection: Any, _record: Any) -> None:
+def _leave(connection: Driver, _record: ConnectionPoolEntry) -> None:
     """Release the locks at once: the server ends a session some time after its connection."""
     with suppress(psycopg.Error):
         connection.execute("SELECT pg_advisory_unlock_all()")
 
 
-def _prepare_reader(connection: Any, _record: Any) -> None:
+def _prepare_reader(connection: Driver, _record: ConnectionPoolEntry) -> None:
     connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
     connection.read_only = True
 
 
-def _prepare_toucher(connection: Any, _record: Any) -> None:
+def _prepare_toucher(connection: Driver, _record: ConnectionPoolEntry) -> None:
     connection.execute("SET synchronous_commit = off")
     connection.commit()
 
 
 class _TextDumper(StrDumper):
-    """Replaces the character 0, which PostgreSQL cannot store, and which messages and URLs may
-    contain.
-    """
+    """Replaces the character 0, which messages may contain, and PostgreSQL cannot store."""
 
-    def dump(self, obj: str) -> Any:
+    def dump(self, obj: str) -> Buffer | None:
         return super().dump(obj.replace("\0", "\N{REPLACEMENT CHARACTER}"))

@@ -167,8 +167,8 @@ RowType = TypeVar("RowType", bound=tuple[Any, ...])
 class RowQuery(Statement, Generic[RowType]):
     """A query whose rows have a type: a NamedTuple with a field for each selected column, in order.
 
-    Raises TypeError where the fields are not the columns of the statement; of one that is written as
-    text they are not known.
+    Raises TypeError where the fields are not the columns of the statement. Of one that is written
+    as text the columns are not known.
     """
 
     def __init__(self, row_type: type[RowType], statement: Executable | str) -> None:

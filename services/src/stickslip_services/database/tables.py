@@ -28,8 +28,19 @@ _Wide = sa.BigInteger().with_variant(sa.Integer, "sqlite")
 """64 bits: SQLite's INTEGER has them, and it must be called so to be a rowid."""
 
 
-def _table(name: str, *columns: sa.Column[Any] | sa.Index, **options: Any) -> sa.Table:
-    return sa.Table(name, metadata, *columns, **options)
+def _table(
+    name: str,
+    *columns: sa.Column[Any] | sa.Index,
+    sqlite_with_rowid: bool = True,
+    sqlite_autoincrement: bool = False,
+) -> sa.Table:
+    return sa.Table(
+        name,
+        metadata,
+        *columns,
+        sqlite_with_rowid=sqlite_with_rowid,
+        sqlite_autoincrement=sqlite_autoincrement,
+    )
 
 
 def _numbered(name: str, *columns: sa.Column[Any] | sa.Index) -> sa.Table:

@@ -2,13 +2,13 @@
 
 | service | period | work |
 |---|---|---|
-| sweep | `sweep_seconds` | store watch, expiry, retries, waiting jobs, transitions that wait for workers |
+| sweep | `sweep_seconds` | store, expiry, retries, waiting jobs, transitions of jobs |
 | existing datasets | `sweep_seconds` | reads large datasets that existed before their jobs |
 | scrub | `sweep_seconds` | reads datasets that nobody has read for a month, while no job runs |
 | planner | `PLAN_SECONDS` | plans jobs of many samples, piece by piece |
 
-Webhooks are delivered by `access.webhooks`. Each service asks first, in a read transaction and by an
-index, whether there is work: a coordinator with thousands of waiting jobs is nearly idle.
+Webhooks are delivered by `access.webhooks`. Each service asks first, in a read transaction and by
+an index, whether there is work: a coordinator with thousands of waiting jobs is nearly idle.
 """
 
 import logging
@@ -102,7 +102,7 @@ def _settle(context: Context) -> None:
         settle_jobs(tx)
 
 
-# ---- Damaged jobs ----------------------------------------------------------------------------------
+# ---- Damaged jobs --------------------------------------------------------------------------------
 
 _ACTIVE_JOBS = RowQuery(
     JobRow,
@@ -132,7 +132,7 @@ def fail_damaged_jobs(context: Context) -> None:
                 end_job(tx, job, JobState.failed, Reason.damaged_row, str(damage))
 
 
-# ---- Store watch -----------------------------------------------------------------------------------
+# ---- Store watch ---------------------------------------------------------------------------------
 
 _IS_OPEN_AND = "FROM jobs WHERE jobs.finished_at IS NULL AND "
 _IS_SCHEDULABLE = "jobs.state IN ('planning', 'queued', 'running')"

@@ -117,7 +117,7 @@ class Notifier:
                 loop.call_soon_threadsafe(event.set)
 
     async def wait(self, seen: int, timeout: float) -> None:
-        """Return when there have been more than `seen` notifications, or after `timeout` seconds."""
+        """Return when there have been more than `seen` notifications, or after `timeout` [s]."""
         entry = (asyncio.get_running_loop(), asyncio.Event())
         with self._lock:
             if self.count != seen:
@@ -156,6 +156,8 @@ class Context:
     turns: Turns = field(default_factory=Turns)
     next_job_check: float = float("-inf")
     """When the rows of the active jobs are checked for damage again [s since 1970]."""
+    no_check_since: int = -1
+    """Number of writes when no job waited for a check of its dataset (`existing_datasets`)."""
     last_situation: tuple[int, tuple[tuple[str, str], ...]] | None = None
     """Writes and workers when it was asked last which jobs no worker can run (`workers`)."""
     next_situation_check: float = float("-inf")

@@ -52,7 +52,8 @@ def pause_job(context: Context, job_id: str) -> JobDetail:
         pausing = (JobState.pausing, JobState.paused)
         if job.state not in (*SCHEDULABLE, *pausing):
             raise ConflictError(
-                f"job {job_id} is {job.state}, and only one that is planning, queued or running can be paused"
+                f"job {job_id} is {job.state}, and only one that is planning, queued or running "
+                "can be paused"
             )
         # A job that waits for the store stays paused after the store works again.
         if job.state not in pausing or job.reason is not None:

@@ -108,8 +108,9 @@ class Leasable(Protocol):
 def compose_task(connection: Connection, task: Leasable, publish: Publish) -> AnyTask:
     """Return the document of a task whose dependencies all have results.
 
-    Raises DamagedRowError where a row is damaged, MissingResultsError, or NoValidSamplesError. Sections of a publish
-    task are stored with `publish`, which takes a while: do not call this in a write transaction.
+    Sections of a publish task are stored with `publish`, which takes a while: do not call this in a
+    write transaction. Raises DamagedRowError where a row is damaged, MissingResultsError, or
+    NoValidSamplesError.
     """
     with reported_damage():
         check_task(task)
@@ -201,7 +202,7 @@ def _read_samples(connection: Connection, job: int, first: int, end: int) -> lis
     return rows
 
 
-# ---- Render ----------------------------------------------------------------------------------------
+# ---- Render --------------------------------------------------------------------------------------
 
 
 def _render_task(connection: Connection, task: Leasable) -> RenderTask:
@@ -218,7 +219,7 @@ def _render_task(connection: Connection, task: Leasable) -> RenderTask:
     return RenderTask.model_validate(document)
 
 
-# ---- Pack ------------------------------------------------------------------------------------------
+# ---- Pack ----------------------------------------------------------------------------------------
 
 
 def _pack_task(connection: Connection, task: Leasable) -> PackTask:
@@ -271,7 +272,7 @@ def _rejection(sample: SampleRow, result: TaskResultRow) -> dict[str, object]:
     }
 
 
-# ---- Publish ---------------------------------------------------------------------------------------
+# ---- Publish -------------------------------------------------------------------------------------
 
 
 class _Rejection(NamedTuple):
@@ -305,8 +306,8 @@ def _check_valid_samples(connection: Connection, job: int, spec: JobSpec) -> Non
     ((reason, count),) = counts.most_common(1)
     raise NoValidSamplesError(
         f"0 of {spec.sample_count} samples are valid, so no dataset is published: all were "
-        f"rejected, most often as {reason} ({count} of {spec.sample_count}). The samples of the job "
-        "are listed with their reasons; change the spec and submit it again"
+        f"rejected, most often as {reason} ({count} of {spec.sample_count}). The samples of the "
+        "job are listed with their reasons; change the spec and submit it again"
     )
 
 

@@ -3,7 +3,7 @@
 With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over
 k_g measured tasks, and p slots to run them on,
 
-    T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  (over the stages left, which run one after the other)
+    T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  over the stages left, in sequence
     var T = sum_g (n_g d_g^2 + n_g^2 d_g^2 / k_g + n_g^2 m_g^2 f^2) / p^2
 
 where M_s is the mean duration of the tasks left of stage s. A running task that reports its
@@ -185,9 +185,7 @@ def known_timings(
 def timings_of(
     costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str
 ) -> StageTimings | None:
-    """Return the shares of a group, or of all groups of the stage and kind where too little is
-    known of it.
-    """
+    """Return the shares of a group, or of all groups of the stage and kind if too few are known."""
     cost = costs.get((stage, kind, group))
     if cost is not None and (cost.is_known or stage in (Stage.pack, Stage.publish)):
         return cost.share

@@ -21,8 +21,9 @@ from stickslip_services.queue.transaction import QueueTransaction
 logger = logging.getLogger(__name__)
 
 SMALL_DATASET = 64 * 2**20
-"""Largest dataset that the sweep checks itself [bytes]: it takes less than a second. Larger ones are
-checked by a service of their own, so that the sweep does not wait for them."""
+"""Largest dataset that the sweep checks itself [bytes]: it takes less than a second.
+
+Larger ones are checked by a service of their own, so that the sweep does not wait for them."""
 
 
 class _ExistingDataset(NamedTuple):
@@ -57,8 +58,14 @@ def check_existing_datasets(context: Context) -> None:
 
 
 def _check_datasets(context: Context, *, max_bytes: int | None) -> None:
+    # Nothing was written since no job waited for a check: an idle coordinator does not ask again.
+    writes = context.notifier.count
+    if context.no_check_since == writes:
+        return
     with context.database.read() as connection:
         existing = _EXISTING_DATASETS.rows(connection)
+    if not existing:
+        context.no_check_since = writes
     for dataset in existing:
         if max_bytes is not None and dataset.bytes > max_bytes:
             continue

@@ -83,7 +83,7 @@ def mark_started(tx: QueueTransaction, leased: Collection[TaskRow]) -> None:
         _MARK_STARTED.run(tx.connection, values)
 
 
-# ---- Return to the queue ---------------------------------------------------------------------------
+# ---- Return to the queue -------------------------------------------------------------------------
 
 
 def requeue(tx: QueueTransaction, leased: Collection[TaskRow], *, is_lost: bool = False) -> None:
@@ -148,7 +148,7 @@ def expire_leases(context: Context) -> None:
         requeue(tx, _TASKS_TO_RETRY.rows(tx.connection, {"b_now": tx.now}))
 
 
-# ---- Failures --------------------------------------------------------------------------------------
+# ---- Failures ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +261,7 @@ def _set_state(
     tx.connection.execute(change)
 
 
-# ---- What users see --------------------------------------------------------------------------------
+# ---- What users see ------------------------------------------------------------------------------
 
 
 def reproducer(name: str, settings: Settings) -> str:

@@ -107,7 +107,7 @@ def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
         set_job_state(tx, job, JobState.running if started else JobState.queued)
 
 
-# ---- Tasks -----------------------------------------------------------------------------------------
+# ---- Tasks ---------------------------------------------------------------------------------------
 
 
 class _KnownTask(NamedTuple):
@@ -352,7 +352,7 @@ def _payload(task: PlannedTask, job: int) -> str:
     return task.payload
 
 
-# ---- Links, totals and samples ---------------------------------------------------------------------
+# ---- Links, totals and samples -------------------------------------------------------------------
 
 
 def _insert_links(

@@ -1,9 +1,9 @@
-"""Damage of the database, all of it: rows whose digest differs, and faults that the database reports.
+"""Damage of the database: rows whose digest differs, and faults that the database reports.
 
 | row | its digest covers | checked when |
 |---|---|---|
 | task | key, stage, build, payload | it is leased |
-| result of a task | key, state, reason, message, output | a dependent is leased; samples are listed |
+| result | key, state, reason, message, output | a dependent is leased; samples are listed |
 | sample | all its columns | its shard or its dataset is made; it is listed |
 | job | spec, builds, certificate | it is planned, served, packed, published or shown |
 
@@ -101,7 +101,7 @@ def sample_digest(
 
 
 def check_samples(rows: Sequence[SampleRow], job: int, slots: Iterable[int]) -> None:
-    """Raise DamagedRowError where rows of `samples` differ, or are not those of `slots`, in order."""
+    """Raise DamagedRowError where rows of `samples` differ, or are not those of `slots`."""
     row_of_slot = {row.slot: row for row in rows}
     for slot in slots:
         row = row_of_slot.get(slot)

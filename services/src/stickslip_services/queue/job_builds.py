@@ -1,6 +1,6 @@
 """The builds that jobs were planned for, read and checked once each.
 
-They never change once a job is planned. A request for tasks looks at those of every schedulable job.
+They never change once a job is planned. A request for tasks needs them of all schedulable jobs.
 """
 
 from sqlalchemy import Connection, bindparam, select

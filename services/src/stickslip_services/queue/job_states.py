@@ -25,7 +25,7 @@ from stickslip_services.queue.ids import task_id
 from stickslip_services.queue.rows import ACTIVE, SCHEDULABLE, TaskRow
 from stickslip_services.queue.transaction import QueueTransaction
 
-# ---- Events ----------------------------------------------------------------------------------------
+# ---- Events --------------------------------------------------------------------------------------
 
 _APPEND_EVENT = Statement(
     insert(events).values(
@@ -66,7 +66,7 @@ def _append_event(tx: QueueTransaction, job: int, name: EventName, data: Documen
     _APPEND_EVENT.run(tx.connection, row)
 
 
-# ---- Transitions -----------------------------------------------------------------------------------
+# ---- Transitions ---------------------------------------------------------------------------------
 
 
 def set_job_state(
@@ -174,7 +174,7 @@ def is_active(connection: Connection, job: int) -> bool:
     return connection.scalar(query) is not None
 
 
-# ---- Transitions that wait for workers -------------------------------------------------------------
+# ---- Transitions that wait for workers -----------------------------------------------------------
 
 # Looked for among the tasks on lease, which are fewer than the tasks of a job.
 _EXCLUSIVE_LEASE: ValueQuery[int] = ValueQuery(

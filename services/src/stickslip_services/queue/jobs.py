@@ -93,8 +93,9 @@ def list_jobs(
     *,
     newest_first: bool = True,
 ) -> Page[Job]:
-    """Return a page of jobs: those of a state and of a project, with `search` in the name, kind, id
-    or dataset.
+    """Return a page of jobs of a state and of a project.
+
+    With `search`, those that have it in the name, kind, id or dataset.
     """
     workers = alive_workers(context, connection)
     query = select(jobs).where(is_visible_project(jobs.c.project))
@@ -199,9 +200,7 @@ def _sample_states(
 def list_previews(
     connection: Connection, job: int, *, count: int = 1000, newest: bool = False
 ) -> list[Preview]:
-    """Return at most `count` previews of a job: the first ones by slot, or the newest ones, newest
-    first.
-    """
+    """Return at most `count` previews of a job: the first ones by slot, or the newest ones."""
     query = select(samples.c.slot, samples.c.labels, previews.c.digest).where(samples.c.job == job)
     query = query.join(previews, previews.c.task == samples.c.render_task)
     if newest:
@@ -270,8 +269,9 @@ def slowest_tasks(connection: Connection, job: int, count: int) -> list[SlowTask
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
-    """Return whether an artifact is a preview that the principal sees, which is served without a
-    dataset.
+    """Return whether an artifact is a preview, which is served without a dataset.
+
+    Previews of jobs that the principal does not see are none.
     """
     query = select(previews.c.task).where(
         previews.c.digest == digest, is_visible_task(previews.c.task)

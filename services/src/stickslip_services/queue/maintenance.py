@@ -1,5 +1,4 @@
-"""Upkeep of a stopped coordinator: removing versions, finding unused artifacts, and recovering a
-lost database.
+"""Maintenance of a stopped coordinator: versions, unused artifacts, and a lost database.
 
 A removed version goes with the jobs that made it, and the tasks that no other job needs. Its files
 stay in the store, where other versions may use them, until `unused` finds them.
@@ -170,6 +169,8 @@ def _needed(database: Database, store: Store) -> set[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
+    """A version of the store, and whether it was inserted."""
+
     name: str
     """Dataset and version, as in `ds-0123456789abcdef:v1`."""
     samples: int

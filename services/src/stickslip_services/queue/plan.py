@@ -1,5 +1,6 @@
-"""The plan of a job: its tasks simulate -> render -> pack -> publish, each keyed by what its result
-depends on.
+"""The plan of a job: its tasks simulate -> render -> pack -> publish.
+
+Each task is keyed by everything that its result depends on.
 
 Planning is pure and slow: a job of many samples is planned piece by piece, outside any transaction.
 `insertion` writes the pieces.

@@ -40,14 +40,19 @@ MAX_MESSAGE = 2000
 _ANY_PLANNING_JOB: ValueQuery[int] = ValueQuery(
     "SELECT seq FROM jobs WHERE jobs.finished_at IS NULL AND state = 'planning' LIMIT 1"
 )
+_ANY_UNPLANNED_JOB: ValueQuery[int] = ValueQuery(
+    "SELECT seq FROM jobs WHERE jobs.finished_at IS NULL AND jobs.builds IS NULL LIMIT 1"
+)
+_IS_UNPLANNED = (
+    text("jobs.finished_at IS NULL AND jobs.builds IS NULL"),
+    jobs.c.state == JobState.queued.value,
+)
 _UNPLANNED_JOBS = RowQuery(
+    JobRow, select(*job_columns(JobRow)).where(*_IS_UNPLANNED).order_by(jobs.c.seq)
+)
+_UNPLANNED_JOB = RowQuery(
     JobRow,
-    select(*job_columns(JobRow))
-    .where(
-        text("jobs.finished_at IS NULL AND jobs.builds IS NULL"),
-        jobs.c.state == JobState.queued.value,
-    )
-    .order_by(jobs.c.seq),
+    select(*job_columns(JobRow)).where(*_IS_UNPLANNED, jobs.c.seq == bindparam("b_job")),
 )
 
 
@@ -82,17 +87,17 @@ def plan_waiting_jobs(context: Context) -> None:
     Fail those that cannot be planned.
     """
     with context.database.read() as connection:
+        # Without a worker thousands of jobs may wait: ask for all of them only if there is one.
+        if _ANY_UNPLANNED_JOB.first(connection) is None:
+            return
+        if not any(worker.builds for worker in present_workers(connection)):
+            return
         waiting = _UNPLANNED_JOBS.rows(connection)
-        is_known = (
-            any(worker.builds for worker in present_workers(connection)) if waiting else False
-        )
-    if not is_known:
-        return
     for row in waiting:
         with context.transaction() as tx:
-            if row not in _UNPLANNED_JOBS.rows(tx.connection):
-                continue  # cancelled, or planned by another coordinator
-            _plan_waiting_job(context, tx, row)
+            # None: cancelled, paused, or planned by another coordinator.
+            if _UNPLANNED_JOB.first(tx.connection, {"b_job": row.seq}) is not None:
+                _plan_waiting_job(context, tx, row)
 
 
 def _plan_waiting_job(context: Context, tx: QueueTransaction, row: JobRow) -> None:

@@ -203,7 +203,7 @@ def _read_frames(
 
 
 def rejected_samples(progress: Progress) -> int:
-    """Return the number of rejected samples of a running job: the rejected tasks of its last stage."""
+    """Return the number of rejected samples of a job: the rejected tasks of its last stage."""
     last = progress.stages.get(Stage.render)
     if last is None or not last.counts:
         last = progress.stages.get(Stage.simulate)

@@ -94,7 +94,7 @@ def reset_results(tx: QueueTransaction, producers: Sequence[Producer]) -> None:
 
 
 def _find_producers(tx: QueueTransaction, consumer: int, digests: set[Sha256]) -> list[Producer]:
-    """Return the tasks that produced `digests`, searched breadth-first from `consumer` downwards."""
+    """Return the tasks that produced `digests`, searched breadth-first below `consumer`."""
     producers: list[Producer] = []
     level = {consumer}
     visited = {consumer}

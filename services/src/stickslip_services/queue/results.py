@@ -73,7 +73,7 @@ class _Judgement:
 
 
 def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
-    """Judge the reports of a worker, one by one, and store the results; raise UnknownWorkerError."""
+    """Judge the reports of a worker and store the results; raise UnknownWorkerError."""
     # The store may answer slowly, so it is asked before the transaction.
     versions: dict[str, Manifest] = {}
     reports = [_check_in_store(context, report, versions) for report in batch.reports]
@@ -111,7 +111,7 @@ def _delete_sections(
                     context.store.delete(digest)
 
 
-# ---- Verdicts --------------------------------------------------------------------------------------
+# ---- Verdicts ------------------------------------------------------------------------------------
 
 
 def _check_in_store(context: Context, report: Report, versions: dict[str, Manifest]) -> Report:
@@ -204,7 +204,10 @@ def _check_against_task(
         message = f"the worker answered with the output of stage {result.output.stage}"
         return _as_failure(result, Reason.internal_error, message)
     if result.outcome == "rejected" and task.stage in (Stage.pack, Stage.publish):
-        message = f"the worker rejected a {task.stage} task, which has no sample to reject: {result.message}"
+        message = (
+            f"the worker rejected a {task.stage} task, which has no sample to reject: "
+            f"{result.message}"
+        )
         return _as_failure(result, Reason.internal_error, message)
     if result.output is not None and task.stage == Stage.publish:
         reserved = find_reserved(tx.connection, task.seq)
@@ -215,7 +218,7 @@ def _check_against_task(
     return result
 
 
-# ---- Results ---------------------------------------------------------------------------------------
+# ---- Results -------------------------------------------------------------------------------------
 
 _RESULT_COLUMNS = (
     "state",
@@ -304,7 +307,7 @@ def _commit(
         complete_job(tx, job.seq, find_committed(tx.connection, publish_task))
 
 
-# ---- Failed attempts -------------------------------------------------------------------------------
+# ---- Failed attempts -----------------------------------------------------------------------------
 
 
 def _end_failed_attempts(

@@ -52,19 +52,22 @@ _RESULTS_BY_JOB = RowQuery(
     ).bindparams(bindparam("b_tasks", expanding=True)),
 )
 _ADD_RESULTS = Statement(
-    "UPDATE job_totals SET succeeded = succeeded + :b_succeeded, rejected = rejected + :b_rejected, "
+    "UPDATE job_totals SET succeeded = succeeded + :b_succeeded, "
+    "rejected = rejected + :b_rejected, "
     "failed = failed + :b_failed, cpu_seconds = cpu_seconds + :b_cpu, "
     "wall_count = wall_count + :b_wall_count, wall_sum = wall_sum + :b_wall, "
     "wall_squares = wall_squares + :b_wall_squares "
     "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
 )
 _REMOVE_RESULTS = Statement(
-    "UPDATE job_totals SET succeeded = succeeded - :b_succeeded, rejected = rejected - :b_rejected, "
+    "UPDATE job_totals SET succeeded = succeeded - :b_succeeded, "
+    "rejected = rejected - :b_rejected, "
     "failed = failed - :b_failed WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
 )
 _ADD_PLANNED = Statement(
     "INSERT INTO job_totals (job, stage, cost_group, total, cached, succeeded, rejected, failed) "
-    "VALUES (:b_job, :b_stage, :b_group, :b_total, :b_cached, :b_succeeded, :b_rejected, :b_failed) "
+    "VALUES (:b_job, :b_stage, :b_group, :b_total, :b_cached, :b_succeeded, :b_rejected, "
+    ":b_failed) "
     "ON CONFLICT (job, stage, cost_group) DO UPDATE SET "
     "total = job_totals.total + excluded.total, cached = job_totals.cached + excluded.cached, "
     "succeeded = job_totals.succeeded + excluded.succeeded, "
@@ -74,7 +77,7 @@ _ADD_PLANNED = Statement(
 
 
 def add_results(connection: Connection, tasks: Collection[int]) -> None:
-    """Add tasks that have just got their result, or failed for good, to the totals of their jobs."""
+    """Add tasks that have just got their result, or failed for good, to the totals of jobs."""
     for batch in batches(tasks):
         rows = _RESULTS_BY_JOB.rows(connection, {"b_tasks": batch})
         _ADD_RESULTS.run_all(connection, [row._asdict() for row in rows])
@@ -115,7 +118,7 @@ def add_planned(
     _ADD_PLANNED.run_all(connection, rows)
 
 
-# ---- Reading ---------------------------------------------------------------------------------------
+# ---- Reading -------------------------------------------------------------------------------------
 
 
 class GroupTotals(NamedTuple):

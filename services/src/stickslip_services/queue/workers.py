@@ -31,6 +31,8 @@ NO_WORKER = (
 
 @dataclass(frozen=True, slots=True)
 class RegisteredWorker:
+    """A session of a dispatcher."""
+
     id: str
     name: str
     builds: Mapping[str, Builds]
@@ -258,10 +260,10 @@ def _worker(row: _WorkerRow) -> RegisteredWorker:
     )
 
 
-# ---- Jobs that no worker can run -------------------------------------------------------------------
+# ---- Jobs that no worker can run -----------------------------------------------------------------
 
 CHECK_SECONDS = 10.0
-"""Interval in which it is asked which jobs can run although nothing is known to have changed [s]."""
+"""Interval of the check which jobs can run, while nothing is known to have changed [s]."""
 
 
 class _JobGroup(NamedTuple):
@@ -356,7 +358,8 @@ def _unschedulable_message(group: _JobGroup, alive: Sequence[RegisteredWorker]) 
             missing.append(stage)
     if missing:
         return (
-            f"no connected worker has the builds that this job was planned for (stages: {', '.join(missing)}); it goes "
+            "no connected worker has the builds that this job was planned for (stages: "
+            f"{', '.join(missing)}); it goes "
             "on when one has. To use the builds of today, cancel the job and submit it again."
         )
     return ""

@@ -16,6 +16,7 @@ _REFUSAL = "the audit log is append-only"
 
 
 def upgrade() -> None:
+    """Make all tables."""
     metadata.create_all(op.get_bind(), checkfirst=False)
     if op.get_bind().dialect.name == "sqlite":
         for verb in ("UPDATE", "DELETE"):
