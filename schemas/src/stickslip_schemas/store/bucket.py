@@ -95,6 +95,7 @@ class BucketStore:
         it with a key of its own [Amazon S3, API reference, Object]. Another tag decides nothing,
         and the object is read.
         """
+        # The size alone decides most cases, and costs no reading.
         head = self._objects.head(artifact_name(digest))
         if head["size"] != len(data):
             return False
@@ -117,6 +118,7 @@ class BucketStore:
         with suppress(RefusedError):
             if length > 0:
                 part = self._objects.get_range(artifact_name(digest), start, length)
+        # A whole part is the usual case; only a short one needs the reason.
         if len(part) == length > 0:
             return part
         if self.size(digest) < start + length:
@@ -169,6 +171,7 @@ class BucketStore:
         show copies.
         """
         for item in self._objects.list_objects(f"{ARTIFACTS}/"):
+            # Objects of somebody else may lie below the prefix.
             digest = item["path"].rpartition("/")[2]
             if is_sha256(digest) and item["path"] == artifact_name(digest):
                 modified_at = item["last_modified"].timestamp()
@@ -218,6 +221,7 @@ class BucketStore:
 
     def probe(self) -> None:
         """Write a small object and delete it; raise OSError if that fails."""
+        # A new name each time: two coordinators may probe at once.
         client = self._objects.with_retry_timeout(PROBE_SECONDS)
         name = f".probe-{random.randbytes(8).hex()}"
         client.put(name, b"probe", mode="overwrite")

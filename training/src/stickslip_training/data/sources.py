@@ -110,6 +110,7 @@ class Source(ABC):
         Raises:
             CorruptDataError: The file has another size than the manifest says.
         """
+        # A whole file is one plain request, and a part is a request with a range.
         count = file.size - offset if length is None else length
         is_whole = count == file.size
         part = None if is_whole else range(offset, offset + count)
@@ -196,6 +197,7 @@ class DirectorySource(Source):
         """Return the bytes of a file, or of a part of it; see `Source`."""
         try:
             with Path(self._root, path).open("rb") as file:
+                # Of the open file: the name may mean another file a moment later.
                 size = os.fstat(file.fileno()).st_size
                 if part is not None:
                     file.seek(part.start)
@@ -287,6 +289,7 @@ class BucketSource(_RemoteSource):
                 f"{self} needs obstore, which is not installed: "
                 + install_hint("stickslip-training", "s3")
             ) from error
+        # The threads of the client stayed in the parent process, and requests would hang.
         if self._client is not None and self._pid != os.getpid():
             raise SourceError(
                 f"{self} cannot be read after a fork: give the DataLoader "
@@ -321,6 +324,7 @@ class HttpSource(_RemoteSource):
         url = url.rstrip("/")
         version = re.match(r"(.*/versions/\d+)(/files|/manifest)?$", url)
         super().__init__(f"{version[1]}/files" if version else url)
+        # A key that the caller passes is for this URL. That of the environment may not be.
         self._api_key = api_key or api_key_for(self._url)
 
     def fetch(
@@ -349,6 +353,7 @@ class HttpSource(_RemoteSource):
 
     def close(self) -> None:
         """Close the connections of this process."""
+        # The connections of the parent process are the parent's to close.
         if self._client is not None and self._pid == os.getpid():
             self._client.close()
         self._client = None
