@@ -99,7 +99,7 @@ void bind_cloth(nb::module_& m) {
             return out;
           },
           "How often each rung of the fallback ladder was tried and converged, by name.")
-      .def_ro("seen", &StepReport::seen)
+      .def_ro("seen", &StepReport::extremes)
       .def_ro("sharpest", &StepReport::sharpest,
               "Least radius of a medial axis that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,

@@ -57,7 +57,7 @@ struct StepReport {
       0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
   double factorizations = 0.0;                       // whole ones, and shares of those in part
   std::array<RungCount, rung_names.size()> rungs{};  // by Rung, rejected steps included
-  DiagnosticExtremes seen;
+  DiagnosticExtremes extremes;
 
   void count(Rung rung, bool solved) {
     RungCount& counted = rungs[static_cast<std::size_t>(rung)];
@@ -83,7 +83,7 @@ struct StepReport {
     least_distance = std::min(least_distance, other.least_distance);
     sharpest = std::min(sharpest, other.sharpest);
     uneven = std::max(uneven, other.uneven);
-    seen.add(other.seen);
+    extremes.add(other.extremes);
   }
 };
 
