@@ -68,3 +68,35 @@ def test_a_device_that_torch_cannot_use_is_said_in_a_line(rods, tmp_path):
     assert result.exit_code == 1
     assert "device must be one that torch can use here" in result.output
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["--help"],
+        ["info", "--help"],
+        ["export", "--help"],
+        ["curvature", "--help"],
+        ["reconstruct", "--help"],
+        ["cloth", "train", "--help"],
+        ["cloth", "predict", "--help"],
+        ["benchmark", "score", "--help"],
+        ["benchmark", "list"],
+        ["info", "DATASET"],
+    ],
+)
+def test_every_table_fits_80_columns(command, clips):
+    command = [str(clips.root) if word == "DATASET" else word for word in command]
+    result = CliRunner(env={"COLUMNS": "80", "NO_COLOR": "1"}).invoke(app, command)
+    assert result.output
+    assert "Traceback" not in result.output
+    too_long = [line for line in result.output.splitlines() if len(line) > 80]
+    assert too_long == []
+
+
+def test_a_selection_of_nothing_fails(clips, tmp_path):
+    nothing = ["export", str(clips.root), "--webdataset", str(tmp_path / "out"), "--where", "mu>9"]
+    result = runner.invoke(app, nothing)
+    assert result.exit_code == 1
+    assert "no valid sample is in this part of the dataset" in result.output
+    assert list(tmp_path.iterdir()) == []

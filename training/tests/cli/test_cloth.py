@@ -83,6 +83,9 @@ def test_predictions_of_a_dataset_are_a_list(clips):
         assert answer["familiarity"] < ALARMS
     table = runner.invoke(app, predict)
     assert "no answer" in table.output
+    narrow = CliRunner(env={"COLUMNS": "80", "NO_COLOR": "1"}).invoke(app, predict)
+    assert "familiarity" in narrow.stdout
+    assert max(map(len, narrow.stdout.splitlines())) <= 80
 
 
 def test_the_clips_of_a_dataset_as_a_network_sees_them(clips):
@@ -109,7 +112,7 @@ def test_what_cannot_be_measured_is_refused(clips, rods, make_clips):
         "a clip must have a frame within 0.06 s of 25.00 s after the start; its nearest of 2 is"
         in refused("predict", str(short.root), "--model", str(WEIGHTS))
     )
-    assert "split must be one of train, validation, test, and is 'all'" in refused(
+    assert "split must be one of train, validation, test, and is all" in refused(
         "predict", str(clips.root), "--model", str(WEIGHTS), "--split", "all"
     )
     assert "splits train and validation must have simulations" in refused(

@@ -210,7 +210,7 @@ def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrore
     for step, count in ((0, 1), (1, 1), (2, 2), (5, 3)):
         known = [torch.cat(column) for column in zip(*drawn[:count], strict=True)]
         plain = mirrored = 0
-        for crops, direction, material, mu, seen in zip(*learner.chosen(step), strict=True):
+        for crops, direction, material, mu, seen in zip(*learner.sample(step), strict=True):
             place = (known[3] == mu).nonzero().flatten().tolist()
             same = [k for k in place if torch.equal(known[0][k], crops)]
             other = [k for k in place if torch.equal(known[0][k].flip(2), crops)]

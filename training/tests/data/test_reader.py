@@ -54,7 +54,7 @@ def test_splits_part_the_valid_samples(rods):
     assert [len(part) for part in parts] == list(rods.manifest.split_counts.values())
     assert all(len(part) for part in parts)
     with pytest.raises(
-        ValueError, match="split must be one of train, validation, test, and is 'all'"
+        ValueError, match="split must be one of train, validation, test, and is all"
     ):
         reader.slots("all")
 

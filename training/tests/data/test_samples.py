@@ -70,7 +70,7 @@ def test_a_clip(clips):
     ]
     assert dataset.categories["material"][item["material"]] == "camel-ponte-roma"
     with pytest.raises(
-        ValueError, match=r"label must be one of texture, viewpoint, .*material.*, and is 'mu'"
+        ValueError, match=r"label must be one of texture, viewpoint, .*material.*, and is mu"
     ):
         item.name("mu")
     assert item["mu"] == np.float32(0.4)

@@ -129,7 +129,7 @@ def test_a_resumed_run_must_be_the_same(tmp_path):
         ({"epoch": 0}, "epoch must be more than 0"),
         ({"clip": -1.0}, "clip must be more than 0"),
         ({"averaging": 1.0}, "averaging must be from 0"),
-        ({"device": "toaster"}, "device must be one that torch can use here, and is 'toaster'"),
+        ({"device": "toaster"}, "device must be one that torch can use here, and is toaster"),
     ],
 )
 def test_settings_are_checked(changes, message):

@@ -164,12 +164,12 @@ def test_a_wrong_length_is_flagged(tight):
 def test_what_is_wrong_is_named():
     dark = [np.zeros((224, 224, 3), np.uint8)] * 4
     with pytest.raises(
-        ReconstructionError, match="view 'front': image must show a rod brighter than its ground"
+        ReconstructionError, match="view front: image must show a rod brighter than its ground"
     ):
         reconstruct(dark, RIG)
     with pytest.raises(
         ReconstructionError,
-        match="view 'front' must be 224 x 224 pixels as its camera; got 100 x 224",
+        match="view front must be 224 x 224 pixels as its camera; got 100 x 224",
     ):
         reconstruct([view[:, :100] for view in dark], RIG)
     with pytest.raises(ValueError, match="one view for each of at least 2 cameras; got 3 for 4"):

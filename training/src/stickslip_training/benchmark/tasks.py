@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from stickslip_training.rods.evaluation import bending, relative_rms_error, with
 NOISES = (0.001, 0.005, 0.01)
 """Standard deviation of every coordinate of a centreline, over L."""
 
-_SHOWN = 3  # frames of a clip that are compared
+_FRAMES = 3  # frames of a clip that are compared
 _BLOCK = 14  # pixels along a side of an averaged block
 _EVERY = 15  # points of a rod of which one is compared
 _DRAWS = 1000
@@ -32,7 +32,7 @@ class Task(ABC):
     """Labels that follow from the spec, with equal bits in every making of a set."""
     columns: tuple[str, ...]
     """Of the table of results, besides the method and who entered it."""
-    tolerances: Mapping[str, float]
+    tolerances: ClassVar[Mapping[str, float]]
     """By which what `seen` returns may differ between two makings of one set."""
 
     def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
@@ -88,20 +88,17 @@ class ClothTask(Task):
         "in 80 % sets",
         *(f"mu {low:g} to {high:g}" for low, high in BANDS),
     )
-    tolerances = {"frames": 1.5}  # noqa: RUF012  # levels of 255, of means over 14 x 14 pixels
+    tolerances: ClassVar[Mapping[str, float]] = {"frames": 1.5}
+    """In levels of 255, of means over 14 x 14 pixels."""
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
-        shown = (
-            np.linspace(0, reader.arrays["video"].shape[0] - 1, _SHOWN + 2)
-            .round()
-            .astype(int)[1:-1]
-        )
-        means = [
-            torch.nn.functional.avg_pool2d(
-                grey(torch.from_numpy(reader.read("video", [slot])[0][shown])), _BLOCK
-            )
-            for slot in slots.tolist()
-        ]
+        # A few frames inside the clip, and means of blocks: small, and equal on all machines.
+        last = reader.arrays["video"].shape[0] - 1
+        frames = np.linspace(0, last, _FRAMES + 2).round().astype(int)[1:-1]
+        means = []
+        for slot in slots.tolist():
+            pictures = torch.from_numpy(reader.read("video", [slot])[0][frames])
+            means.append(torch.nn.functional.avg_pool2d(grey(pictures), _BLOCK))
         return {"frames": (255 * torch.stack(means)).round().to(torch.uint8).numpy()}
 
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
@@ -124,16 +121,16 @@ class ClothTask(Task):
         def error(part: Mapping[str, Any]) -> str:
             return f"{part['mae']['value']:.3f}"
 
+        # A band without a clip has an empty cell.
+        names = [f"{low:g} to {high:g}" for low, high in BANDS]
+        band_cells = [error(bands[name]) if name in bands else "" for name in names]
         return (
             f"{error(blind)} ({blind['mae']['low']:.3f} to {blind['mae']['high']:.3f})",
             f"{blind['interval']['value']:.3f}" if "interval" in blind else "",
             f"{blind['within_01']['value']:.0%} / {blind['within_02']['value']:.0%}",
             f"{scores['top_1']['value']:.0%}",
             f"{blind['coverage']['value']:.0%}",
-            *(
-                error(bands[name]) if name in bands else ""
-                for name in (f"{low:g} to {high:g}" for low, high in BANDS)
-            ),
+            *band_cells,
         )
 
     def rank(self, scores: Mapping[str, Any]) -> float:
@@ -157,7 +154,7 @@ class RodTask(Task):
         *(f"{100 * noise:g} %: error of \\|κ\\|, median; p95" for noise in NOISES),
         f"error of gamma at {100 * NOISES[1]:g} %, median; p95",
     )
-    tolerances = {"centerline": 1e-5, "bending": 1e-3}  # noqa: RUF012
+    tolerances: ClassVar[Mapping[str, float]] = {"centerline": 1e-5, "bending": 1e-3}
 
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         exact = reader.read("centerline", slots)
@@ -169,13 +166,14 @@ class RodTask(Task):
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
         """Return the slots, (n,), the noises, (3,), and the centrelines over L, (3, n, 150, 3).
 
-        Who does not know the secret cannot draw the noise again and take it away.
+        The secret keeps a method from drawing the noise again and subtracting it.
         """
         exact = reader.read("centerline", slots)
         seed = int(sha256(secret), 16)
-        lines = np.stack(
-            [with_white_noise(exact, noise, (seed, place)) for place, noise in enumerate(NOISES)]
-        )
+        noisy = [
+            with_white_noise(exact, noise, (seed, number)) for number, noise in enumerate(NOISES)
+        ]
+        lines = np.stack(noisy)
         return {"slot": slots, "noise": np.array(NOISES), "centerline": lines}
 
     def score(
@@ -184,22 +182,26 @@ class RodTask(Task):
         truth = _truth(reader, slots)
         gamma = reader.label("gamma")[slots]
         estimated, weights = _parsed(answers, slots, truth.shape[1])
-        found = {}
-        for place, noise in enumerate(NOISES):
-            given = np.isfinite(weights[place])
-            found[f"{noise:g}"] = {
+        scores = {}
+        for number, noise in enumerate(NOISES):
+            bending_errors = relative_rms_error(estimated[number], truth)
+            gamma_errors = np.abs(weights[number] / gamma - 1.0)
+            # gamma is optional: it has no score if a method gives none at all.
+            has_gamma = np.isfinite(weights[number]).any()
+            scores[f"{noise:g}"] = {
                 "rods": len(slots),
-                "failed": int(np.isnan(estimated[place, :, 0]).sum()),
-                "bending": _quantiles(relative_rms_error(estimated[place], truth)),
-                "gamma": _quantiles(np.abs(weights[place] / gamma - 1.0)) if given.any() else None,
+                "failed": int(np.isnan(estimated[number, :, 0]).sum()),
+                "bending": _quantiles(bending_errors),
+                "gamma": _quantiles(gamma_errors) if has_gamma else None,
             }
-        return found
+        return scores
 
     def row(self, scores: Mapping[str, Any]) -> tuple[str, ...]:
         cells = []
         for noise in NOISES:
-            of = scores[f"{noise:g}"]
-            cells.append(_cell(of["bending"]) + (f" ({of['failed']} fail)" if of["failed"] else ""))
+            part = scores[f"{noise:g}"]
+            failures = f" ({part['failed']} fail)" if part["failed"] else ""
+            cells.append(_cell(part["bending"]) + failures)
         gamma = scores[f"{NOISES[1]:g}"]["gamma"]
         return (*cells, "" if gamma is None else _cell(gamma))
 
@@ -212,6 +214,47 @@ def _truth(reader: DatasetReader, slots: Integers) -> Floats:
     return bending(reader.read("curvature", slots))
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """An answer to one rod at one noise."""
+
+    slot: int
+    noise: float
+    bending: Floats | None
+    """|kappa| L, (points,); None if the method failed."""
+    gamma: float | None
+
+
+def _parsed_answer(number: int, document: Any, points: int) -> _Answer:
+    """Return an answer of a file; raise ValueError, with its number in the file, if it is none."""
+    try:
+        bending = document["bending"]
+        gamma = document.get("gamma")
+        answer = _Answer(
+            slot=int(document["slot"]),
+            noise=float(document["noise"]),
+            bending=None if bending is None else np.array(bending, dtype=np.float64),
+            gamma=None if gamma is None else float(gamma),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"answer {number} must have slot, noise and bending, and may have gamma: "
+            f"{type(error).__name__}: {error}"
+        ) from None
+    values = answer.bending
+    if values is not None:
+        is_valid = values.shape == (points,) and bool((np.isfinite(values) & (values >= 0)).all())
+        if not is_valid:
+            raise ValueError(
+                f"bending of answer {number} must be {points} finite numbers of 0 or more, or null"
+            )
+    if answer.gamma is not None and not 0 < answer.gamma < np.inf:
+        raise ValueError(
+            f"gamma of answer {number} must be more than 0 and finite, and is {answer.gamma}"
+        )
+    return answer
+
+
 def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Floats, Floats]:
     """Return |kappa| L, (noises, rods, points), and gamma, (noises, rods).
 
@@ -220,49 +263,32 @@ def _parsed(answers: Sequence[Any], slots: Integers, points: int) -> tuple[Float
     rows = {int(slot): row for row, slot in enumerate(slots)}
     estimated = np.full((len(NOISES), len(slots), points), np.nan)
     gamma = np.full((len(NOISES), len(slots)), np.nan)
-    answered = np.zeros(gamma.shape, dtype=bool)
-    for place, answer in enumerate(answers):
-        try:
-            slot = int(answer["slot"])
-            noise = float(answer["noise"])
-            given = answer["bending"]
-            values = None if given is None else np.array(given, dtype=np.float64)
-            weight = None if answer.get("gamma") is None else float(answer["gamma"])
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+    is_answered = np.zeros(gamma.shape, dtype=bool)
+    for number, document in enumerate(answers):
+        answer = _parsed_answer(number, document, points)
+        if answer.slot not in rows or answer.noise not in NOISES:
+            noises = ", ".join(f"{noise:g}" for noise in NOISES)
             raise ValueError(
-                f"answer {place} must have slot, noise and bending, and may have gamma: {error!r}"
-            ) from None
-        if slot not in rows or noise not in NOISES:
-            raise ValueError(
-                f"slot and noise of answer {place} must be of the test set, whose noises "
-                f"are {NOISES}: they are {slot} "
-                f"and {noise:g}"
+                f"slot and noise of answer {number} must be of the test set, whose noises are "
+                f"{noises}: they are {answer.slot} and {answer.noise:g}"
             )
-        where = NOISES.index(noise), rows[slot]
-        if answered[where]:
+        index = NOISES.index(answer.noise), rows[answer.slot]
+        if is_answered[index]:
             raise ValueError(
-                f"slot {slot} is answered twice at noise {noise:g}, at {place} for the second time"
+                f"slot {answer.slot} is answered twice at noise {answer.noise:g}, "
+                f"at {number} for the second time"
             )
-        answered[where] = True
-        if values is not None:
-            if values.shape != (points,) or not (np.isfinite(values).all() and (values >= 0).all()):
-                raise ValueError(
-                    f"bending of answer {place} must be {points} finite numbers of 0 or "
-                    "more, or null"
-                )
-            estimated[where] = values
-        if weight is not None:
-            if not 0 < weight < np.inf:
-                raise ValueError(
-                    f"gamma of answer {place} must be more than 0 and finite, and is {weight}"
-                )
-            gamma[where] = weight
-    if not answered.all():
-        noise, row = (int(index[0]) for index in np.nonzero(~answered))
+        is_answered[index] = True
+        if answer.bending is not None:
+            estimated[index] = answer.bending
+        if answer.gamma is not None:
+            gamma[index] = answer.gamma
+    # A method must not leave out the rods that it cannot do.
+    if not is_answered.all():
+        noise, row = np.argwhere(~is_answered)[0]
         raise ValueError(
             "every slot of the test set must be answered at every noise, and "
-            f"{(~answered).sum()} are not, "
-            f"{slots[row]} at {NOISES[noise]:g} first"
+            f"{(~is_answered).sum()} are not, {slots[row]} at {NOISES[noise]:g} first"
         )
     return estimated, gamma
 
@@ -273,17 +299,18 @@ def _quantiles(errors: Floats) -> dict[str, Any]:
     None if it is infinite.
     """
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    drawn = errors[np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))]
-    found: dict[str, Any] = {}
-    for name, share in (("median", 0.5), ("p95", 0.95)):
-        value = float(np.quantile(errors, share, method="higher"))
-        low, high = np.quantile(
-            np.quantile(drawn, share, axis=1, method="higher"), (0.05, 0.95), method="nearest"
-        )
+    draws = np.random.default_rng(0).integers(len(errors), size=(_DRAWS, len(errors)))
+    resampled = errors[draws]
+    quantiles: dict[str, Any] = {}
+    for name, level in (("median", 0.5), ("p95", 0.95)):
+        value = float(np.quantile(errors, level, method="higher"))
+        estimates = np.quantile(resampled, level, axis=1, method="higher")
+        low, high = np.quantile(estimates, (0.05, 0.95), method="nearest")
         numbers = {"value": value, "low": float(low), "high": float(high)}
-        told = {key: number if np.isfinite(number) else None for key, number in numbers.items()}
-        found[name] = told if np.isfinite(value) else None
-    return found
+        # JSON has no infinity.
+        finite = {key: number if np.isfinite(number) else None for key, number in numbers.items()}
+        quantiles[name] = finite if np.isfinite(value) else None
+    return quantiles
 
 
 def _cell(quantiles: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ file (`clips_of_file`).
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -75,21 +75,20 @@ class Clips(Truth):
         return len(self.mu)
 
     def __getitem__(self, chosen: Integers | NDArray[np.bool_]) -> "Clips":
-        parts: dict[str, Any] = {
-            name: value[torch.from_numpy(np.asarray(chosen))]
-            if torch.is_tensor(value)
-            else value[chosen]
-            for name, value in vars(self).items()
-        }
+        parts: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            # Tensors take no index of NumPy.
+            is_tensor = torch.is_tensor(value)
+            parts[name] = value[torch.from_numpy(np.asarray(chosen)) if is_tensor else chosen]
         return Clips(**parts)
 
     @staticmethod
     def joined(parts: "Sequence[Clips]") -> "Clips":
-        columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
-        whole: dict[str, Any] = {
-            name: torch.cat(each) if torch.is_tensor(each[0]) else np.concatenate(each)
-            for name, each in columns.items()
-        }
+        """Return all clips of several parts."""
+        whole: dict[str, Any] = {}
+        for name, value in vars(parts[0]).items():
+            values = [getattr(part, name) for part in parts]
+            whole[name] = torch.cat(values) if torch.is_tensor(value) else np.concatenate(values)
         return Clips(**whole)
 
 
@@ -97,8 +96,8 @@ class Clips(Truth):
 class RenderedClips:
     """Clips of another renderer, over dark floors, to train on besides rendered pictures.
 
-    They are a share of each batch, with worlds drawn about their cloth; `validation` chooses the
-    weights and the temperature.
+    They are a fraction of each batch, with surroundings sampled about their cloth. `validation`
+    chooses the weights and the temperature.
     """
 
     train: Clips
@@ -130,16 +129,16 @@ def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[floa
     Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX`
     from any frame.
     """
-    shown = np.asarray(instants, dtype=np.float64)
-    frames = [int(np.abs(shown - instant).argmin()) for instant in INSTANTS]
+    available = np.asarray(instants, dtype=np.float64)
+    frames = [int(np.abs(available - instant).argmin()) for instant in INSTANTS]
     for frame, instant in zip(frames, INSTANTS, strict=True):
-        if abs(shown[frame] - instant) > LATE_MAX * RATE:
+        if abs(available[frame] - instant) > LATE_MAX * RATE:
             raise ValueError(
                 f"a clip must have a frame within {LATE_MAX:g} s of {instant / RATE:.2f} s "
                 "after the start; its "
-                f"nearest of {len(shown)} is at {shown[frame] / RATE:.2f} s"
+                f"nearest of {len(available)} is at {available[frame] / RATE:.2f} s"
             )
-    return frames, tuple(shown[frames].tolist())
+    return frames, tuple(available[frames].tolist())
 
 
 def training_cameras() -> tuple[Camera, ...]:
@@ -164,32 +163,32 @@ def render_clips(
     """
     frames, instants = frames_at(runs.instants)
     number = np.repeat(np.arange(len(runs)), renders)
-    crops = []
-    covers = []
-    directions = []
+    crops: list[torch.Tensor] = []
+    covers: list[torch.Tensor] = []
+    directions: list[torch.Tensor] = []
     with torch.device(device):
         rig = Cameras.of(training_cameras())
         for start in range(0, len(number), CHUNK):
-            chosen = number[start : start + CHUNK]
+            chunk = number[start : start + CHUNK]
             generator = torch.Generator(device).manual_seed(seed_of_step(seed, VALIDATION, start))
-            seen = jitter_cameras(
-                rig[torch.arange(start, start + len(chosen)) % len(rig.focal)], spread, generator
-            )
-            style = sample_style(len(chosen), len(frames), generator)
-            meshes = torch.from_numpy(runs.positions[chosen][:, frames]).to(device)
-            surroundings = (
-                sample_surroundings(len(chosen), generator) if with_surroundings else None
-            )
-            picture, cover = render_crops(meshes, seen, instants, style, generator, surroundings)
+            # The order of these draws is part of what a seed means.
+            turns = torch.arange(start, start + len(chunk)) % len(rig.focal)
+            cameras = jitter_cameras(rig[turns], spread, generator)
+            style = sample_style(len(chunk), len(frames), generator)
+            meshes = torch.from_numpy(runs.positions[chunk][:, frames]).to(device)
+            surroundings = None
+            if with_surroundings:
+                surroundings = sample_surroundings(len(chunk), generator)
+            picture, cover = render_crops(meshes, cameras, instants, style, generator, surroundings)
             crops.append(picture.cpu())
             covers.append(cover.cpu())
-            directions.append(seen.rotation[:, 2].cpu())
-    shown = runs[number]
+            directions.append(cameras.rotation[:, 2].cpu())
+    rendered = runs[number]
     return Clips(
         crops=torch.cat(crops),
         direction=torch.cat(directions),
-        material=shown.material,
-        mu=shown.mu,
+        material=rendered.material,
+        mu=rendered.mu,
         run=number,
         cover=torch.cat(covers),
     )
@@ -201,14 +200,15 @@ def jittered(crops: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     They differ as other exposures and registrations would; values stay about 0 to 1.
     """
 
-    def drawn(deviation: float) -> torch.Tensor:
+    def normal(deviation: float) -> torch.Tensor:
         return deviation * torch.randn(len(crops), 1, 1, 1, generator=generator)
 
-    changed = crops.clamp(1e-3, 1.0) ** torch.exp(drawn(0.25)) * torch.exp(drawn(0.15)) + drawn(
-        0.05
-    )
+    # The order of the calls is part of what a seed means: gamma, gain, offset, shift, noise.
+    gamma = torch.exp(normal(0.25))
+    gain = torch.exp(normal(0.15))
+    exposed = crops.clamp(1e-3, 1.0) ** gamma * gain + normal(0.05)
     shifts = torch.randint(-1, 2, (len(crops), 2), generator=generator).tolist()
-    moved = [torch.roll(clip, shift, (1, 2)) for clip, shift in zip(changed, shifts, strict=True)]
+    moved = [torch.roll(clip, shift, (1, 2)) for clip, shift in zip(exposed, shifts, strict=True)]
     return torch.stack(moved) + 0.01 * torch.randn(crops.shape, generator=generator)
 
 
@@ -232,26 +232,18 @@ def read_clips(
         )
     slots = reader.slots(split)
     if not len(slots):
-        raise ValueError(f"the dataset has no clip in the split {split}")
+        part = "dataset" if split is None else f"split {split} of the dataset"
+        raise ValueError(f"the {part} has no valid clip")
     frames, instants = frames_at(tuple(reader.arrays["video"].attributes["instants"]))
-    names = reader.categories("viewpoint")
-    cameras = {camera.name: camera for camera in reader.manifest.cameras}
-    views = [cameras[names[code]] for code in reader.label("viewpoint")[slots].tolist()]
-    seen = Cameras.of(views)
-    chunks = [slots[start : start + _READ_CHUNK] for start in range(0, len(slots), _READ_CHUNK)]
-    names_of = [name for name in ("video", "segmentation") if name in reader.arrays]
-    pictures = ([reader.read(name, some)[:, frames] for name in names_of] for some in chunks)
-    crops, cover = _cropped(pictures, seen, instants)
-    known = np.array(
-        [
-            materials.index(name) if name in materials else -1
-            for name in reader.categories("material")
-        ]
-    )
+    viewpoints = reader.categories("viewpoint")
+    rig = {camera.name: camera for camera in reader.manifest.cameras}
+    codes = reader.label("viewpoint")[slots].tolist()
+    cameras = Cameras.of([rig[viewpoints[code]] for code in codes])
+    crops, cover = _cropped(_pictures(reader, slots, frames), cameras, instants)
     clips = Clips(
         crops=crops,
-        direction=seen.rotation[:, 2],
-        material=known[reader.label("material")[slots]],
+        direction=cameras.rotation[:, 2],
+        material=_codes(reader.categories("material"), materials)[reader.label("material")[slots]],
         mu=reader.label("mu")[slots].astype(np.float64),
         run=simulations(reader, slots),
         cover=cover,
@@ -259,25 +251,43 @@ def read_clips(
     return clips, slots
 
 
+def _pictures(
+    reader: DatasetReader, slots: Integers, frames: list[int]
+) -> Iterator[tuple[Array, Array | None]]:
+    """Yield videos (n, F, H, W, 3), and classes of pixels if the dataset has them."""
+    has_classes = "segmentation" in reader.arrays
+    for start in range(0, len(slots), _READ_CHUNK):
+        chunk = slots[start : start + _READ_CHUNK]
+        video = reader.read("video", chunk)[:, frames]
+        classes = reader.read("segmentation", chunk)[:, frames] if has_classes else None
+        yield video, classes
+
+
+def _codes(names: Sequence[str], materials: Sequence[str]) -> Integers:
+    """Return the place of each name in `materials`, and -1 for a name that is not there."""
+    places = [materials.index(name) if name in materials else -1 for name in names]
+    return np.array(places, dtype=np.int64)
+
+
 def _cropped(
-    pictures: Iterable[Sequence[Array]], seen: Cameras, instants: tuple[float, ...]
+    pictures: Iterable[tuple[Array, Array | None]], cameras: Cameras, instants: tuple[float, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return crops and coverage of batches of pictures (n, F, H, W, 3).
 
     A batch may have the classes of its pixels, too. Coverage is NaN without them.
     """
-    crops = []
-    covers = []
+    crops: list[torch.Tensor] = []
+    covers: list[torch.Tensor] = []
     first = 0
-    for video, *classes in pictures:
-        place = holder_crops(seen[first : first + len(video)], instants)
+    for video, classes in pictures:
+        place = holder_crops(cameras[first : first + len(video)], instants)
         first += len(video)
         crops.append(cut(grey(torch.from_numpy(video)), place))
-        masks = [
-            torch.from_numpy((codes == SEGMENTS.index("cloth")).astype(np.float32))
-            for codes in classes
-        ]
-        covers.append(cut(masks[0], place) if masks else torch.full_like(crops[-1], math.nan))
+        if classes is None:
+            covers.append(torch.full_like(crops[-1], math.nan))
+        else:
+            is_cloth = (classes == SEGMENTS.index("cloth")).astype(np.float32)
+            covers.append(cut(torch.from_numpy(is_cloth), place))
     return torch.cat(crops), torch.cat(covers)
 
 
@@ -296,29 +306,23 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
             )
         video = file["video"]
         classes = file["segmentation"]
-        shown = tuple(map(int, file["instants"]))
+        shown_instants = tuple(map(int, file["instants"]))
         about = [json.loads(str(line)) for line in file["about"]]
-    frames, instants = frames_at(shown)
-    named = {camera.name: camera for camera in load_rig(RIG)}
-    seen = Cameras.of([named[clip["viewpoint"]] for clip in about])
-    crops, cover = _cropped(
-        (
-            [part[clip : clip + 1, frames] for part in (video, classes)]
-            for clip in range(len(video))
-        ),
-        seen,
-        instants,
+    frames, instants = frames_at(shown_instants)
+    rig = {camera.name: camera for camera in load_rig(RIG)}
+    cameras = Cameras.of([rig[clip["viewpoint"]] for clip in about])
+    # One clip at a time: full pictures of all of them would fill the memory.
+    pictures = (
+        (video[clip : clip + 1, frames], classes[clip : clip + 1, frames])
+        for clip in range(len(video))
     )
-    known = [
-        materials.index(clip["material"]) if clip["material"] in materials else -1 for clip in about
-    ]
-    mu, run = (np.array([clip[name] for clip in about]) for name in ("mu", "run"))
+    crops, cover = _cropped(pictures, cameras, instants)
     clips = Clips(
         crops=crops,
-        direction=seen.rotation[:, 2],
-        material=np.array(known),
-        mu=mu,
-        run=run,
+        direction=cameras.rotation[:, 2],
+        material=_codes([clip["material"] for clip in about], materials),
+        mu=np.array([clip["mu"] for clip in about]),
+        run=np.array([clip["run"] for clip in about]),
         cover=cover,
     )
     return clips, about

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -169,6 +169,21 @@ def train_friction(
         return learner.calibrated(fit(learner, settings, identity=identity, **run))
 
 
+class Batch(NamedTuple):
+    """Clips to learn from."""
+
+    crops: torch.Tensor
+    """(B, F, 72, 88)"""
+    direction: torch.Tensor
+    """(B, 3): of view."""
+    material: torch.Tensor
+    """(B,): codes."""
+    mu: torch.Tensor
+    """(B,)"""
+    silhouettes: torch.Tensor
+    """(B, F, 18, 22), 0 to 1."""
+
+
 class FrictionLearner(Learner):
     """Batches are runs, or meshes between two neighbours in mu, that are rendered anew.
 
@@ -194,26 +209,20 @@ class FrictionLearner(Learner):
         self.frames, self.instants = frames_at(train.instants)
         self.train = train
         self.judged = validation
-        self.meshes = torch.from_numpy(np.ascontiguousarray(train.positions[:, self.frames])).to(
-            settings.device
-        )
-        self.pairs = np.array(
-            between(train, settings.gap) + [(run, run) for run in range(len(train))]
-        )
-        widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
-        self.chances = (widths + 0.02) / (widths + 0.02).sum()
-        with torch.device(settings.device):
-            self.rig = Cameras.of(training_cameras())
         self.clips = clips
+        self._load(train)
         self.render = partial(
             render_clips, with_surroundings=settings.worlds, device=settings.device
         )
-        self.validation = (
-            self.render(validation, 6, settings.seed, spread=settings.turn)
-            if clips is None
-            else clips.validation
-        )
+        if clips is None:
+            self.validation = self.render(validation, 6, settings.seed, spread=settings.turn)
+        else:
+            self.validation = clips.validation
         self.centers = torch.from_numpy(MU_BINS.centers.astype(np.float32)).to(settings.device)
+        self.batches: dict[int, Batch] = {}
+        """The newest batches, by number."""
+        self.settled = math.ceil(SETTLED * settings.steps / settings.repeats)
+        """Batches that teach the silhouette of cloth."""
         with seeded(settings.seed):
             sizes = {
                 "materials": len(train.materials),
@@ -221,24 +230,40 @@ class FrictionLearner(Learner):
                 "frames": len(self.frames),
             }
             self.net = PosteriorNet(**sizes, width=settings.width, dropout=settings.dropout)
-        self.drawn: dict[int, tuple[torch.Tensor, ...]] = {}
-        self.settled = math.ceil(
-            SETTLED * settings.steps / settings.repeats
-        )  # batches that teach what cloth is
+        self._initialize(start)
+
+    def _load(self, train: Runs) -> None:
+        """Put the meshes on the device, and pair runs that have meshes between them."""
+        device = self.settings.device
+        frames = np.ascontiguousarray(train.positions[:, self.frames])
+        self.meshes = torch.from_numpy(frames).to(device)
+        with torch.device(device):
+            self.rig = Cameras.of(training_cameras())
+        # A run is also a pair with itself, so that it is drawn as it is.
+        alone = [(run, run) for run in range(len(train))]
+        self.pairs = np.array(between(train, self.settings.gap) + alone)
+        # Wide pairs stand for more of the range of mu.
+        widths = train.mu[self.pairs[:, 1]] - train.mu[self.pairs[:, 0]]
+        self.chances = (widths + 0.02) / (widths + 0.02).sum()
+
+    def _initialize(self, start: FrictionModel | None) -> None:
+        """Set the first weights: standardized on the first batches, or those of a model."""
         if start is None:
-            crops, direction, _, _, cover = map(
-                torch.cat, zip(*map(self.batch, range(FIRST)), strict=True)
-            )
-            self.net.to(settings.device).standardize(crops, direction, cover)
-        elif start.materials != train.materials or start.net.sizes != self.net.sizes:
+            first = [self.batch(number) for number in range(FIRST)]
+            crops = torch.cat([batch.crops for batch in first])
+            direction = torch.cat([batch.direction for batch in first])
+            cover = torch.cat([batch.silhouettes for batch in first])
+            self.net.to(self.settings.device).standardize(crops, direction, cover)
+            return
+        if start.materials != self.train.materials or start.net.sizes != self.net.sizes:
             raise ValueError(
                 "the model to start from must know the runs' materials, and be "
                 f"{self.net.sizes}: it knows "
                 f"{', '.join(start.materials)}, and is {start.net.sizes}"
             )
-        else:
-            self.settled = 0
-            self.net.load_state_dict(start.net.state_dict())
+        # It finds the silhouette of cloth, and keeps those weights.
+        self.settled = 0
+        self.net.load_state_dict(start.net.state_dict())
 
     def optimizer(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
         return torch.optim.AdamW(parameters, lr=self.settings.learning_rate, weight_decay=0.02)
@@ -248,102 +273,123 @@ class FrictionLearner(Learner):
 
     def loss(self, net: nn.Module, step: int) -> torch.Tensor:
         assert isinstance(net, PosteriorNet)
-        crops, direction, material, mu, silhouettes = self.chosen(step)
+        batch = self.sample(step)
+        # The target is a histogram about the true mu, which gets narrower with the steps.
         first, last = self.settings.smoothing
         deviation = first * (last / first) ** (step / self.settings.steps)
-        target = torch.exp(-0.5 * ((self.centers - mu[:, None]) / deviation) ** 2)
+        target = torch.exp(-0.5 * ((self.centers - batch.mu[:, None]) / deviation) ** 2)
         target = target / target.sum(dim=1, keepdim=True)
-        log_material, log_mu = net.read(net.features(crops, direction, silhouettes))
-        rows = torch.arange(len(mu), device=mu.device)
-        loss = -(log_material[rows, material] + (target * log_mu[rows, material]).sum(dim=1)).mean()
+
+        # Cross entropy of the true material, and of mu given that material.
+        features = net.features(batch.crops, batch.direction, batch.silhouettes)
+        log_material, log_mu = net.read(features)
+        rows = torch.arange(len(batch.mu), device=batch.mu.device)
+        log_p = log_material[rows, batch.material]
+        loss = -(log_p + (target * log_mu[rows, batch.material]).sum(dim=1)).mean()
         if step < self.settled * self.settings.repeats:
-            found = net.silhouettes(crops[::SILHOUETTES])
-            loss = loss + functional.binary_cross_entropy_with_logits(
-                found, silhouettes[::SILHOUETTES]
-            )
+            logits = net.silhouettes(batch.crops[::SILHOUETTES])
+            truth = batch.silhouettes[::SILHOUETTES]
+            loss = loss + functional.binary_cross_entropy_with_logits(logits, truth)
         return torch.as_tensor(loss)
 
-    def chosen(self, step: int) -> tuple[torch.Tensor, ...]:
+    def sample(self, step: int) -> Batch:
         """Return the batch of a step: clips of the last batches, half of them mirrored."""
         newest = step // self.settings.repeats
         last = range(max(0, newest - KEPT + 1), newest + 1)
-        self.drawn = {number: self.drawn.get(number) or self.batch(number) for number in last}
+        self.batches = {number: self.batches.get(number) or self.batch(number) for number in last}
         random = np.random.default_rng((self.settings.seed, CHOICE, step))
         count = self.settings.batch_size
-        drawn = list(self.drawn.values())
-        places = random.integers(len(last) * count, size=count).tolist()
-        parts = zip(
-            *([part[at % count] for part in drawn[at // count]] for at in places), strict=True
+        clips = random.integers(len(last) * count, size=count).tolist()
+        batches = list(self.batches.values())
+        # Clip i is number i % count of batch i // count.
+        crops, direction, material, mu, silhouettes = (
+            torch.stack([batches[clip // count][part][clip % count] for clip in clips])
+            for part in range(len(Batch._fields))
         )
-        crops, direction, material, mu, silhouettes = map(torch.stack, parts)
-        turned = torch.from_numpy(random.random(count) < 0.5).to(self.settings.device)
-        crops[turned], direction[turned] = mirrored(crops[turned], direction[turned])
-        silhouettes[turned] = silhouettes[turned].flip(3)
-        return crops, direction, material, mu, silhouettes
+        is_mirrored = torch.from_numpy(random.random(count) < 0.5).to(self.settings.device)
+        crops[is_mirrored], direction[is_mirrored] = mirrored(
+            crops[is_mirrored], direction[is_mirrored]
+        )
+        silhouettes[is_mirrored] = silhouettes[is_mirrored].flip(3)
+        return Batch(crops, direction, material, mu, silhouettes)
 
-    def batch(self, number: int) -> tuple[torch.Tensor, ...]:
-        """Return crops, directions of view, materials, mu and silhouettes.
+    def batch(self, number: int) -> Batch:
+        """Return a batch of clips that are rendered anew.
 
-        Silhouettes are the true ones before batch `settled`.
+        Silhouettes are the true ones before batch `settled`, and then those that the network sees.
         """
-        device = self.settings.device
         seeds = (self.settings.seed, TRAINING, number)
-        with torch.device(device):
+        with torch.device(self.settings.device):
             random = np.random.default_rng(seeds)
-            generator = torch.Generator(device).manual_seed(seed_of_step(*seeds))
-            some = (
-                0
-                if self.clips is None
-                else math.ceil(self.settings.clip_share * self.settings.batch_size)
-            )
-            count = self.settings.batch_size - some
-            chosen = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
-            share = random.random(count, dtype=np.float32)
-            near = torch.from_numpy(share).to(device)[:, None, None, None, None]
-            meshes = (1 - near) * self.meshes[chosen[:, 0]] + near * self.meshes[chosen[:, 1]]
-            views = torch.from_numpy(random.integers(len(self.rig.focal), size=count))
-            cameras = jitter_cameras(self.rig[views], self.settings.turn, generator)
-            looks = sample_style(count, len(self.frames), generator)
-            world = sample_surroundings(count, generator) if self.settings.worlds else None
-            crops, cover = render_crops(meshes, cameras, self.instants, looks, generator, world)
-            first = self.train.mu[chosen[:, 0]]
-            second = self.train.mu[chosen[:, 1]]
-            mu = torch.from_numpy(((1 - share) * first + share * second).astype(np.float32)).to(
-                device
-            )
-            codes = torch.from_numpy(self.train.material[chosen[:, 0]])
-            parts = [crops, cameras.rotation[:, 2], codes.to(device), mu, cover]
-            if self.clips is not None and some:
-                given = self.elsewhere(
-                    self.clips.train[random.integers(len(self.clips.train), size=some)], generator
-                )
-                parts = [torch.cat(both) for both in zip(parts, given, strict=True)]
-            *parts, cover = parts
-            return *parts, pooled(cover) if number < self.settled else self.net.seen_silhouettes(
-                parts[0]
-            )
+            generator = torch.Generator(self.settings.device).manual_seed(seed_of_step(*seeds))
+            blender_count = 0
+            if self.clips is not None:
+                blender_count = math.ceil(self.settings.clip_share * self.settings.batch_size)
+            batch = self._rendered(self.settings.batch_size - blender_count, random, generator)
+            if self.clips is not None and blender_count:
+                clips = random.integers(len(self.clips.train), size=blender_count)
+                others = self._composed(self.clips.train[clips], generator)
+                both = zip(batch, others, strict=True)
+                batch = Batch(*(torch.cat(parts) for parts in both))
+            if number < self.settled:
+                return batch._replace(silhouettes=pooled(batch.silhouettes))
+            return batch._replace(silhouettes=self.net.seen_silhouettes(batch.crops))
 
-    def elsewhere(self, clips: Clips, generator: torch.Generator) -> tuple[torch.Tensor, ...]:
-        """Return clips of another renderer as part of a batch, each in a drawn world."""
+    def _rendered(
+        self, count: int, random: np.random.Generator, generator: torch.Generator
+    ) -> Batch:
+        """Render clips of meshes between neighbours in mu; silhouettes are coverage of pixels."""
         device = self.settings.device
-        shown, cover, direction = (
-            part.to(device) for part in (clips.crops, clips.cover, clips.direction)
+        pairs = self.pairs[random.choice(len(self.pairs), size=count, p=self.chances)]
+        fraction = random.random(count, dtype=np.float32)
+        alpha = torch.from_numpy(fraction).to(device)[:, None, None, None, None]
+        meshes = (1 - alpha) * self.meshes[pairs[:, 0]] + alpha * self.meshes[pairs[:, 1]]
+
+        # The order of these draws is part of what a seed means.
+        views = torch.from_numpy(random.integers(len(self.rig.focal), size=count))
+        cameras = jitter_cameras(self.rig[views], self.settings.turn, generator)
+        style = sample_style(count, len(self.frames), generator)
+        surroundings = sample_surroundings(count, generator) if self.settings.worlds else None
+        crops, cover = render_crops(meshes, cameras, self.instants, style, generator, surroundings)
+
+        first = self.train.mu[pairs[:, 0]]
+        second = self.train.mu[pairs[:, 1]]
+        mu = ((1 - fraction) * first + fraction * second).astype(np.float32)
+        return Batch(
+            crops=crops,
+            direction=cameras.rotation[:, 2],
+            material=torch.from_numpy(self.train.material[pairs[:, 0]]).to(device),
+            mu=torch.from_numpy(mu).to(device),
+            silhouettes=cover,
         )
-        looks = sample_style(len(clips), len(self.frames), generator)
-        world = sample_surroundings(len(clips), generator)
-        cloth, world, cover = cloth_of_clip(shown, cover, looks, world, generator)
+
+    def _composed(self, clips: Clips, generator: torch.Generator) -> Batch:
+        """Return clips of another renderer, each in sampled surroundings."""
+        device = self.settings.device
+        direction = clips.direction.to(device)
+        style = sample_style(len(clips), len(self.frames), generator)
+        surroundings = sample_surroundings(len(clips), generator)
+        cloth, surroundings, cover = cloth_of_clip(
+            clips.crops.to(device), clips.cover.to(device), style, surroundings, generator
+        )
+        # The cameras of the clips are those of the rig, found by their direction of view.
         cameras = self.rig[torch.cdist(direction, self.rig.rotation[:, 2]).argmin(dim=1)]
         crops = expose(
             cloth,
             cameras,
             holder_crops(cameras, self.instants),
             self.instants,
-            looks,
+            style,
             generator,
-            world,
+            surroundings,
         )
-        material, mu = (torch.from_numpy(part).to(device) for part in (clips.material, clips.mu))
-        return crops, direction, material, mu.float(), cover
+        return Batch(
+            crops=crops,
+            direction=direction,
+            material=torch.from_numpy(clips.material).to(device),
+            mu=torch.from_numpy(clips.mu).to(device).float(),
+            silhouettes=cover,
+        )
 
     def validate(self, net: nn.Module) -> float | None:
         assert isinstance(net, PosteriorNet)
@@ -366,10 +412,11 @@ class FrictionLearner(Learner):
         varied = replace(clips, crops=jittered(clips.crops, generator))
         good = Clips.joined([varied, self.render(self.judged, 6, settings.seed + 2)])
         log_p = log_histograms(net, good)
+        # mu gets the temperature that covers. The likeliest one widens all for a few large errors.
         of_material, _ = likeliest_temperatures(*log_p, good.material, good.mu, MU_BINS)
         of_mu = covering_temperature(*log_p, good.mu, MU_BINS, of_material)
-        seen = silhouettes(net, Clips.joined([clips, varied]))
-        known = Familiarity.of(train, settings.seed + 1, seen, settings.device)
+        good_silhouettes = silhouettes(net, Clips.joined([clips, varied]))
+        familiarity = Familiarity.of(train, settings.seed + 1, good_silhouettes, settings.device)
         card = {
             "settings": asdict(settings),
             "training_runs": len(train),
@@ -383,6 +430,6 @@ class FrictionLearner(Learner):
             instants=self.instants,
             bins=MU_BINS,
             temperature=(of_material, of_mu),
-            familiarity=known,
+            familiarity=familiarity,
             card=card,
         )

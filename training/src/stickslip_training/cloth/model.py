@@ -239,9 +239,10 @@ def mean_model(models: Sequence[FrictionModel]) -> FrictionModel:
             "the models to start from must know the same materials, and be of the same sizes"
         )
     net = PosteriorNet(**first.net.sizes)
-    net.load_state_dict(
-        {name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]}
-    )
+    mean: dict[str, torch.Tensor] = {}
+    for name in states[0]:
+        mean[name] = torch.stack([state[name] for state in states]).mean(dim=0)
+    net.load_state_dict(mean)
     return replace(first, net=net.eval())
 
 
@@ -270,7 +271,8 @@ def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
     try:
         with safetensors.safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})["friction"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = list(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names}
         net = PosteriorNet(**about["sizes"])
         net.load_state_dict({name: tensors[f"net.{name}"] for name in net.state_dict()})
         known = {

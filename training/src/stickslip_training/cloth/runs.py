@@ -109,7 +109,8 @@ def runs_of_dataset(
             slots.append(slot)
             meshes.append(mesh)
     if not slots:
-        raise ValueError(f"the dataset has no simulation in the split {split}")
+        part = "dataset" if split is None else f"split {split} of the dataset"
+        raise ValueError(f"the {part} has no valid simulation")
     chosen = np.array(slots)
     rest = reader.read("rest", chosen[:1])[0]
     material = reader.label("material")[chosen].astype(np.int64)

@@ -14,7 +14,7 @@ holders is the residual.
 
 import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -138,41 +138,22 @@ def import_video(
             f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}"
         )
     times, tracks = _follow(path, camera, frame_rate)
-    last = INSTANTS[-1] / RATE - CUT_MAX
-    if times[-1] - times[0] < last:
-        raise VideoError(
-            f"the video must show {last:.0f} s from the start on, and lasts "
-            f"{times[-1] - times[0]:.1f} s"
-        )
-    if (rate := 1.0 / float(np.median(np.diff(times)))) < 0.5 / LATE_MAX:
-        raise VideoError(
-            f"frame_rate must be at least {0.5 / LATE_MAX:.1f} frames a second, and is {rate:.1f}"
-        )
-    registration, wanders = _register(times, tracks, camera.straight, start)
-    if reasons := registration.refusals():
+    _check_times(times)
+    registration, holder_motion = _register(times, tracks, camera.straight, start)
+    reasons = registration.refusals()
+    if reasons:
         raise VideoError("; ".join(reasons))
-    chosen, instants = frames_at((times - registration.start) * RATE)
-    first, *pictures = _pictures(path, camera, [0, *chosen])
-    pixel = camera.width / _WIDE
-    off = wanders[chosen]
-    found = [
-        floor_motion(first, picture, near)
-        for picture, near in zip(pictures, off / pixel, strict=True)
-    ]
-    motions, deviations = map(np.array, zip(*found, strict=True))
-    if max(deviations) <= FLOOR_MAX:
-        if (apart := np.abs(motions - off / pixel).max()) > APART_MAX:
-            rule = (
-                f"must show one motion of the camera to within {APART_MAX:g} px of a "
-                "picture 224 px wide"
-            )
-            raise VideoError(f"the floor and the holders {rule}, and differ by {apart:.1f}")
-        off = motions * pixel
+
+    # Only the frames at the instants that a network reads are decoded in full.
+    frames, instants = frames_at((times - registration.start) * RATE)
+    first, *pictures = _pictures(path, camera, [0, *frames])
+    motion = _camera_motion(first, pictures, holder_motion[frames], camera.width / _WIDE)
+
+    # The crop follows the camera, so that the cloth is seen as by a camera that stands still.
     registered = holder_crops(Cameras.of([camera.straight]), instants)
-    place = Crops(
-        registered.origin + torch.from_numpy(off.astype(np.float32))[None], registered.scale
-    )
-    crops = cut(torch.from_numpy(np.stack(pictures).astype(np.float32) / 255)[None], place)
+    offset = torch.from_numpy(motion.astype(np.float32))[None]
+    video = torch.from_numpy(np.stack(pictures).astype(np.float32) / 255)[None]
+    crops = cut(video, Crops(registered.origin + offset, registered.scale))
     clip = Clips(
         crops=crops,
         direction=torch.tensor(camera.rotation[2])[None],
@@ -182,6 +163,51 @@ def import_video(
         cover=torch.full_like(crops, math.nan),
     )
     return clip, registration
+
+
+def _check_times(times: Floats) -> None:
+    """Raise VideoError if a video is too short, or has too few frames a second."""
+    duration = times[-1] - times[0]
+    shortest = INSTANTS[-1] / RATE - CUT_MAX
+    if duration < shortest:
+        raise VideoError(
+            f"the video must show {shortest:.0f} s from the start on, and lasts {duration:.1f} s"
+        )
+    # A frame is then no farther from an instant than `LATE_MAX`.
+    rate = 1.0 / float(np.median(np.diff(times)))
+    slowest = 0.5 / LATE_MAX
+    if rate < slowest:
+        raise VideoError(
+            f"frame_rate must be at least {slowest:.1f} frames a second, and is {rate:.1f}"
+        )
+
+
+def _camera_motion(
+    first: npt.NDArray[np.uint8],
+    pictures: Sequence[npt.NDArray[np.uint8]],
+    holder_motion: Floats,
+    pixel: float,
+) -> Floats:
+    """Return the motion of the camera at each picture, (F, 2) [px].
+
+    It is that of the floor, which is surer, if the floor has marks. Otherwise it is the common
+    motion of the holders, (F, 2) [px]. `pixel` is a pixel of a picture 224 px wide [px].
+    """
+    near = holder_motion / pixel
+    pairs = zip(pictures, near, strict=True)
+    motions, deviations = zip(
+        *(floor_motion(first, picture, start) for picture, start in pairs), strict=True
+    )
+    if max(deviations) > FLOOR_MAX:
+        return holder_motion
+    motion = np.array(motions)
+    difference = np.abs(motion - near).max()
+    if difference > APART_MAX:
+        raise VideoError(
+            "the floor and the holders must show one motion of the camera to within "
+            f"{APART_MAX:g} px of a picture 224 px wide, and differ by {difference:.1f}"
+        )
+    return np.asarray(motion * pixel)
 
 
 # --- following the holders
@@ -230,47 +256,55 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
         raise VideoError(
             "following the holders needs OpenCV: " + install_hint("stickslip-training", "video")
         ) from error
-    seen, depth = camera.project(holder_points(np.zeros(1))[0])
+    # A window of the same size on the cloth, whatever the camera.
+    start, depth = camera.project(holder_points(np.zeros(1))[0])
     window = max(9, round(WINDOW * camera.fx / float(depth.mean())) | 1)
     precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
     flow = partial(cv2.calcOpticalFlowPyrLK, winSize=(window, window), criteria=precise)
     times: list[float] = []
-    places: list[Any] = []
-    before = kept = None
-    place = kept_place = seen.astype(np.float32)[:, None]
-    for number, (shown, picture) in enumerate(_frames(path)):
-        time = shown if frame_rate is None else number / frame_rate
-        height, width = picture.shape
-        if (width, height) != (camera.width, camera.height):
-            raise VideoError(
-                f"frames must have the size of the calibration, {camera.width} x "
-                f"{camera.height}, and have "
-                f"{width} x {height}"
-            )
-        if before is not None:
-            step, found, _ = flow(before, picture, place, None, maxLevel=2)
-            if not found.all():
-                raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
-            # Errors of steps from frame to frame add up. Those of a match with one kept frame do
-            # not.
-            first = {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-            place, found, _ = flow(kept, picture, kept_place, step.copy(), **first)
-            if not found.all() or np.abs(place - step).max() > MATCH_MAX:
-                place = step
-                kept = picture
-                kept_place = step
+    tracks: list[Any] = []
+    before = reference = None
+    patches = reference_patches = start.astype(np.float32)[:, None]
+    for number, (frame_time, picture) in enumerate(_frames(path)):
+        time = frame_time if frame_rate is None else number / frame_rate
+        _check_size(picture, camera)
+        if before is None:
+            reference = picture
         else:
-            kept = picture
+            step, is_tracked, _ = flow(before, picture, patches, None, maxLevel=2)
+            if not is_tracked.all():
+                raise VideoError(f"the holders must stay in sight, and are lost at {time:.1f} s")
+            # Errors of steps from frame to frame add up. Those of a match with one frame that is
+            # kept for long do not.
+            near = {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+            patches, is_tracked, _ = flow(
+                reference, picture, reference_patches, step.copy(), **near
+            )
+            if not is_tracked.all() or np.abs(patches - step).max() > MATCH_MAX:
+                patches = reference_patches = step
+                reference = picture
         times.append(time)
-        places.append(place.reshape(2, 2).copy())
+        tracks.append(patches.reshape(2, 2).copy())
         before = picture
     if len(times) < 2:
         raise VideoError(f"{path} must have frames, and has {len(times)}")
+
+    # Take the distortion of the lens out of the tracks.
     focal = np.array((camera.fx, camera.fy))
     center = np.array((camera.cx, camera.cy))
-    u, v = np.moveaxis((np.array(places, dtype=np.float64) - center) / focal, -1, 0)
+    u, v = np.moveaxis((np.array(tracks, dtype=np.float64) - center) / focal, -1, 0)
     flat = np.stack(undistorted(u, v, camera.distortion), axis=-1)
     return np.array(times), focal * flat + center
+
+
+def _check_size(picture: npt.NDArray[np.uint8], camera: Camera) -> None:
+    """Raise VideoError if a frame does not have the size of the calibration."""
+    height, width = picture.shape
+    if (width, height) != (camera.width, camera.height):
+        raise VideoError(
+            f"frames must have the size of the calibration, {camera.width} x {camera.height}, "
+            f"and have {width} x {height}"
+        )
 
 
 def _register(
@@ -281,35 +315,43 @@ def _register(
     The motion is the common motion of both holders besides the path, from the first frame on.
     """
 
-    def off(t0: float, some: slice = slice(None)) -> Floats:
-        """Return tracks less the path, less their mean, (N, 2, 2)."""
-        path = camera.project(holder_points(np.maximum(times[some] - t0, 0.0) * RATE))[0]
-        apart = tracks[some] - path
-        return np.asarray(apart - np.median(apart, axis=(0, 1)))
+    def path_error(t0: float, part: slice = slice(None)) -> Floats:
+        """Return tracks less the path, less their median, (N, 2, 2)."""
+        path = camera.project(holder_points(np.maximum(times[part] - t0, 0.0) * RATE))[0]
+        error = tracks[part] - path
+        return np.asarray(error - np.median(error, axis=(0, 1)))
 
     second = max(1, round(1.0 / float(np.median(np.diff(times)))))  # in frames
 
-    def found(some: slice, near: float) -> float:
+    def fitted_start(part: slice, near: float) -> float:
+        """Return the start that fits a part of the video best."""
+
         def residuals(t0: Floats) -> Floats:
-            # What moves within a second: a hand wanders slowly, and the holders turn fast.
-            apart = off(float(t0[0]), some)
-            return np.asarray(apart[second:] - apart[:-second]).ravel()
+            # Changes within a second tell: a hand wanders slowly, and the holders turn fast.
+            error = path_error(float(t0[0]), part)
+            return np.asarray(error[second:] - error[:-second]).ravel()
 
         fit = least_squares(residuals, np.array([near]), loss="soft_l1", diff_step=np.array([1e-4]))
         return float(fit.x[0])
 
     if start is None:
-        coarse = np.arange(times[0] - CUT_MAX, times[-1] - 30.0, 0.5)
-        every = slice(None, None, max(1, len(times) // 600))
-        near = float(coarse[np.argmin([np.abs(off(t, every)).sum() for t in coarse])])
-        start = found(slice(None), near)
+        # The error has several minima, so half seconds are tried first, on 600 frames or so.
+        tried = np.arange(times[0] - CUT_MAX, times[-1] - 30.0, 0.5)
+        thinned = slice(None, None, max(1, len(times) // 600))
+        costs = [np.abs(path_error(t0, thinned)).sum() for t0 in tried]
+        start = fitted_start(slice(None), float(tried[np.argmin(costs)]))
+
+    # Both halves must agree: another path, or another speed, fits each half at another start.
     half = int(np.searchsorted(times, start + 0.5 * (times[-1] - start)))
-    halves = [found(part, start) for part in (slice(None, half), slice(half, None))]
-    apart = off(start)
-    common = apart.mean(axis=1)
-    difference = apart - common[:, None]
+    halves = [fitted_start(part, start) for part in (slice(None, half), slice(half, None))]
+    timing = float(np.ptp([start, *halves]))
+
+    # A camera moves both holders alike. Their difference is no motion of the camera.
+    error = path_error(start)
+    common = error.mean(axis=1)
+    difference = error - common[:, None]
     residual = float(np.sqrt(difference.var(axis=0).mean())) * _WIDE / camera.width
-    return Registration(start, float(np.ptp([start, *halves])), residual), common - common[0]
+    return Registration(start, timing, residual), common - common[0]
 
 
 def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.NDArray[np.uint8]]:

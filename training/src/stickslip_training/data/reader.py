@@ -145,7 +145,7 @@ class DatasetReader:
         chosen = self.chosen.copy()
         if split is not None:
             if split not in SPLITS:
-                raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split!r}")
+                raise ValueError(f"split must be one of {', '.join(SPLITS)}, and is {split}")
             chosen &= self.label("split") == SPLITS.index(split)
         return np.flatnonzero(chosen).astype(np.int64)
 
@@ -155,7 +155,7 @@ class DatasetReader:
             return self.arrays[name]
         except KeyError:
             raise ValueError(
-                f"array must be one of {', '.join(self.arrays)}, and is {name!r}"
+                f"array must be one of {', '.join(self.arrays)}, and is {name}"
             ) from None
 
     def label(self, name: str) -> Array:

@@ -50,7 +50,7 @@ class Item(dict[str, torch.Tensor]):
             return self.categories[label]
         except KeyError:
             raise ValueError(
-                f"label must be one of {', '.join(self.categories)}, and is {label!r}"
+                f"label must be one of {', '.join(self.categories)}, and is {label}"
             ) from None
 
 
@@ -66,9 +66,8 @@ class Batch(Item):
         return [names[code] for code in self[label].tolist()]
 
     def __missing__(self, key: Any) -> torch.Tensor:
-        if isinstance(
-            key, int
-        ):  # torch's own collate function takes a list of items, and asks for its first
+        # torch's own collate function takes a list of items, and asks for its first.
+        if isinstance(key, int):
             raise TypeError(
                 "a batch comes whole from the dataset: make the DataLoader with collate_fn=collate"
             )
@@ -100,10 +99,13 @@ class Samples(Dataset[Item]):
     ) -> None:
         """Open `split` of a dataset, or all of it.
 
-        Args: source: A directory, a URL or an open reader. split: The split; None takes all
-            samples. arrays: Arrays of an item; by default the video, or all curves of a dataset
-            without videos. labels: Labels of an item; by default all that are one number. ring:
-            Buffers that are used in turn; 0 makes a new one for each batch.
+        Args:
+            source: A directory, a URL or an open reader.
+            split: The split; None takes all samples.
+            arrays: Arrays of an item; by default the video, or all curves of a dataset without
+                videos.
+            labels: Labels of an item; by default all that are one number.
+            ring: Buffers that are used in turn; 0 makes a new one for each batch.
 
         Raises:
             ValueError: The dataset has no such array, the split has no valid sample, or `ring` is
@@ -116,6 +118,7 @@ class Samples(Dataset[Item]):
         self.reader = source if isinstance(source, DatasetReader) else DatasetReader(source)
         known = self.reader.arrays
         if arrays is None:
+            # A dataset with videos is large: its meshes and curves are read on demand only.
             curves = [
                 array.name
                 for array in known.values()
@@ -140,8 +143,10 @@ class Samples(Dataset[Item]):
             raise ValueError(f"{name} of {self.reader.source} has no valid sample")
         self._arrays = tuple(arrays)
         values = {name: self.reader.label(name)[self.slots] for name in labels}
+        # Networks compute in single precision, and index with 64-bit codes.
         self._labels = {
-            n: v.astype(np.float32 if v.dtype.kind == "f" else np.int64) for n, v in values.items()
+            name: column.astype(np.float32 if column.dtype.kind == "f" else np.int64)
+            for name, column in values.items()
         }
         self.categories = {
             name: self.reader.categories(name) for name in labels if self.reader.categories(name)
@@ -177,6 +182,7 @@ class Samples(Dataset[Item]):
         chosen = np.asarray(indices, dtype=np.int64)
         slots = self.slots[chosen]
         batch = Batch(self._buffers(len(slots)), self.categories)
+        # One read into each buffer, without a copy of every sample.
         for name in self._arrays:
             self.reader.read_into(name, slots, batch[name].numpy())
         for name, values in self._labels.items():
@@ -204,15 +210,17 @@ class Samples(Dataset[Item]):
 
     def _buffers(self, count: int) -> dict[str, torch.Tensor]:
         """Return a tensor (count, *sample shape) for each array, new or of the ring."""
+        # Workers send their batches to another process, which would see a buffer change.
         if self._ring_length == 0 or get_worker_info() is not None:
             return self._new_buffers(count)
-        place = self._drawn % self._ring_length
+        turn = self._drawn % self._ring_length
         self._drawn += 1
-        if place == len(self._ring):
+        # Buffers are made as they are needed; a larger batch needs larger ones.
+        if turn == len(self._ring):
             self._ring.append(self._new_buffers(count))
-        elif any(len(tensor) < count for tensor in self._ring[place].values()):
-            self._ring[place] = self._new_buffers(count)
-        return {name: tensor[:count] for name, tensor in self._ring[place].items()}
+        elif any(len(tensor) < count for tensor in self._ring[turn].values()):
+            self._ring[turn] = self._new_buffers(count)
+        return {name: tensor[:count] for name, tensor in self._ring[turn].items()}
 
     def _new_buffers(self, count: int) -> dict[str, torch.Tensor]:
         return {
@@ -252,15 +260,14 @@ class Stream:
         `options` are those of DataLoader. Raises ValueError where a number makes no sense, or no
         round is full.
         """
-        runs = torch.distributed.is_available() and torch.distributed.is_initialized()
-        self.rank = rank if rank is not None else torch.distributed.get_rank() if runs else 0
-        self.world_size = (
-            world_size
-            if world_size is not None
-            else torch.distributed.get_world_size()
-            if runs
-            else 1
-        )
+        distributed = torch.distributed
+        is_parallel = distributed.is_available() and distributed.is_initialized()
+        if rank is None:
+            rank = distributed.get_rank() if is_parallel else 0
+        if world_size is None:
+            world_size = distributed.get_world_size() if is_parallel else 1
+        self.rank = rank
+        self.world_size = world_size
         if batch_size < 1 or self.world_size < 1:
             raise ValueError(
                 f"batch_size and world_size must be at least 1, and are {batch_size} and "
@@ -300,12 +307,10 @@ class Stream:
         self.drawn = 0
 
     def _batches(self) -> list[list[int]]:
-        count = len(self.dataset)
-        order = (
-            np.random.default_rng([self.seed, self.epoch]).permutation(count)
-            if self.shuffle
-            else np.arange(count)
-        )
+        # Every process finds the same order, and takes its own part of each round.
+        order = np.arange(len(self.dataset))
+        if self.shuffle:
+            order = np.random.default_rng([self.seed, self.epoch]).permutation(len(order))
         size = self.batch_size * self.world_size
         first = self.rank * self.batch_size
         return [
@@ -325,7 +330,7 @@ class Stream:
         for name, value in self._same().items():
             if state.get(name) != value:
                 raise ValueError(
-                    f"{name} of the stream is {value!r}, and of the state {state.get(name)!r}"
+                    f"{name} of the stream is {value}, and of the state {state.get(name)}"
                 )
         self.epoch, self.drawn = int(state["epoch"]), int(state["drawn"])
 

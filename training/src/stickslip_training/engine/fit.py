@@ -369,7 +369,7 @@ def check_device(name: str) -> None:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:
         raise ValueError(
-            f"device must be one that torch can use here, and is {name!r}: "
+            f"device must be one that torch can use here, and is {name}: "
             f"{str(error).splitlines()[0]}"
         ) from None
 

@@ -12,7 +12,7 @@ Labels are columns of the episodes.
 Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -186,10 +186,9 @@ class _Export:
         _write_tables(parquet, [table], meta / "episodes/chunk-000/file-000.parquet")
         tasks = pandas.DataFrame({"task_index": [0]}, index=[self.content.title])
         tasks.to_parquet(meta / "tasks.parquet")
-        totals = {
-            feature: _merged([episode[feature] for episode in self.statistics])
-            for feature in self.statistics[0]
-        }
+        totals: dict[str, Any] = {}
+        for feature in self.statistics[0]:
+            totals[feature] = _merged([episode[feature] for episode in self.statistics])
         (meta / "stats.json").write_text(strict_json(totals))
         info = _info(self.episodes, names, self.views, float(self.clock.rate), self.clip_shape)
         (meta / "info.json").write_text(strict_json(info, indent=2))
@@ -215,26 +214,25 @@ def _episodes(content: Content) -> Iterator[tuple[str, dict[str, int]]]:
     An episode is whole if all viewpoints see it.
     """
     reader = content.reader
-    labels = [
-        name for name in reader.spec.named_axes if name in reader.arrays and name != "viewpoint"
-    ]
-    seen: dict[tuple[Any, ...], dict[str, int]] = {}
     views = reader.categories("viewpoint")
+    labels = ["split", *reader.spec.named_axes]
+    labels = [name for name in labels if name in reader.arrays and name != "viewpoint"]
+    # Samples that differ in nothing but the viewpoint are of one episode.
+    episodes: dict[tuple[Any, ...], dict[str, int]] = {}
+    all_views: set[str] = set()
     for slot in content.slots.tolist():
-        key = (
-            int(reader.label("split")[slot]),
-            *(reader.label(name)[slot].item() for name in labels),
-        )
-        seen.setdefault(key, {})[views[reader.label("viewpoint")[slot]]] = slot
-    every = {view for slots in seen.values() for view in slots}
-    whole = [(key[0], slots) for key, slots in seen.items() if slots.keys() == every]
+        key = tuple(reader.label(name)[slot].item() for name in labels)
+        view = views[reader.label("viewpoint")[slot]]
+        episodes.setdefault(key, {})[view] = slot
+        all_views.add(view)
+    whole = [(key[0], slots) for key, slots in episodes.items() if slots.keys() == all_views]
     if not whole:
         raise ValueError(
-            f"an episode needs a clip of each of {', '.join(sorted(every))}, and no "
-            "simulation of this part of "
-            f"{content.name} has them all"
+            f"an episode needs a clip of each of {', '.join(sorted(all_views))}, and no "
+            f"simulation of this part of {content.name} has them all"
         )
-    for split, slots in sorted(whole, key=lambda found: found[0]):
+    # LeRobot takes a split to be a range of episodes.
+    for split, slots in sorted(whole, key=lambda episode: episode[0]):
         yield SPLITS[split], dict(sorted(slots.items()))
 
 
@@ -251,36 +249,49 @@ def _numbers(
     def over_time(name: str) -> Array:
         return np.asarray(content.read(name, alone)[0][instants])
 
+    # Holders: pose, and whether they hold.
     poses = _flat_poses(over_time("holder_pose"))
     grasped = over_time("grasped").astype(np.float32)
-    holders = np.concatenate([poses, grasped[..., None]], axis=2)
-    things = arrays["holder_pose"].attributes["names"]
-    own = [f"{holder}.{what}" for holder in things for what in (*_POSE, "grasp")]
-    held = holders.reshape(len(holders), -1)
-    parts = [held]
-    names = list(own)
+    holders = np.concatenate([poses, grasped[..., None]], axis=2).reshape(len(poses), -1)
+    parts = [holders]
+    action_names = _dotted(arrays["holder_pose"].attributes["names"], (*_POSE, "grasp"))
+    names = list(action_names)
+
     if "body_pose" in arrays:
         parts.append(_flat_poses(over_time("body_pose")).reshape(len(holders), -1))
-        names += [
-            f"{body}.{what}" for body in arrays["body_pose"].attributes["names"] for what in _POSE
-        ]
-    for name in (name for name in arrays if name.endswith(".positions")):
-        sheet = name.removesuffix(".positions")
-        rest = content.read(f"{sheet}.rest", alone)[
-            0
-        ]  # a flat sheet (V, 2): its corners and its middle are tracked
-        low = rest.min(axis=0)
-        high = rest.max(axis=0)
-        places = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
-        tracked = [int(np.abs(rest - place).sum(axis=1).argmin()) for place in places]
-        parts.append(over_time(name)[:, tracked].reshape(len(holders), -1))
-        names += [f"{sheet}.{vertex}.{axis}" for vertex in tracked for axis in "xyz"]
-    following = np.concatenate([held[1:], held[-1:]])
-    state = np.concatenate(parts, axis=1)
+        names += _dotted(arrays["body_pose"].attributes["names"], _POSE)
+
+    # Sheets: five vertices of each are tracked.
+    for name in arrays:
+        if name.endswith(".positions"):
+            sheet = name.removesuffix(".positions")
+            tracked = _tracked_vertices(content.read(f"{sheet}.rest", alone)[0])
+            parts.append(over_time(name)[:, tracked].reshape(len(holders), -1))
+            names += _dotted([f"{sheet}.{vertex}" for vertex in tracked], "xyz")
+
+    # The action of a frame is the state of the holders at the next one.
+    action = np.concatenate([holders[1:], holders[-1:]]).astype(np.float32)
+    state = np.concatenate(parts, axis=1).astype(np.float32)
     return (
-        {"action": following.astype(np.float32), "observation.state": state.astype(np.float32)},
-        {"action": own, "observation.state": names},
+        {"action": action, "observation.state": state},
+        {"action": action_names, "observation.state": names},
     )
+
+
+def _dotted(owners: Sequence[str], parts: Sequence[str]) -> list[str]:
+    """Return the names OWNER.PART of all parts of all owners."""
+    names: list[str] = []
+    for owner in owners:
+        names += [f"{owner}.{part}" for part in parts]
+    return names
+
+
+def _tracked_vertices(rest: Array) -> list[int]:
+    """Return the vertices at the corners and in the middle of a flat sheet (V, 2)."""
+    low = rest.min(axis=0)
+    high = rest.max(axis=0)
+    points = [low, (high[0], low[1]), high, (low[0], high[1]), 0.5 * (low + high)]
+    return [int(np.abs(rest - point).sum(axis=1).argmin()) for point in points]
 
 
 def _flat_poses(poses: Array) -> Array:
@@ -316,15 +327,20 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
 
     length = len(frames["action"])
     index = np.arange(length, dtype=np.int64)
-    columns = {
-        name: v.ravel()
-        if v.shape[1] == 1
-        else pyarrow.FixedSizeListArray.from_arrays(v.ravel(), v.shape[1])
-        for name, v in frames.items()
+    columns: dict[str, Any] = {}
+    for name, values in frames.items():
+        width = values.shape[1]
+        columns[name] = values.ravel()
+        if width > 1:
+            columns[name] = pyarrow.FixedSizeListArray.from_arrays(values.ravel(), width)
+    columns |= {
+        "timestamp": (index / float(rate)).astype(np.float32),
+        "frame_index": index,
+        "episode_index": np.full_like(index, number),
+        "index": index + number * length,
+        "task_index": np.zeros_like(index),
     }
-    counters = {"timestamp": (index / float(rate)).astype(np.float32), "frame_index": index}
-    counters |= {"episode_index": np.full_like(index, number), "index": index + number * length}
-    return pyarrow.table(columns | counters | {"task_index": np.zeros_like(index)})
+    return pyarrow.table(columns)
 
 
 def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
@@ -333,30 +349,32 @@ def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str
     They are lists of a shape, (k,) by default.
     """
     exact = values.astype(np.float64)
-    found = {
+    statistics = {
         "min": exact.min(axis=0),
         "max": exact.max(axis=0),
         "mean": exact.mean(axis=0),
         "std": exact.std(axis=0),
     }
-    return {name: value.reshape(shape or -1).tolist() for name, value in found.items()} | {
-        "count": [len(values)]
-    }
+    lists = {name: value.reshape(shape or -1).tolist() for name, value in statistics.items()}
+    return lists | {"count": [len(values)]}
 
 
 def _merged(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the statistics of all episodes together, which have equally many values each."""
-    each = {name: np.array([part[name] for part in parts]) for name in parts[0]}
-    mean = each["mean"].mean(axis=0)
-    variance = (each["std"] ** 2 + (each["mean"] - mean) ** 2).mean(axis=0)
-    found = {
-        "min": each["min"].min(axis=0),
-        "max": each["max"].max(axis=0),
-        "mean": mean,
-        "std": np.sqrt(variance),
-    }
-    return {name: value.tolist() for name, value in found.items()} | {
-        "count": each["count"].sum(axis=0).tolist()
+
+    def column(name: str) -> Array:
+        return np.array([part[name] for part in parts])
+
+    means = column("mean")
+    mean = means.mean(axis=0)
+    # The variance within episodes, and that of their means.
+    variance = (column("std") ** 2 + (means - mean) ** 2).mean(axis=0)
+    return {
+        "min": column("min").min(axis=0).tolist(),
+        "max": column("max").max(axis=0).tolist(),
+        "mean": mean.tolist(),
+        "std": np.sqrt(variance).tolist(),
+        "count": column("count").sum(axis=0).tolist(),
     }
 
 
@@ -365,12 +383,12 @@ def _labels(content: Content, slot: int) -> dict[str, Any]:
 
     Categories are names, and not codes.
     """
-    found: dict[str, Any] = {}
+    labels: dict[str, Any] = {}
     for array in content.labels:
         if not array.shape and array.name != "viewpoint":
             value = content.read(array.name, np.array([slot]))[0].item()
-            found[array.name] = str(array.categories[value]) if array.categories else value
-    return found
+            labels[array.name] = str(array.categories[value]) if array.categories else value
+    return labels
 
 
 def _info(
@@ -406,7 +424,6 @@ def _info(
     }
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
-    ends = np.cumsum([0, *(sum(own == split for own, _ in episodes) for split in SPLITS)]).tolist()
     return {
         "codebase_version": "v3.0",
         "robot_type": "holders",
@@ -417,10 +434,20 @@ def _info(
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": int(rate) if rate == int(rate) else rate,
-        "splits": {
-            split: f"{a}:{b}" for split, a, b in zip(SPLITS, ends, ends[1:], strict=False) if b > a
-        },
+        "splits": _split_ranges([split for split, _ in episodes]),
         "data_path": DATA,
         "video_path": VIDEO,
         "features": features,
     }
+
+
+def _split_ranges(splits: list[str]) -> dict[str, str]:
+    """Return the range of episodes of each split that has any, as FIRST:END."""
+    ranges: dict[str, str] = {}
+    first = 0
+    for split in SPLITS:
+        count = splits.count(split)
+        if count:
+            ranges[split] = f"{first}:{first + count}"
+        first += count
+    return ranges

@@ -122,7 +122,7 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
         rigs = read_rigs(path)
     except ValidationError as error:
         problems = [
-            f"{'.'.join(map(str, item['loc']))}: {item['msg']}; got {item['input']!r}"
+            f"{'.'.join(map(str, item['loc']))}: {item['msg']}; got {item['input']}"
             for item in error.errors(include_url=False)
         ]
         raise ReconstructionError(f"{path}: " + "\n  ".join(problems)) from error
@@ -136,7 +136,7 @@ def read_calibration(path: str | Path, rig: str | None = None) -> tuple[Camera, 
             )
         rig = next(iter(rigs))
     if rig not in rigs:
-        raise ReconstructionError(f"rig must be one of {names} in {path}; got {rig!r}")
+        raise ReconstructionError(f"rig must be one of {names} in {path}; got {rig}")
     for camera in rigs[rig]:
         if any(camera.distortion):
             raise ReconstructionError(

@@ -158,7 +158,7 @@ def reconstruct(
 def _vector(name: str, value: npt.ArrayLike) -> Floats:
     vector = np.asarray(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{name} must be three finite numbers; got {value!r}")
+        raise ValueError(f"{name} must be three finite numbers; got {vector.tolist()}")
     return vector
 
 
@@ -174,25 +174,25 @@ def _silhouettes(
             f"there must be one view for each of at least 2 cameras; got {len(images)} for "
             f"{len(cameras)}"
         )
-    seen = []
+    silhouettes = []
     for image, camera in zip(images, cameras, strict=True):
         if image.shape[:2] != (camera.height, camera.width):
             raise ReconstructionError(
-                f"view {camera.name!r} must be {camera.width} x {camera.height} pixels as "
-                "its camera; "
-                f"got {image.shape[1]} x {image.shape[0]}"
+                f"view {camera.name} must be {camera.width} x {camera.height} pixels as "
+                f"its camera; got {image.shape[1]} x {image.shape[0]}"
             )
         try:
-            seen.append(_view(image, camera, length, clamp))
+            silhouettes.append(_view(image, camera, length, clamp))
         except ReconstructionError as error:
-            raise ReconstructionError(f"view {camera.name!r}: {error}") from error
-    return seen
+            raise ReconstructionError(f"view {camera.name}: {error}") from error
+    return silhouettes
 
 
 def _view(image: npt.NDArray[np.generic], camera: Camera, length: float, clamp: Floats) -> View:
     factor = int(np.ceil(max(image.shape[:2]) / LARGEST_IMAGE))
     light = shrink_image(to_linear(image), factor)
     coverage = silhouette(light)
+    # A rod of many pixels is as good in fewer, and costs less.
     again = int(_half_width(coverage) / WIDEST_ROD * 2.0)
     if again > 1:
         factor = factor * again
@@ -211,10 +211,11 @@ def _half_width(coverage: Floats) -> float:
 
 def _radius(views: Sequence[View]) -> float:
     """Estimate the radius [L]."""
-    found = [
+    # A half width in pixels is a length at the distance of the clamp. One view may be off.
+    radii = [
         _half_width(view.coverage) * float(np.linalg.norm(view.t)) / view.focal for view in views
     ]
-    return float(np.clip(np.median(found), *SLENDER))
+    return float(np.clip(np.median(radii), *SLENDER))
 
 
 def _refined(
@@ -222,9 +223,11 @@ def _refined(
 ) -> list[Fit]:
     """Return the fits of all different starts."""
     lines = follow(views, radius, direction, STARTS)
+    # The cloud's polyline is a start only if it is about as long as the rod.
     by_hull = moving_cylinder(visual_hull(views), radius, direction)
     if 0.8 < arc_length(by_hull)[-1] < 1.2:
         lines.append(by_hull)
+    # A coarse fit to blurred views of half the size finds the way from far off.
     coarse_views = [view.shrunk(2) for view in views]
     starts = [start(fit_curve(line, CONTROL_POINTS), radius, len(views)) for line in lines]
     coarse = [
@@ -239,19 +242,20 @@ def _refined(
         )
         for fit in starts
     ]
-    kept: list[Fit] = []
+    # A fine fit is expensive: starts that came to the same curve, or to a bad one, get none.
+    promising: list[Fit] = []
     for fit in sorted(coarse, key=lambda fit: fit.cost):
-        hopeless = bool(kept) and fit.cost > HOPELESS * kept[0].cost
-        if not hopeless and all(
-            _distance(fit.control, other.control) > 0.5 * APART for other in kept
-        ):
-            kept.append(fit)
-    return [refine(views, fit, direction, fixed_radius=fixed_radius) for fit in kept]
+        is_hopeless = bool(promising) and fit.cost > HOPELESS * promising[0].cost
+        is_new = all(_distance(fit.control, other.control) > 0.5 * APART for other in promising)
+        if is_new and not is_hopeless:
+            promising.append(fit)
+    return [refine(views, fit, direction, fixed_radius=fixed_radius) for fit in promising]
 
 
-def _distance(one: Floats, other: Floats) -> float:
+def _distance(control: Floats, other: Floats) -> float:
     """Return the largest distance of two curves at the same arc length [L]."""
-    a, b = (at_uniform_arc_length(control, 100) for control in (one, other))
+    a = at_uniform_arc_length(control, 100)
+    b = at_uniform_arc_length(other, 100)
     return float(np.linalg.norm(a - b, axis=1).max())
 
 
@@ -263,10 +267,12 @@ def _match(views: Sequence[View], fit: Fit) -> tuple[float, float, float]:
         image = draw(view, index, fit, s)
         drawn = np.zeros(view.coverage.size)
         drawn[image.pixel] = image.value
+        # Behind the clamp nothing is known.
         known = np.ones(view.coverage.size, dtype=bool)
         known[image.left_out] = False
         seen = np.minimum(view.coverage.ravel(), 1.5)[known]
         drawn = drawn[known]
+        # Pixels of one without the other count as unexplained or unsupported.
         seen_sum += seen.sum()
         drawn_sum += drawn.sum()
         difference += np.abs(seen - drawn).sum()
@@ -311,6 +317,7 @@ def _residual(views: Sequence[View], fit: Fit, points: int) -> Floats:
         error = view.coverage.ravel()[image.pixel] - image.value
         front = image.sides[0]
         point = np.rint(s[front.sample] * (points - 1)).astype(np.int64)
+        # Least squares over the pixels about each point; points that are hidden have no slope.
         pull = np.bincount(point, front.by_normal * error, points)
         hold = np.bincount(point, front.by_normal**2, points)
         open_ = hold > 0.05

@@ -90,6 +90,7 @@ def refine(
 
     `extra_blur` [px] blurs the views first, which makes the curve findable from farther off.
     """
+    # The drawing is blurred as much, so the two stay alike.
     if extra_blur > 0.0:
         views = [
             replace(view, coverage=ndimage.gaussian_filter(view.coverage, extra_blur))
@@ -101,6 +102,7 @@ def refine(
     damping = 1e-3
     for _ in range(iterations):
         step = system.step(damping)
+        # A step that does not help is shortened, and one that does lets the next be longer.
         tried = problem.system(x + step)
         if tried.cost < system.cost:
             gain = system.cost - tried.cost
@@ -113,6 +115,7 @@ def refine(
             damping *= 8.0
             if damping > 1e4:
                 break
+    # The errors of pixels, as measured, give those of the control points.
     K = len(fit.control)
     spread = system.inverse()[: 3 * K, : 3 * K] * system.pixel_variance
     return replace(problem.unpack(x), cost=system.cost, covariance=spread)
@@ -126,9 +129,11 @@ class _System:
     pixel_variance: float
 
     def step(self, damping: float) -> Floats:
+        # Damping by the diagonal makes the step independent of the units of the unknowns.
         H = self.normal + damping * np.diag(np.diag(self.normal) + 1e-9)
         try:
             return np.asarray(-cho_solve(cho_factor(H), self.gradient))
+        # A gradient step needs no factorisation.
         except LinAlgError:
             return np.asarray(-self.gradient / (np.diag(H) + 1.0))
 
@@ -159,11 +164,14 @@ class _Problem:
         self._B = basis(self._s, K)
         self._N = _hats(self._s)
         self._shape = shape = fit.light.shape
-        own = np.arange(fit.light.size).reshape(shape)
+        # Light and slope belong to one view; all else is shared, so each view touches few columns.
+        by_view = np.arange(fit.light.size).reshape(shape)
         shared = np.arange(3 * K + 2)
         self._columns = [
-            np.concatenate([shared, 3 * K + 2 + row, 3 * K + 2 + own.size + row]) for row in own
+            np.concatenate([shared, 3 * K + 2 + row, 3 * K + 2 + by_view.size + row])
+            for row in by_view
         ]
+        # Unknowns that stay as they are.
         self._free = np.ones(3 * K + 2 + 2 * fit.light.size, dtype=bool)
         self._free[3 * K] = not fixed_radius
         self._free[3 * K + 1] = shading
@@ -198,12 +206,14 @@ class _Problem:
         """Return the cost at x with its gradient and Gauss-Newton matrix."""
         fit = self.unpack(x)
         size = len(x)
+        # Priors that are linear in x.
         normal = self._prior_rows.T @ self._prior_rows
         gradient = np.zeros(size)
         error = self._prior_rows @ x - self._prior_target
         gradient += self._prior_rows.T @ error
         cost = 0.5 * float(error @ error)
 
+        # A rod does not stretch: its speed along the parameter is 1.
         velocity = self._speed @ fit.control
         speed = np.linalg.norm(velocity, axis=1)
         stretch = (speed - 1.0) / STRETCH / np.sqrt(3.0)  # three of them to a control point
@@ -219,6 +229,7 @@ class _Problem:
         gradient[:end] += J.T @ stretch
         cost += 0.5 * float(stretch @ stretch)
 
+        # Pixels, with the weights of Cauchy's loss.
         squares = 0.0
         count = 0
         for index, view in enumerate(self._views):
@@ -232,6 +243,7 @@ class _Problem:
             columns = self._columns[index]
             normal[np.ix_(columns, columns)] += (J * weight[:, None]).T @ J
             gradient[columns] += J.T @ (weight * error)
+        # A fixed unknown has the equation step = 0.
         fixed = ~self._free
         normal[fixed] = 0.0
         normal[:, fixed] = 0.0
@@ -247,6 +259,7 @@ class _Problem:
         for side in image.sides:
             B = self._B[side.sample]
             N = self._N[side.sample]
+            # The picture moves with the sample, and the sample with the control points.
             for axis in range(3):
                 J[:, axis : 3 * K : 3] += B * side.by_point[:, axis, None]
             J[:, 3 * K] += side.by_radius
@@ -273,18 +286,22 @@ class _Problem:
                 rows[axis, axis : 3 * K : 3] = row
             return rows
 
+        # The rod begins at the clamp, in the direction of the clamp.
         add(on_axes(basis(np.zeros(1), K)[0] / CLAMP))
         add(on_axes(basis(np.zeros(1), K, 1)[0] / CLAMP_TANGENT), direction / CLAMP_TANGENT)
+        # It bends smoothly: its third derivative, one in each interval of knots, is small.
         intervals = K - 3
         for row in basis((np.arange(intervals) + 0.5) / intervals, K, 3):
             add(on_axes(row / JERK))
-        for place, value, spread in (
+        # Radius and blur stay near their first values, unless pixels say otherwise.
+        for unknown, value, spread in (
             (3 * K, np.log(self._start.radius), LOG_RADIUS),
             (3 * K + 1, np.log(self._start.blur), LOG_BLUR),
         ):
             row = np.zeros((1, size))
-            row[0, place] = 1.0 / spread
+            row[0, unknown] = 1.0 / spread
             add(row, value / spread)
+        # Light is about 1 and even over the picture, and changes smoothly along the rod.
         bend = np.diff(np.eye(nodes), 2, axis=0) / LIGHT_BEND
         for group, (value, spread) in enumerate(((1.0, LIGHT), (0.0, SLOPE))):
             for view in range(views):
@@ -293,12 +310,12 @@ class _Problem:
                 rows[:nodes, at : at + nodes] = np.eye(nodes) / spread
                 rows[nodes:, at : at + nodes] = bend
                 add(rows, np.concatenate([np.full(nodes, value / spread), np.zeros(len(bend))]))
-        return np.concatenate([rows for rows, _ in blocks]), np.concatenate(
-            [target for _, target in blocks]
-        )
+        matrix = np.concatenate([rows for rows, _ in blocks])
+        targets = np.concatenate([target for _, target in blocks])
+        return matrix, targets
 
 
 def _hats(s: Floats) -> Floats:
     """Return hat functions on evenly spaced nodes, (n, LIGHT_NODES)."""
-    place = s * (LIGHT_NODES - 1)
-    return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(LIGHT_NODES))))
+    position = s[:, None] * (LIGHT_NODES - 1)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(position - np.arange(LIGHT_NODES))))

@@ -35,13 +35,12 @@ CELL = 0.006  # [L]: of two ways at one place, in one direction, the better is k
 TURN = 0.35  # the side of a cell of directions
 APART = 0.02  # [L]: curves that are farther apart anywhere are different curves
 BLUR = 0.6  # deviation of the filter of `_middle`, over the rod's radius
-PEAK = float(
-    erf(1.0 / BLUR / np.sqrt(2.0))
-)  # what it leaves in the middle of a straight strip of coverage 1
+PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))
+"""Value that the filter leaves in the middle of a straight strip of coverage 1."""
 
 
-def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 5) -> list[Floats]:
-    """Return the best ways from the clamp, (STEPS + 1, 3) each, one step apart; radius [L].
+def follow(views: Sequence[View], radius: float, direction: Floats, count: int = 5) -> list[Floats]:
+    """Return the best paths from the clamp, (STEPS + 1, 3) each, one step apart; radius [L].
 
     The cheapest comes first, and each is unlike the ones before it.
     """
@@ -52,35 +51,40 @@ def follow(views: Sequence[View], radius: float, direction: Floats, ways: int = 
     turn = np.zeros((1, 3))  # rotation vector of the last step
     cost = np.zeros(1)
     for _ in range(STEPS):
+        # A rod bends evenly: the likeliest turn is that of the last step.
         ahead = Rotation.from_rotvec(turn).apply(heading)
         candidates = _cone(ahead)  # (n, m, 3)
         n, m = candidates.shape[:2]
+        # A step goes along the chord of the arc from the old direction to the new one.
         middle = heading[:, None] + candidates
         places = (
             trail[:, -1:] + step * middle / np.linalg.norm(middle, axis=-1, keepdims=True)
         ).reshape(-1, 3)
         flat = candidates.reshape(-1, 3)
         parent = np.repeat(np.arange(n), m)
+        # The cost of a path: points outside of silhouettes, uneven bends, and any bend at all.
         total = (
             cost[parent]
             + sum(_outside(view, field, places) for view, field in zip(views, fields, strict=True))
             + UNEVEN * _squared(flat - ahead[parent])
             + BENT * _squared(flat - heading[parent])
         )
-        kept = _best_of_cells(places, flat, total)
-        turn = _rotation(heading[parent[kept]], flat[kept])
-        trail = np.concatenate([trail[parent[kept]], places[kept, None]], axis=1)
-        heading = flat[kept]
-        cost = total[kept]
-    tracks: list[Floats] = []
-    for way in trail[np.argsort(cost, kind="stable")]:
-        if all(np.linalg.norm(way - other, axis=1).max() > APART for other in tracks):
-            tracks.append(way)
-    return tracks[:ways]
+        beam = _best_of_cells(places, flat, total)
+        turn = _rotation(heading[parent[beam]], flat[beam])
+        trail = np.concatenate([trail[parent[beam]], places[beam, None]], axis=1)
+        heading = flat[beam]
+        cost = total[beam]
+    # The beam holds many paths that differ in nothing but their last steps.
+    paths: list[Floats] = []
+    for path in trail[np.argsort(cost, kind="stable")]:
+        if all(np.linalg.norm(path - other, axis=1).max() > APART for other in paths):
+            paths.append(path)
+    return paths[:count]
 
 
 def _middle(view: View, radius: float) -> Floats:
     """Return the fraction of the rod's disc about each pixel that is in the silhouette."""
+    # The rod's size in this view, at the distance of its clamp.
     size = radius * view.focal / float(np.linalg.norm(view.t))
     solid = np.minimum(view.coverage, 1.0)
     return np.asarray(ndimage.gaussian_filter(solid, BLUR * size)) / PEAK
@@ -94,10 +98,12 @@ def _outside(view: View, field: Floats, points: Floats) -> Floats:
 
 def _cone(ahead: Floats) -> Floats:
     """Return directions around each of (n, 3), itself first, (n, m, 3)."""
+    # Any axis across will do: the one that is least along the direction.
     axis = np.eye(3)[np.argmin(np.abs(ahead), axis=1)]
     right = np.cross(ahead, axis)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     up = np.cross(ahead, right)
+    # Rings about the direction; the rays of one ring lie between those of the next.
     rays = [ahead]
     for angle, count in RINGS:
         for azimuth in 2.0 * np.pi / count * (np.arange(count) + 0.5 * angle):
@@ -120,28 +126,25 @@ def _squared(vectors: Floats) -> Floats:
 
 def _best_of_cells(places: Floats, directions: Floats, cost: Floats) -> npt.NDArray[np.int64]:
     """Return the cheapest paths, at most BEAM, and one of each cell of positions and directions."""
-    few = (
-        np.argpartition(cost, 8 * BEAM)[: 8 * BEAM]
-        if len(cost) > 8 * BEAM
-        else np.arange(len(cost))
-    )
-    order = few[np.argsort(cost[few], kind="stable")]
+    # Sorting all candidates would cost more than all the rest of a step.
+    cheap = np.arange(len(cost))
+    if len(cost) > 8 * BEAM:
+        cheap = np.argpartition(cost, 8 * BEAM)[: 8 * BEAM]
+    order = cheap[np.argsort(cost[cheap], kind="stable")]
     sides = np.concatenate(
         [np.rint(places[order] / CELL), np.rint(directions[order] / TURN)], axis=1
     ).astype(np.int64)
     cell = np.zeros(len(order), dtype=np.int64)
     for side in sides.T:
-        cell = (
-            cell * 1024 + side + 512
-        )  # a side is a few hundred cells long at most; six of them fit in 60 bits
+        # A side is a few hundred cells long at most, so six of them fit in 60 bits.
+        cell = cell * 1024 + side + 512
     _, first = np.unique(cell, return_index=True)
     return order[np.sort(first)[:BEAM]]
 
 
 ROOM = 1.05  # [L]: the rod cannot reach farther from its clamp
-HULL_CELL = (
-    0.0025  # [L]: the cloud's spacing, about half a pixel of the views that the project renders
-)
+HULL_CELL = 0.0025
+"""Spacing of the cloud [L]: about half a pixel of the views that the project renders."""
 MOST_CELLS = 400_000  # a hull this large is no rod's
 
 
@@ -157,16 +160,17 @@ def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
     halvings = int(np.ceil(np.log2(2.0 * ROOM / cell)))
     centers = np.zeros((1, 3))
     side = 2.0 * ROOM
-    corners = np.array(
-        [[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25)]
-    )
+    # Centres of the eight halves of a cube, over its side.
+    corners = np.stack(np.meshgrid(*[(-0.25, 0.25)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     for level in range(halvings + 1):
         if level > 0:
             centers = (centers[:, None] + side * corners).reshape(-1, 3)
             side = side / 2.0
+        # At the last level the centre itself must be in every silhouette.
         reach = 0.5 * np.sqrt(3.0) * side if level < halvings else 0.0
         for view, distance in zip(views, outside, strict=True):
             centers = centers[_touches(view, distance, centers, reach)]
+        # A hull this large means that the silhouettes do not bound a rod.
         if len(centers) > MOST_CELLS:
             return np.zeros((0, 3))
     return centers
@@ -179,10 +183,10 @@ def _touches(view: View, distance: Floats, points: Floats, reach: float) -> npt.
     inside = np.clip(nearest, 0, [width - 1, height - 1])
     out_of_frame = np.linalg.norm(nearest - inside, axis=1)
     u, v = inside.astype(np.int64).T
+    # A point out of the picture is as far away as its nearest pixel.
     away = np.maximum(distance[v, u], out_of_frame)
-    allowed = (
-        float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71
-    )  # half a pixel's diagonal
+    # The ball about a cube may touch a silhouette half a pixel's diagonal away.
+    allowed = float(view.f.max()) * reach / np.maximum(depth - reach, 1e-3) + 0.71
     if reach == 0.0:
         allowed = np.zeros(len(points))
     return np.asarray(away <= allowed)
@@ -202,11 +206,12 @@ def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float
         offset = cloud - points[-1]
         ahead = offset @ heading
         aside = np.linalg.norm(offset - ahead[:, None] * heading, axis=1)
-        held = (ahead > 0.0) & (ahead < 2.0 * step) & (aside < 3.0 * radius)
-        if not held.any():
+        is_inside = (ahead > 0.0) & (ahead < 2.0 * step) & (aside < 3.0 * radius)
+        if not is_inside.any():
             break
-        toward = offset[held].mean(axis=0)
+        toward = offset[is_inside].mean(axis=0)
         toward /= np.linalg.norm(toward)
+        # Half a turn towards the centroid, so that single points do not throw it off.
         heading = heading + toward
         heading /= np.linalg.norm(heading)
         points.append(points[-1] + step * toward)
