@@ -9,10 +9,10 @@ Array = npt.NDArray[Any]
 """Of any type of number."""
 
 Floats = npt.NDArray[np.float64]
-"""What is computed in double precision."""
+"""Results in double precision."""
 
 SingleFloats = npt.NDArray[np.float32]
-"""What networks see, and datasets hold."""
+"""Input of networks, and content of datasets."""
 
 AnyFloats = npt.NDArray[np.floating[Any]]
 """Of either precision."""

@@ -1,13 +1,13 @@
 """Named test sets, and entries: records of scores, and their table.
 
 A set is a spec, and the split of its dataset to answer, or all of it. Builds of the code differ
-between machines, and so do manifests. What identifies a set is therefore what its samples hold:
+between machines, and so do manifests. So the content of its samples identifies a set:
 
   * the labels that follow from the spec, slot by slot, to the last bit: a digest;
   * a little of what methods see, and of truths that are computed, to within a tolerance: an array.
 
 The manifests of versions that were published stand beside it, so that a table can tell entries on
-the published bytes from those on a set that was remade.
+the published bytes from entries on a set that was remade.
 """
 
 import json
@@ -63,7 +63,7 @@ class NamedSet:
     def check(self, reader: DatasetReader) -> tuple[Integers, Making]:
         """Return the slots to answer, and whether the dataset is a published version or was remade.
 
-        Raises ValueError where the dataset is not this set.
+        Raises ValueError if the dataset is not this set.
         """
         refused = f"the dataset must be the test set {self.name}, and is not: "
         if reader.spec.content_digest != self.parsed_spec.content_digest:
@@ -121,7 +121,7 @@ def labels_digest(task: Task, reader: DatasetReader, slots: Integers) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """What is kept of an entry."""
+    """Record of an entry."""
 
     set: str
     method: str
@@ -154,7 +154,7 @@ def enter(
 ) -> Record:
     """Score a file of answers to the test set `name`.
 
-    Raises ValueError where the file holds no list, or the dataset is not that set.
+    Raises ValueError if the file holds no list, or the dataset is not that set.
     """
     data = answers.read_bytes()
     answered = json.loads(data)

@@ -33,7 +33,7 @@ class Task(ABC):
     columns: tuple[str, ...]
     """Of the table of results, besides the method and who entered it."""
     tolerances: ClassVar[Mapping[str, float]]
-    """By which what `seen` returns may differ between two makings of one set."""
+    """Tolerances of the arrays of `seen` between two makings of one set."""
 
     def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
         """Return the slots and labels of samples as plain values; a category by its name."""
@@ -46,13 +46,13 @@ class Task(ABC):
 
     @abstractmethod
     def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
-        """Return a little of what a method sees of slots, and of a truth that is computed."""
+        """Return a small part of the input of a method, and of a computed truth, for slots."""
 
     @abstractmethod
     def inputs(self, reader: DatasetReader, slots: Integers, secret: bytes) -> dict[str, Array]:
-        """Return what a method is given, with noise from a secret.
+        """Return the input of a method, with noise from a secret.
 
-        Raise ValueError where that is the dataset itself.
+        Raise ValueError if the input is the dataset itself.
         """
 
     @abstractmethod
@@ -61,7 +61,7 @@ class Task(ABC):
     ) -> dict[str, Any]:
         """Return the scores of answers as plain values.
 
-        Raise ValueError, which names the answer, where one is none.
+        Raise ValueError, which names the answer, if one is none.
         """
 
     @abstractmethod
@@ -70,7 +70,7 @@ class Task(ABC):
 
     @abstractmethod
     def rank(self, scores: Mapping[str, Any]) -> float:
-        """Return what is smaller for a better entry."""
+        """Return a number that is smaller for a better entry."""
 
 
 class ClothTask(Task):

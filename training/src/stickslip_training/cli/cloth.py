@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stickslip_training.cloth.scope import Scope
 
 NO_ANSWER = 3
-"""Exit status of `predict` where no clip has an answer."""
+"""Exit status of `predict` if no clip has an answer."""
 
 cloth = typer.Typer(
     no_args_is_help=True, help="Measure friction and material of dragged cloth from video."
@@ -149,7 +149,7 @@ def predict(
     """Estimate material and friction, with its 80 % interval, of each clip.
 
     The clips are those of a dataset, or your own video. A dataset that the weights of the package
-    do not know, for example of a coarse mesh, is refused. A clip that is unlike those of training
+    do not know, for example of a coarse mesh, is refused. A clip that is unlike the clips of training
     has no answer, and a reason; if all are so, the exit status is 3.
     """
     from stickslip_training.cloth.evaluation import predictions

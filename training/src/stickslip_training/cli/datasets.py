@@ -66,7 +66,7 @@ def _facts(reader: DatasetReader, files: str) -> Table:
 
 
 def _arrays(reader: DatasetReader, sizes: Counter[str]) -> Table:
-    """Return a table of the arrays of a version; `sizes` are those on disk [bytes]."""
+    """Return a table of the arrays of a version; `sizes` are sizes on disk [bytes]."""
     arrays = Table(box=None, pad_edge=False, header_style="bold")
     for title in ("array", "type", "shape", "raw", "on disk"):
         is_size = title in ("raw", "on disk")
@@ -93,7 +93,7 @@ class Format:
 
     write: Writer
     packages: tuple[str, ...] = ()
-    """Packages that it needs, besides those of this distribution."""
+    """Packages that it needs, besides this distribution's."""
     is_file: bool = False
     """One file, and not a directory."""
 

@@ -1,4 +1,4 @@
-"""What all commands of `stickslip-train` share: errors in one line, and lines of progress."""
+"""Parts that all commands of `stickslip-train` use: errors in one line, and lines of progress."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -16,7 +16,7 @@ def likeliest_temperatures(
 ) -> tuple[float, float]:
     """Return the temperatures at which the truth is the most likely.
 
-    They are those of log p(m), (clips, M), and log p(mu | m), (clips, M, K).
+    They belong to log p(m), (clips, M), and log p(mu | m), (clips, M, K).
     """
     rows = np.arange(len(true_mu))
     tried = np.geomspace(0.4, 4.0, 47)

@@ -1,4 +1,4 @@
-"""The clips that a network sees: crops around the holders, and what is true of them.
+"""The clips that a network sees: crops around the holders, and their true values.
 
 They are rendered from simulations (`render_clips`), or read from a dataset (`read_clips`) or from a
 file (`clips_of_file`).
@@ -31,13 +31,13 @@ from stickslip_training.engine.fit import seed_of_step
 RIG = "drag"
 
 VIEWPOINTS = ("calibrated", "left", "right")
-"""Those that a network is trained on; the family of turned ones is to test with."""
+"""Viewpoints of training. The family of turned ones is for tests."""
 
 INSTANTS = (60, 80, 130, 150, 210, 220)
 """Of the frames that a network sees, of 300: two along each of the first three legs.
 
 By then the cloth slides steadily: leave-one-out, a mesh between two neighbours in mu is 0.03 mm
-from the simulation there, and 18 mm at instant 20, where the side of the drop still shows.
+from the simulation there. It is 18 mm off at instant 20, since the side of the drop still shows.
 """
 
 RATE = 2.4
@@ -69,7 +69,7 @@ class Clips(Truth):
     direction: torch.Tensor
     """(clips, 3): of view."""
     cover: torch.Tensor
-    """(clips, F, 72, 88): share of each pixel that cloth covers; NaN where it is not known."""
+    """(clips, F, 72, 88): fraction of each pixel that cloth covers; NaN if it is not known."""
 
     def __len__(self) -> int:
         return len(self.mu)
@@ -126,7 +126,7 @@ class RenderedClips:
 def frames_at(instants: Sequence[float] | Floats) -> tuple[list[int], tuple[float, ...]]:
     """Return the frames nearest to the instants that a network reads, and their instants.
 
-    Crops of a frame are cut at its own instant. Raises ValueError where one is more than `LATE_MAX`
+    Crops of a frame are cut at its own instant. Raises ValueError if one is more than `LATE_MAX`
     from any frame.
     """
     available = np.asarray(instants, dtype=np.float64)
@@ -221,9 +221,9 @@ def read_clips(
 ) -> tuple[Clips, Integers]:
     """Return the crops of the clips of a split, and their slots.
 
-    `materials` are those that the network knows.
+    `materials` are known to the network.
 
-    A clip of another material has the code -1. Raises ValueError where the dataset is of another
+    A clip of another material has the code -1. Raises ValueError if the dataset is of another
     kind, has no clip, or shows other instants than a network needs.
     """
     if reader.kind != "cloth_drag":  # crops follow the path of its holders
@@ -329,7 +329,7 @@ def clips_of_file(path: Path, materials: tuple[str, ...]) -> tuple[Clips, list[d
 
 
 def training_runs(source: str, validation: str | None) -> tuple[dict[str, Any], Runs, Runs]:
-    """Return what identifies simulations to train on and to validate, and both.
+    """Return the identity of simulations to train on and to validate, and both.
 
     They are two packed files (.npz), or splits of one dataset.
     """

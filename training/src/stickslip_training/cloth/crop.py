@@ -1,4 +1,4 @@
-"""The holder-registered crop: every frame is seen from where the two holders are, at one scale.
+"""The holder-registered crop: every frame is seen from the two holders, at one scale.
 
 The path of the holders is known, and so is the camera: the middle of the two holders lands on a
 known pixel, at a known depth. A crop puts that pixel at one place of the picture and shows `SCALE`
@@ -71,12 +71,12 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Crops:
-    """Where the crops of a batch lie: crop pixel = (pixel - origin) * scale + anchor."""
+    """Positions of the crops of a batch: crop pixel = (pixel - origin) * scale + anchor."""
 
     origin: torch.Tensor
     """(B, F, 2) [px]: column and row of the middle of the holders."""
     scale: torch.Tensor
-    """(B, F): pixels of the crop over those of the picture."""
+    """(B, F): pixels of the crop over pixels of the picture."""
 
     def __getitem__(self, chosen: slice) -> "Crops":
         return Crops(self.origin[chosen], self.scale[chosen])
@@ -121,7 +121,7 @@ def holder_path(instants: Sequence[float] | Array) -> tuple[torch.Tensor, torch.
 
 
 def holder_crops(cameras: Cameras, instants: Sequence[float]) -> Crops:
-    """Return where the crops of clips by `cameras` lie, at each of the instants."""
+    """Return the positions of the crops of clips by `cameras`, at each of the instants."""
     x, z = holder_path(instants)
     middle = torch.stack([x, torch.zeros_like(x), z], dim=-1).expand(len(cameras.focal), -1, -1)
     origin, depth = cameras.project(middle)

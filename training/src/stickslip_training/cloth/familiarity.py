@@ -1,4 +1,4 @@
-"""Whether a clip has an answer: how close its silhouettes come to those of training.
+"""Whether a clip has an answer: the distance of its silhouettes from the training's.
 
 The network sees a silhouette in every frame, pooled to 4 x 4 pixels. The six of a clip are one
 point, x. With d the mean distance of x from the `NEAREST` clips of dragged cloth that were trained
@@ -47,7 +47,7 @@ def pooled(cover: torch.Tensor) -> torch.Tensor:
 
 
 def holders_at(instants: tuple[float, ...]) -> SingleFloats:
-    """Return where the middle of the holders is, (F, 1, 1, 3) [m]."""
+    """Return the middle of the holders, (F, 1, 1, 3) [m]."""
     x, z = holder_path(instants)
     return np.stack([x, np.zeros_like(x), z], axis=-1, dtype=np.float32)[:, None, None]
 
@@ -65,7 +65,7 @@ def hanging(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
 
 
 def glued(meshes: SingleFloats, held: SingleFloats) -> SingleFloats:
-    """Return cloth of which what first lies on the floor stays where it lies."""
+    """Return cloth that sticks to the floor with the part that first lies on it."""
     first = meshes[:, :1]
     return np.where(first[..., 2:] < _LYING, first, meshes)
 

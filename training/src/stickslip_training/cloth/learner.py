@@ -51,8 +51,8 @@ from stickslip_training.engine.fit import (
 )
 
 SILHOUETTES = 16
-"""Of so many clips of a batch one teaches what cloth is: that is learned sooner than friction, and
-costs more.
+"""Of so many clips of a batch one teaches the silhouette of cloth: that is learned sooner than
+friction, and costs more.
 """
 
 SETTLED = 2 / 3
@@ -99,12 +99,12 @@ class ClothTraining(FitSettings):
     turn: float = 4.0
     """Standard deviation of the turns of cameras, about the vertical and up [degree]."""
     clip_share: float = 0.5
-    """Of a batch, where there are clips of another renderer. A long training needs 2,000: it
+    """Of a batch, if there are clips of another renderer. A long training needs 2,000: it
     learned 512 by heart.
     """
     worlds: bool = True
-    """Draw what stands about the cloth: see `world`. Without it a network learns sooner, and knows
-    dark floors only.
+    """Sample what is around the cloth: see `surroundings`. Without it a network learns sooner, and
+    knows dark floors only.
     """
     width: int = 96
 
@@ -154,7 +154,7 @@ def train_friction(
         validation: Simulations that choose the weights and the temperatures.
         settings: Settings of the training.
         clips: Clips of another renderer to train on, too.
-        start: A model whose weights are the first. What cloth is, it knows: its silhouettes stay.
+        start: A model whose weights are the first. Its weights of silhouettes stay.
         identity: Names the runs and the clips. A run that is resumed must have the same.
         **run: Checkpoint, resume and reports, as `fit` has them.
     """
@@ -247,7 +247,7 @@ class FrictionLearner(Learner):
         self.chances = (widths + 0.02) / (widths + 0.02).sum()
 
     def _initialize(self, start: FrictionModel | None) -> None:
-        """Set the first weights: standardized on the first batches, or those of a model."""
+        """Set the first weights: standardized on the first batches, or a model's."""
         if start is None:
             first = [self.batch(number) for number in range(FIRST)]
             crops = torch.cat([batch.crops for batch in first])
@@ -316,7 +316,7 @@ class FrictionLearner(Learner):
     def batch(self, number: int) -> Batch:
         """Return a batch of clips that are rendered anew.
 
-        Silhouettes are the true ones before batch `settled`, and then those that the network sees.
+        Silhouettes are the true ones before batch `settled`, and then as the network sees them.
         """
         seeds = (self.settings.seed, TRAINING, number)
         with torch.device(self.settings.device):

@@ -96,7 +96,7 @@ class PosteriorNet(nn.Module):
     def features(
         self, crops: torch.Tensor, direction: torch.Tensor, silhouettes: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Return what material and mu are read off, (B, 2 width).
+        """Return the features from which material and mu are read, (B, 2 width).
 
         `silhouettes` are found if they are not given.
         """
@@ -156,7 +156,7 @@ def _silhouette_net() -> nn.Sequential:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrictionModel:
-    """A trained network, what its answers mean and how they are calibrated."""
+    """A trained network, the meaning of its answers, and their calibration."""
 
     net: PosteriorNet
     materials: tuple[str, ...]
@@ -267,7 +267,7 @@ def save_friction(path: Path, model: FrictionModel) -> None:
 
 
 def load_friction(path: str | Path = WEIGHTS) -> FrictionModel:
-    """Return the model of a file; raise ValueError where it holds none."""
+    """Return the model of a file; raise ValueError if it holds none."""
     try:
         with safetensors.safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})["friction"])

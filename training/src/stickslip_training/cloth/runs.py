@@ -1,4 +1,4 @@
-"""Simulated drop-and-drag as meshes: what clips are rendered from while a network trains.
+"""Simulated drop-and-drag as meshes, from which clips are rendered while a network trains.
 
 A packed file holds the instants that clips show of many runs with one mesh
 (`benchmarks/training/cloth_runs.py` writes it); a dataset that stores its meshes holds them, too.
@@ -56,7 +56,7 @@ class Runs:
     def named(self, materials: tuple[str, ...]) -> "Runs":
         """Return the runs with the codes of other names.
 
-        Raise ValueError where one of theirs is missing.
+        Raise ValueError if one of theirs is missing.
         """
         if missing := set(self.materials) - set(materials):
             raise ValueError(
@@ -67,7 +67,7 @@ class Runs:
 
 
 def load_runs(path: str | Path) -> Runs:
-    """Read a packed file; raise ValueError where it is damaged, or none."""
+    """Read a packed file; raise ValueError if it is damaged, or none."""
     try:
         with np.load(path) as file:
             low, high = file["differences"]
@@ -150,7 +150,7 @@ def landed_side(positions: SingleFloats, rest: SingleFloats) -> Integers:
 def grid_order(rest: SingleFloats) -> Integers:
     """Return the vertices, (side, side), of the square grid that `rest` (V, 2) is.
 
-    Raise ValueError where it is none.
+    Raise ValueError if it is none.
     """
     side = round(len(rest) ** 0.5)
     order = np.lexsort(np.round(rest.T / 1e-6).astype(np.int64))

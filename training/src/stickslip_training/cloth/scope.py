@@ -28,7 +28,7 @@ class Scope:
     def outside(self, spec: ClothDragSpec, materials: set[str], mu: float) -> list[str]:
         """Return the settings of a dataset that the model does not know, each with its value.
 
-        `materials` are those of the clips, and `mu` is their largest friction coefficient.
+        `materials` are the clips' materials, and `mu` is their largest friction coefficient.
         """
         unknown = []
         if spec.mesh < self.mesh_min:

@@ -7,7 +7,7 @@ projection by the calibrated camera, and h_c(t) the place of holder c on the pat
     p_c(t) = P(h_c(t - t0)) + w(t)
 
 gives the start t0 of the path. The common motion w(t) of both holders is that of a shaking camera,
-which is removed. Where the floor has marks, it gives w(t) to 0.1 px, and the holders' patches,
+which is removed. If the floor has marks, it gives w(t) to 0.1 px, and the holders' patches,
 which change as they come nearer, to 0.3 px: see `floor_motion`. The difference between the two
 holders is the residual.
 """

@@ -57,7 +57,7 @@ class Index:
         self._shard_indexes: dict[tuple[str, int], Array] = {}
         self._labels: dict[str, Array] = {}
         self._chunks: OrderedDict[tuple[str, int], Array] = OrderedDict()
-        """Decoded chunks of many samples, the one used last at the end."""
+        """Decoded chunks of many samples, in the order of their last use."""
         self._chunk_bytes = 0
         self._cache_bytes = cache_bytes
 

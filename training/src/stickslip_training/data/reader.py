@@ -115,7 +115,7 @@ class DatasetReader:
 
     @cached_property
     def valid(self) -> Array:
-        """True where there is a sample, bool (slots,)."""
+        """Mask of the slots with a sample, bool (slots,)."""
         return self.label("valid")
 
     @cached_property
@@ -124,7 +124,7 @@ class DatasetReader:
         return self.selection.choose_samples(self.arrays.values(), self.label)
 
     def __len__(self) -> int:
-        """Return the number of slots, those of rejected samples included."""
+        """Return the number of slots, with the slots of rejected samples."""
         return self.manifest.sample_count
 
     def __enter__(self) -> Self:
@@ -172,7 +172,7 @@ class DatasetReader:
     def categories(self, name: str) -> tuple[str, ...]:
         """Return the names of the codes 0, 1, ... of a categorical label.
 
-        None where it is no such label.
+        The tuple is empty if it is no such label.
         """
         return tuple(map(str, self.array(name).categories))
 
@@ -373,7 +373,7 @@ def _parse_metadata(data: bytes, path: str) -> dict[str, Any]:
 def _check_array(
     metadata: Any, array: ArrayLayout, *, sample_count: int, samples_per_file: int
 ) -> None:
-    """Raise InvalidDatasetError where the metadata of one array contradict its layout."""
+    """Raise InvalidDatasetError if the metadata of one array contradict its layout."""
     if not isinstance(metadata, dict):
         raise InvalidDatasetError(f"array {array.name}: there must be metadata, and there are none")
     shard = [samples_per_file, *array.shape]

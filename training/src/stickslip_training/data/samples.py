@@ -31,7 +31,7 @@ from stickslip_training.data.reader import DatasetReader, Split
 class Item(dict[str, torch.Tensor]):
     """Tensors by name, of one sample.
 
-    `name("material")` says what the code of a categorical label means.
+    `name("material")` names the code of a categorical label.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Item(dict[str, torch.Tensor]):
 class Batch(Item):
     """Tensors by name, the first dimension of each is the sample.
 
-    `names("material")` says what the codes mean.
+    `names("material")` names the codes.
     """
 
     def names(self, label: str) -> list[str]:
@@ -84,7 +84,7 @@ class Samples(Dataset[Item]):
     """Samples of one split: arrays are read sample by sample, labels are in memory.
 
     An item holds the arrays and labels that were asked for, by name, and `slot` int64 and
-    `sample_key` uint8 (32,). Labels are float32 where they are quantities, and int64 where they are
+    `sample_key` uint8 (32,). Labels are float32 if they are quantities, and int64 if they are
     codes or counts: `item.name("material")` and `batch.names("material")` name a category.
     """
 
@@ -256,8 +256,8 @@ class Stream:
     ) -> None:
         """Begin with the first batch of epoch 0.
 
-        `rank` and `world_size` are those of torch.distributed where it runs, else 0 and 1.
-        `options` are those of DataLoader. Raises ValueError where a number makes no sense, or no
+        `rank` and `world_size` are those of torch.distributed if it runs, else 0 and 1.
+        `options` are those of DataLoader. Raises ValueError if a number makes no sense, or no
         round is full.
         """
         distributed = torch.distributed
@@ -323,9 +323,9 @@ class Stream:
         return self._same() | {"epoch": self.epoch, "drawn": self.drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where the stream was that `state` is of.
+        """Continue from the state of another stream.
 
-        Raise ValueError where it is of another order.
+        Raise ValueError if it is of another order.
         """
         for name, value in self._same().items():
             if state.get(name) != value:

@@ -1,6 +1,6 @@
 """The training loop of every model: steps, averaged weights, validation, checkpoints, resume.
 
-What is learned is a `Learner`'s business. A run is a function of its settings: every step draws its
+A `Learner` decides the task. A run is a function of its settings: every step draws its
 batch from the seed and its own number, and torch's generator is seeded with both, so the same
 settings, data, machine and number of threads give the same weights, and a run that is resumed goes
 on exactly as if it had not stopped.
@@ -61,7 +61,7 @@ class FitSettings:
 
 
 class Learner(ABC):
-    """What the loop has to know of a model: its network, its optimiser, and the loss of a step."""
+    """Interface of a model to the loop: its network, its optimiser, and the loss of a step."""
 
     net: nn.Module
 
@@ -100,7 +100,7 @@ class EpochReport:
 
 @dataclass
 class Progress:
-    """What changes during a run, besides the weights and the optimiser."""
+    """State of a run, besides the weights and the optimiser."""
 
     step: int = 0
     seconds: float = 0.0
@@ -114,7 +114,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What came out of a run."""
+    """Result of a run."""
 
     net: nn.Module
     """With the best averaged weights, ready to estimate."""
@@ -158,7 +158,7 @@ def fit(
 ) -> Fitted:
     """Train the network of `learner`.
 
-    A checkpoint is kept below `out`, where one is given. With `resume` the run goes on from it;
+    A checkpoint is kept below `out`, if that is given. With `resume` the run goes on from it;
     `identity` and the settings but for the length, threads and device must be those of the run that
     is resumed, or ValueError is raised.
     """
@@ -227,7 +227,7 @@ class _Run:
     def _average(self) -> None:
         """Move the average towards the weights.
 
-        Faster at first, so that it forgets where they began.
+        Faster at first, so that it forgets the first weights.
         """
         step = self.state.step
         share = 1.0 - min(self.settings.averaging, (1 + step) / (10 + step))
@@ -312,7 +312,7 @@ def save_tensors(path: Path, content: dict[str, Any]) -> None:
 
 
 def load_tensors(path: str | Path, *, device: str = "cpu") -> dict[str, Any]:
-    """Return what `save_tensors` wrote; nothing but tensors and plain values is ever loaded."""
+    """Return the content of a file of `save_tensors`; only tensors and plain values are loaded."""
     content: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
     return content
 
@@ -364,7 +364,7 @@ def cosine_rate(highest: float, step: int, steps: int, warm_up: int) -> float:
 
 
 def check_device(name: str) -> None:
-    """Raise ValueError where torch cannot compute on the device `name`."""
+    """Raise ValueError if torch cannot compute on the device `name`."""
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:
@@ -375,7 +375,7 @@ def check_device(name: str) -> None:
 
 
 def check_positive(settings: object, *names: str) -> None:
-    """Raise ValueError where one of the attributes is not more than 0 and finite; None passes."""
+    """Raise ValueError if one of the attributes is not more than 0 and finite; None passes."""
     for name in names:
         value = getattr(settings, name)
         if value is not None and not (0 < value < math.inf):

@@ -36,7 +36,7 @@ SLOT = ArrayLayout("slot", "int64", (), (), "slot of the sample in the version")
 MANIFEST_COPY = "source-manifest.json"
 DESCRIPTION = "dataset.json"
 FILE_BYTES = 256 * 2**20
-"""Decoded samples that go into one file, where a format has many files [bytes]."""
+"""Decoded samples that go into one file, if a format has many files [bytes]."""
 
 CHUNK_BYTES = 2**20
 """Decoded samples of a chunk of HDF5 [bytes]."""
@@ -49,10 +49,10 @@ GROUP_BYTES = 32 * 2**20
 
 
 class Content:
-    """What is exported of a version."""
+    """The part of a version that is exported."""
 
     def __init__(self, reader: DatasetReader, selection: Selection) -> None:
-        """Choose; raise ValueError where the selection makes no sense or leaves no sample."""
+        """Choose; raise ValueError if the selection makes no sense or leaves no sample."""
         self.reader = reader
         self.selection = selection
         everything = reader.arrays.values()
@@ -131,7 +131,7 @@ class Content:
         }
 
     def description(self) -> bytes:
-        """Return a JSON document that says what the export is of, and what each array of it is."""
+        """Return a JSON document that describes the export and each of its arrays."""
         arrays = {
             array.name: {
                 "dtype": array.dtype,
@@ -164,7 +164,7 @@ def made_whole(target: Path) -> Iterator[Path]:
 
     After an error nothing is left.
 
-    Raises FileExistsError, and overwrites nothing, where `target` exists.
+    Raises FileExistsError, and overwrites nothing, if `target` exists.
     """
     _refuse_existing(target)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -82,7 +82,7 @@ class _Clock:
 
 
 class _Export:
-    """One export: files of the episodes, and then those about all of them."""
+    """One export: files of the episodes, and then files about all of them."""
 
     def __init__(self, content: Content, directory: Path, on_bytes: OnBytes) -> None:
         self.content = content
@@ -131,7 +131,7 @@ class _Export:
         return frames, names
 
     def _write_videos(self, number: int, slots: dict[str, int]) -> dict[str, Any]:
-        """Write a video for each view, and return the columns that say where it is."""
+        """Write a video for each view, and return the columns that locate it."""
         chunk, file = divmod(number, FILES)
         columns: dict[str, Any] = {}
         for view, slot in slots.items():

@@ -82,7 +82,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 @dataclass(frozen=True, slots=True)
 class FolderReconstruction:
-    """What came of a folder: the reconstruction, and what it was made from."""
+    """Result of a folder: the reconstruction, and its sources."""
 
     reconstruction: Reconstruction
     cameras: tuple[Camera, ...]

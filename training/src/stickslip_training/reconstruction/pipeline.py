@@ -5,7 +5,7 @@
    centroid of a cylinder that moves through the visual hull, as in the thesis [starts].
 3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does
    so best wins.
-4. The winner is judged: what it leaves unexplained, what it claims that is not there, and whether
+4. The winner is judged: the parts that it leaves unexplained or unsupported, and whether
    another curve would do as well.
 
 Nothing of rods' physics is used but that they do not stretch and bend smoothly, so hair and
@@ -44,7 +44,7 @@ SLENDER = (0.0005, 0.05)  # radius over length that is believed
 
 
 class Verdict(StrEnum):
-    """What a reconstruction is worth."""
+    """Quality of a reconstruction."""
 
     good = "good"
     ambiguous = "ambiguous"
@@ -80,9 +80,9 @@ class Reconstruction:
     misfit: float
     """Sum of |seen - drawn| over the sum of seen."""
     unexplained: float
-    """Share of the silhouettes' area where nothing is drawn."""
+    """Fraction of the silhouettes' area in which nothing is drawn."""
     unsupported: float
-    """Share of the drawn area where nothing is seen."""
+    """Fraction of the drawn area in which nothing is seen."""
     rival: float
     """Misfit of the best other curve over this one's; infinite if there is none."""
     verdict: Verdict
@@ -107,9 +107,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Return the centreline of the rod that `views` show, one picture (y, x, rgb) for each camera.
 
-    `length`, `clamp` (where the rod leaves its clamp), `direction` (of the rod there) and `radius`
-    are in the unit and the axes of the cameras. A radius that is not given is found. Pictures must
-    be free of lens distortion.
+    `length`, `clamp` (the point at which the rod leaves its clamp), `direction` (of the rod there)
+    and `radius` are in the unit and the axes of the cameras. A radius that is not given is found.
+    Pictures must be free of lens distortion.
     """
     if not length > 0.0:
         raise ValueError(f"length must be positive; got {length}")

@@ -4,7 +4,7 @@ Unknown are the control points of the curve, the radius, the blur, and how light
 each view. The sum of squares
 
     rho((seen - drawn) / 0.05) over the pixels near the rod
-    + length, clamp and smoothness, each against what it may be off (the constants below)
+    + length, clamp and smoothness, each against its tolerance (the constants below)
 
 is reduced by Levenberg-Marquardt steps with exact derivatives of the drawing; rho is Cauchy's, so
 that dirt, highlights and specks pull little.
@@ -49,11 +49,11 @@ class Fit:
     light: Floats
     """Brightness in the middle at LIGHT_NODES places along the rod, (views, nodes)."""
     slope: Floats
-    """What it gains from the middle to the edge, (views, nodes)."""
+    """Its gain from the middle to the edge, (views, nodes)."""
     cost: float = np.inf
     """Half the sum of squares."""
     covariance: Floats | None = None
-    """Of the control points [L^2], (3 K, 3 K), if pixels err independently by what they do err."""
+    """Of the control points [L^2], (3 K, 3 K), if the measured errors of pixels are independent."""
 
 
 def start(control: Floats, radius: float, views: int) -> Fit:

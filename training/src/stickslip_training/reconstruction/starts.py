@@ -42,7 +42,7 @@ PEAK = float(erf(1.0 / BLUR / np.sqrt(2.0)))
 def follow(views: Sequence[View], radius: float, direction: Floats, count: int = 5) -> list[Floats]:
     """Return the best paths from the clamp, (STEPS + 1, 3) each, one step apart; radius [L].
 
-    The cheapest comes first, and each is unlike the ones before it.
+    The cheapest comes first, and each is unlike all before it.
     """
     fields = [_middle(view, radius) for view in views]
     step = 1.0 / STEPS
@@ -153,7 +153,7 @@ def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
 
     Points are at most `cell` [L] apart.
 
-    There are none where the silhouettes leave room for far more than a slender rod. Cubes are
+    There are none if the silhouettes leave room for far more than a slender rod. Cubes are
     halved again and again; those are kept whose surrounding ball touches every silhouette.
     """
     outside = [ndimage.distance_transform_edt(view.coverage < 0.5) for view in views]
@@ -198,7 +198,7 @@ def moving_cylinder(cloud: Floats, radius: float, direction: Floats, step: float
     Its points are centroids of the part of the cloud in a cylinder that moves along the rod.
 
     The cylinder begins at the clamp, reaches two steps ahead and is three radii wide; it turns
-    towards each centroid, and the polyline ends where it is empty, or after twice the rod's length.
+    towards each centroid, and the polyline ends when it is empty, or after twice the rod's length.
     """
     points = [np.zeros(3)]
     heading = direction / np.linalg.norm(direction)

@@ -10,7 +10,7 @@ coverage
     c(n) = Phi((n + r) / b) - Phi((n - r) / b)     Phi the normal distribution, b the blur
 
 and the brightness c (light + slope n / r): lamps make one side brighter, and a model without the
-slope would move the centreline towards it. Where two parts of the rod cross in a view, the nearer
+slope would move the centreline towards it. If two parts of the rod cross in a view, the nearer
 covers the farther, I = I_1 + (1 - c_1) I_2. The free end is round. Pixels behind the clamp are left
 out: whatever holds the rod may be seen there.
 """
@@ -42,7 +42,7 @@ BAND = 2.5  # blurs beyond the edge of the rod that are looked at
 
 
 class ReconstructionError(ValueError):
-    """The views do not hold what a reconstruction needs; the message names the view."""
+    """The views are not enough for a reconstruction; the message names the view."""
 
 
 def silhouette(light: Floats) -> Floats:
@@ -101,7 +101,7 @@ def to_linear(image: npt.ArrayLike) -> Floats:
 
 
 def _ground(light: Floats) -> Floats:
-    """Fit the ground by a polynomial, leaving out, again and again, what is brighter than it."""
+    """Fit the ground by a polynomial, leaving out, again and again, all that is brighter."""
     height, width, channels = light.shape
     step = max(1, int(np.sqrt(height * width / GROUND_SAMPLES)))
     x = np.linspace(-1.0, 1.0, width)
@@ -261,7 +261,7 @@ class Side:
     sample: Integers
     """Sample of the curve nearest to the pixel, (n,)."""
     by_light: Floats
-    """d I / d light, (n,); c where nothing is in front."""
+    """d I / d light, (n,); c if nothing is in front."""
     by_slope: Floats
     """d I / d slope, (n,)."""
     by_point: Floats
@@ -295,7 +295,7 @@ def tube_image(
 
     Radius [L], blur [px].
 
-    `light` is the brightness in the middle at the samples, (n,), and `slope` what it gains from
+    `light` is the brightness in the middle at the samples, (n,), and `slope` its gain from
     there to the edge.
     """
     pixels, depth = view.project(points)

@@ -46,7 +46,7 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
 
     Return them, and notes on them.
 
-    Where a split is empty, another one takes its place, with a note.
+    If a split is empty, another one takes its place, with a note.
     """
     if reader.kind != "rod_hang":
         raise ValueError(
@@ -99,7 +99,7 @@ class CurvatureNet(nn.Module):
     """The network of Table 5.1 of the thesis.
 
     It takes centrelines over L, (B, 150, 3), to strains (twist, bend1, bend2) times L, (B, 150, 3).
-    The table is silent on four things. What was chosen, and why:
+    The table is silent on four things. The choices, and why:
 
     * Convolutions are padded to keep the length: every one of the 150 points is then the middle of
       a filter, the clamp and the free end too, where the rod bears all of its weight and none.

@@ -55,7 +55,7 @@ def cubic_spline_curvature(centerline: AnyFloats) -> Floats:
     """Take the derivatives from cubic smoothing splines, the usual ones.
 
     They minimise the sum of squares plus lambda ∫ |x''|^2, and so they are straight at their ends:
-    at the free end, where a rod has its natural curvature, they find none.
+    at the free end a rod has its natural curvature, and they find none.
     `scipy.interpolate.make_smoothing_spline` gives the same splines, at 50 ms each.
     """
     return _spline_curvature(centerline, 2)
