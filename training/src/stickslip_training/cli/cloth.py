@@ -149,8 +149,8 @@ def predict(
     """Estimate material and friction, with its 80 % interval, of each clip.
 
     The clips are those of a dataset, or your own video. A dataset that the weights of the package
-    do not know, for example of a coarse mesh, is refused. A clip that is unlike the clips of training
-    has no answer, and a reason; if all are so, the exit status is 3.
+    do not know, for example of a coarse mesh, is refused. A clip that is unlike the clips of
+    training has no answer, and a reason. If all are so, the exit status is 3.
     """
     from stickslip_training.cloth.evaluation import predictions
     from stickslip_training.cloth.model import WEIGHTS, load_friction
