@@ -76,6 +76,7 @@ def test_short_and_long_forms_are_one_spec() -> None:
         ("thesis-cloth", ClothDragSpec, 3_840),
         ("demo-rods", RodHangSpec, 48),
         ("demo-cloth", ClothDragSpec, 4),
+        ("friction-cloth", ClothDragSpec, 2),
         ("sampled-rods", RodHangSpec, 2_500),
     ],
 )
