@@ -75,7 +75,7 @@ def submit(spec: Path, url: str) -> str:
 
 @contextmanager
 def service(data: Path) -> Iterator[str]:
-    """Run `stickslip up` on a free port and yield its URL; stop it and all it started at the end."""
+    """Run `stickslip up` on a free port and yield its URL; stop all of it at the end."""
     console.rule("stickslip up")
     process = subprocess.Popen([BIN / "stickslip", "up", "--data", data, "--port", "0"])
     try:
@@ -93,7 +93,8 @@ def wait_for_url(file: Path, process: subprocess.Popen[bytes]) -> str:
             return url
         time.sleep(0.1)
     raise SystemExit(
-        f"the service did not start within {START_SECONDS} s; its logs are in {file.parent / 'logs'}"
+        f"the service did not start within {START_SECONDS} s; "
+        f"its logs are in {file.parent / 'logs'}"
     )
 
 
@@ -112,15 +113,14 @@ def train(dataset: Path, out: Path) -> None:
 
 
 def look_at(directory: Path) -> None:
-    """Draw batches as a training loop does, and lay the pictures out on a sheet: four views a rod."""
+    """Draw batches as a training loop does, and lay pictures out on a sheet: four views a rod."""
     console.rule("batches")
     rods = Samples(directory, arrays=["centerline", "curvature", "views"])
     rows = []
     for batch in rods.loader(16):
         rows += [np.concatenate(list(views), axis=1) for views in batch["views"].numpy()]
-    console.print(
-        f"{len(rods)} rods in batches of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"
-    )
+    shapes = {name: tuple(tensor.shape) for name, tensor in batch.items()}
+    console.print(f"{len(rods)} rods in batches of {shapes}")
     rows += [np.zeros_like(rows[0])] * (-len(rows) % SHEET_COLUMNS)
     lines = [
         np.concatenate(rows[i : i + SHEET_COLUMNS], axis=1)
@@ -130,15 +130,12 @@ def look_at(directory: Path) -> None:
 
 
 def look_at_cloth(directory: Path) -> None:
-    """Draw a batch of clips with their meshes, and lay frames of them out on a sheet: one clip a
-    row.
-    """
+    """Draw a batch of clips with their meshes, and lay frames out on a sheet: one clip a row."""
     console.rule("clips")
     clips = Samples(directory, arrays=["video", "positions"])
     (batch,) = clips.loader(len(clips))
-    console.print(
-        f"{len(clips)} clips in one batch of { ({name: tuple(tensor.shape) for name, tensor in batch.items()}) }"
-    )
+    shapes = {name: tuple(tensor.shape) for name, tensor in batch.items()}
+    console.print(f"{len(clips)} clips in one batch of {shapes}")
     video = batch["video"].numpy()
     shown = np.linspace(0, video.shape[1] - 1, CLIP_FRAMES).round().astype(int)
     rows = [np.concatenate(list(clip[shown]), axis=1) for clip in video]
