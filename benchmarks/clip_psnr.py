@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
-from stickslip_blender.cloth.quality import errors, pooled, trio
+from stickslip_blender.cloth.quality import errors, measured_group, pool_errors
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.arrays import shown_frames
@@ -72,7 +72,7 @@ def main() -> None:
         shading = clip.shading()
         videos, _ = clip.clips(shading, [pictures[name] for name in TEXTURES])
         made = time.process_time()
-        groups = list(dict.fromkeys(map(trio, TEXTURES)))
+        groups = list(dict.fromkeys(map(measured_group, TEXTURES)))
         own = [
             list(clip.references([pictures[x] for x in g], clip.measured(options.measured, g)))
             for g in groups
@@ -93,10 +93,12 @@ def main() -> None:
         )
         for channel, name in enumerate(groups[0]):
             video = videos[TEXTURES.index(name)]
-            stated = pooled(
+            stated = pool_errors(
                 [(errors(video[f], lit, channel), weights[f]) for f, lit in own[0]], usual
             )
-            found = pooled([(errors(video[f], lit, channel), weights[f] > 0.0) for f, lit in long])
+            found = pool_errors(
+                [(errors(video[f], lit, channel), weights[f] > 0.0) for f, lit in long]
+            )
             said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
             print(
                 f"  {name}:",

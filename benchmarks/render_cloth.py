@@ -44,9 +44,9 @@ from stickslip_blender.cloth.looks import (
     Substrate,
     drawn_light,
     drawn_substrate,
+    fabric_look,
     floor_factor,
-    grained,
-    look_of,
+    print_on_fabric,
 )
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling, Sampling, import_bpy
@@ -91,14 +91,16 @@ class Bench:
         with np.load(trajectory) as file:
             self.track = file["track"].astype(np.float64)
             self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
-        self.look = look_of(MATERIAL)
+        self.look = fabric_look(MATERIAL)
         self.pictures = {
-            texture: grained(texture_image(texture), self.look, self.renderer.geometry.surface)
+            texture: print_on_fabric(
+                texture_image(texture), self.look, self.renderer.geometry.surface
+            )
             for texture in TEXTURES
         }
         self.textures = Textures(list(self.pictures.values()))
         self.geometry, self.scene = self.renderer.geometry, self.renderer.scene
-        self.geometry.surface.dress(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
+        self.geometry.surface.apply_relief(hem=1e-3 * self.look.hem, creases=CREASES, seed=1)
         self.rig = load_rig("drag")[:3]
         build = hashlib.sha256((build_digest("cloth_drag") + str(trajectory)).encode()).hexdigest()[
             :12
@@ -246,7 +248,7 @@ def cost_of_looks(bench: Bench, chosen: list[View]) -> None:
         for view in chosen:
             for name, look, creases in (("plain", plain, 0.0), ("full", full, CREASES)):
                 bench.look = look
-                bench.geometry.surface.dress(hem=1e-3 * look.hem, creases=creases, seed=1)
+                bench.geometry.surface.apply_relief(hem=1e-3 * look.hem, creases=creases, seed=1)
                 _, light, other = bench.composed(view, CLOTH_SAMPLING[Quality.standard])
                 seconds[name].append(light + other)
     ratio = np.median(np.array(seconds["full"]) / np.array(seconds["plain"])) - 1

@@ -37,7 +37,8 @@ _SQUARES = 8
 _GROUND = 0.62
 _LINE = 0.5
 _SKY = 0.9
-_LINES, _THICK = 0.1, 0.003  # [m], between lines on the floor, and their thickness
+_LINE_DISTANCE = 0.1  # [m], between lines on the floor
+_LINE_WIDTH = 0.003  # [m]
 
 Array = npt.NDArray[Any]
 
@@ -135,7 +136,9 @@ def _floor(
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(ray[..., 2] < 0.0, (height - camera.position[2]) / ray[..., 2], np.inf)
         place = camera.position[:2] + depth[..., None] * ray[..., :2]
-        lines = (np.abs((place + 0.5 * _LINES) % _LINES - 0.5 * _LINES) < _THICK).any(axis=-1)
+        # Distance from the nearest line, along each axis of the floor.
+        distance = np.abs((place + 0.5 * _LINE_DISTANCE) % _LINE_DISTANCE - 0.5 * _LINE_DISTANCE)
+        lines = (distance < _LINE_WIDTH).any(axis=-1)
     shadow = points - (points[:, 2:] - height) / light[2] * light
     window = Window(0, 0, camera.width, camera.height)
     dark = see(projected(camera, shadow), geometry.triangles, window, _SHARPNESS).triangle >= 0

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from stickslip_blender.cloth.clips import ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
-from stickslip_blender.cloth.quality import UNMEASURED, Measured, errors, instants, pooled, trio
+from stickslip_blender.cloth.quality import (
+    FEWEST,
+    UNMEASURED,
+    Measured,
+    errors,
+    instants,
+    measured_group,
+    pool_errors,
+)
 from stickslip_blender.cloth.textures import texture_image
 from stickslip_blender.cycles.engine import CLOTH_SAMPLING, ClothSampling
 from stickslip_blender.cycles.pixels import encode
@@ -33,7 +41,7 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
     for noise in (0.1, 0.4):
         light = decoded(truth) * (1.0 + noise * random.standard_normal((4, *truth.shape)))
         light[2:, :200] = np.nan
-        found = pooled(
+        found = pool_errors(
             [
                 (
                     errors(np.dstack([clip] * 3), light[..., None], 0),
@@ -52,10 +60,52 @@ def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
     large.
     """
     measured = np.ones((3, 64, 64))
-    found = pooled([(np.full((64, 64), 4.0), measured)], usual=(1.0, 3.0, 1.0))
+    found = pool_errors([(np.full((64, 64), 4.0), measured)], mean_weights=(1.0, 3.0, 1.0))
     exact = [10.0 * np.log10(255.0**2 / (4.0 * usual)) for usual in (1.0, 3.0, 1.0)]
     assert found.psnr == pytest.approx(exact)
     assert min(found.deviations) > 1.0  # of one frame
+
+
+def test_a_region_of_too_few_pixels_has_no_number() -> None:
+    weights = np.ones((3, 8, 8))
+    weights[1] = 0.0
+    weights[1].flat[: FEWEST - 1] = 1.0
+    weights[2] = 0.0
+    weights[2].flat[:FEWEST] = 1.0
+    measured = pool_errors([(np.full((8, 8), 4.0), weights)])
+    assert np.isnan([measured.psnr[1], measured.deviations[1]]).all()
+    assert measured.labels["psnr_landed"] is None
+    assert measured.psnr[2] == pytest.approx(10.0 * np.log10(255.0**2 / 4.0))
+
+
+def test_deviations_grow_with_the_spread_of_frames_and_of_blocks() -> None:
+    """Hand-computed: two frames of 16 x 16 pixels in blocks of 8, weight 1 everywhere."""
+    weights = np.ones((3, 16, 16))
+    even = [(np.full((16, 16), 4.0), weights)] * 2
+    frames = [(np.full((16, 16), 2.0), weights), (np.full((16, 16), 6.0), weights)]
+    prior = 4 * 0.6**2  # four frames of a spread of 0.6
+
+    # Equal blocks and frames: the deviation is that of frames before any is measured.
+    expected = 10.0 / np.log(10.0) * np.sqrt(prior / 5 / 2)
+    assert pool_errors(even).deviations == pytest.approx([expected] * 3)
+
+    # Eight blocks of 64 pixels differ by 128 from the mean 4: sqrt(8 * 128^2) / 512 over 4. Each
+    # frame differs by half of the mean.
+    within = np.sqrt(8 * 128.0**2) / 512 / 4.0
+    between = (2 * 0.5**2 + prior) / 5 / 2
+    expected = 10.0 / np.log(10.0) * np.sqrt(within**2 + between)
+    assert pool_errors(frames).deviations == pytest.approx([expected] * 3)
+    assert pool_errors(frames).psnr == pytest.approx(pool_errors(even).psnr)
+
+
+def test_a_mean_below_zero_counts_as_its_deviation() -> None:
+    """Products of noise may be negative: the error is then as large as chance makes it."""
+    weights = np.ones((3, 16, 16))
+    error = np.full((16, 16), -1.0)
+    error[:8] = 0.5
+    measured = pool_errors([(error, weights)])
+    within = np.sqrt(4 * (64 * 0.75) ** 2) / 256
+    assert measured.psnr[0] == pytest.approx(10.0 * np.log10(255.0**2 / within))
 
 
 def test_small_cloth_has_more_paths() -> None:
@@ -82,8 +132,8 @@ def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
         assert len(drawn) >= 3
     assert instants(5, 9.0, 16, (1, 3)) == [0, 1, 2, 3, 4]
     assert len(instants(2, 0.0, 4, (1, 3))) == 1
-    assert trio("checker") == ("checker", "dots", "stripes")
-    assert trio("sha256:0") == ("sha256:0",)
+    assert measured_group("checker") == ("checker", "dots", "stripes")
+    assert measured_group("sha256:0") == ("sha256:0",)
 
 
 @pytest.mark.parametrize(
@@ -112,14 +162,14 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
     clip = renderer.clip(
         look, load_rig("drag")[0], sheet.track[1:2], sampling=ClothSampling(4, 4, (0.0, 0.0, 0.0))
     )
-    names = trio("plaid")
+    names = measured_group("plaid")
     pictures = [texture_image(Texture(name)) for name in names]
     shading = clip.shading()
     videos, _ = clip.clips(shading, pictures)
     weights, usual = clip.weights(shading)
     ((_, light),) = clip.references(pictures, [0])
     for channel, video in enumerate(videos):
-        found = pooled([(errors(video[0], light, channel), weights[0])], usual)
+        found = pool_errors([(errors(video[0], light, channel), weights[0])], usual)
         assert min(found.psnr) > 28.0, names[channel]
         assert found.psnr[0] > 35.0, names[channel]
 

@@ -13,9 +13,9 @@ from stickslip_blender.cloth.looks import (
     SOURCES,
     drawn_light,
     drawn_substrate,
+    fabric_look,
     floor_factor,
-    grained,
-    look_of,
+    print_on_fabric,
 )
 from stickslip_blender.cloth.surface import Surface
 from stickslip_blender.raster import decoded
@@ -71,7 +71,9 @@ def test_marks_lie_still_on_the_floor() -> None:
 def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
     surface = Surface(sheet.triangles, sheet.rest)
     white = np.full((256, 256, 3), 200, dtype=np.uint8)
-    prints = {material: grained(white, look_of(material), surface) for material in LOOKS}
+    prints = {
+        material: print_on_fabric(white, fabric_look(material), surface) for material in LOOKS
+    }
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
     inner = {
         material: picture[20:-20, 20:-20].astype(float) for material, picture in prints.items()

@@ -17,7 +17,7 @@ def _flat(sheet: Any, height: float) -> Any:
 def test_a_hem_is_as_thick_as_asked_for_and_goes_all_around(make_sheet: Callable[..., Any]) -> None:
     sheet = make_sheet(21)
     surface = Surface(sheet.triangles, sheet.rest)
-    surface.dress(hem=0.001)
+    surface.apply_relief(hem=0.001)
     points = surface(_flat(sheet, 0.1))
     hem = points[surface._count :]
     assert surface._count >= FINE_VERTICES
@@ -40,7 +40,7 @@ def test_creases_are_seeded_and_not_stronger_than_their_label(sheet: Any) -> Non
     plain = surface(_flat(sheet, 0.1))
     heights = []
     for strength, seed in ((1.0, 1), (0.5, 1), (1.0, 2)):
-        surface.dress(hem=0.0, creases=strength, seed=seed)
+        surface.apply_relief(hem=0.0, creases=strength, seed=seed)
         heights.append((surface(_flat(sheet, 0.1)) - plain)[: surface._count, 2])
     assert 0.5 * CREASE < np.abs(heights[0]).max() <= CREASE * (1.0 + 1e-9)
     np.testing.assert_allclose(heights[1], 0.5 * heights[0], atol=1e-12)

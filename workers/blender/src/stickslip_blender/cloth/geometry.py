@@ -50,15 +50,18 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
     quarter = np.linspace(0.0, 0.5 * np.pi, ARC + 1)
     polar = np.concatenate([quarter, quarter + 0.5 * np.pi])
     azimuth = np.concatenate([quarter + side * 0.5 * np.pi for side in range(4)])
-    middle = np.repeat(
-        0.25 * np.pi + 0.5 * np.pi * np.arange(4), ARC + 1
-    )  # of the octant, to be pulled to
+    # Azimuths of the middles of the octants, which say along which axes a vertex is pulled.
+    middle = np.repeat(0.25 * np.pi + 0.5 * np.pi * np.arange(4), ARC + 1)
     p, a = np.meshgrid(polar, azimuth, indexing="ij")
     direction = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
     octant = np.empty_like(direction)
-    octant[..., 0], octant[..., 1] = np.sign(np.cos(middle)), np.sign(np.sin(middle))
+    octant[..., 0] = np.sign(np.cos(middle))
+    octant[..., 1] = np.sign(np.sin(middle))
     octant[..., 2] = np.repeat([1.0, -1.0], ARC + 1)[:, None]
     vertices = (radius * direction + np.asarray(core, dtype=np.float64) * octant).reshape(-1, 3)
+
+    # Quadrilaterals between neighbouring rings. Edges of octants are doubled: without a core the
+    # faces between them have no area.
     rings, around = p.shape
     faces: Faces = []
     for ring in range(rings - 1):
@@ -66,6 +69,8 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
             left = ring * around + place
             right = ring * around + (place + 1) % around
             faces.append((left, left + around, right + around, right))
+
+    # The poles are pulled apart to the corners of a flat face.
     corners = [side * (ARC + 1) for side in range(4)]
     return vertices, [
         *faces,
@@ -90,7 +95,7 @@ def box(
     size: tuple[float, float, float], center: tuple[float, float, float]
 ) -> tuple[Array, Faces]:
     """Return the vertices (8, 3) and faces of a box, with sides parallel to the axes [m]."""
-    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    signs = np.array(list(product((-1, 1), repeat=3)))
     faces: Faces = [
         (0, 1, 3, 2),
         (4, 6, 7, 5),
@@ -124,6 +129,7 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
     owners: list[int] = []
     count = len(vertices)
     for number, face in enumerate(faces):
+        # A tile's side is that of the longer of two opposite edges.
         a, b, c, d = vertices[list(face)]
         across = max(1, int(np.ceil(max(np.linalg.norm(b - a), np.linalg.norm(c - d)) / side)))
         along = max(1, int(np.ceil(max(np.linalg.norm(d - a), np.linalg.norm(c - b)) / side)))
@@ -131,24 +137,30 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
             pieces.append(face)
             owners.append(number)
             continue
+
+        # Bilinear coordinates of a grid of vertices over the quadrilateral.
         u, v = (
             line[..., None]
             for line in np.mgrid[0 : across + 1, 0 : along + 1] / np.array([[[across]], [[along]]])
         )
         points.append((((1 - u) * a + u * b) * (1 - v) + ((1 - u) * d + u * c) * v).reshape(-1, 3))
         row = along + 1
-        for i, j in product(range(across), range(along)):
-            corner = count + i * row + j
-            pieces.append((corner, corner + row, corner + row + 1, corner + 1))
-        owners += [number] * (across * along)
+        grid = count + np.arange((across + 1) * row).reshape(across + 1, row)
+        corners = grid[:-1, :-1].ravel().tolist()
+        pieces += [(corner, corner + row, corner + row + 1, corner + 1) for corner in corners]
+        owners += [number] * len(corners)
         count += len(points[-1])
-    given = np.concatenate(points)
+
+    # Grids of neighbouring faces have vertices in common: equal positions become one vertex.
+    candidates = np.concatenate(points)
     _, first, joint = np.unique(
-        np.round(given / _JOINT), axis=0, return_index=True, return_inverse=True
+        np.round(candidates / _JOINT), axis=0, return_index=True, return_inverse=True
     )
     rings = [tuple(dict.fromkeys(joint.ravel()[list(piece)].tolist())) for piece in pieces]
-    kept = [number for number, ring in enumerate(rings) if len(ring) > 2]
-    return given[first], [rings[number] for number in kept], np.array(owners)[kept]
+
+    # A face between doubled edges has shrunk to a line or a point, and goes.
+    solid = [number for number, ring in enumerate(rings) if len(ring) > 2]
+    return candidates[first], [rings[number] for number in solid], np.array(owners)[solid]
 
 
 @dataclass(frozen=True)
@@ -257,17 +269,20 @@ class Geometry:
         self.vertices = len(np.asarray(rest))
         self.surroundings = surroundings
         self.surface = surface(triangles, rest)
-        self.cloth_vertices, self.cloth_triangles = (
-            len(self.surface.uv),
-            len(self.surface.triangles),
-        )
+        self.cloth_vertices = len(self.surface.uv)
+        self.cloth_triangles = len(self.surface.triangles)
         props = surroundings.props
+
+        # All vertices stand in one array, those of the cloth first: a prop's triangles count from
+        # its first vertex.
         sizes = np.cumsum([self.cloth_vertices, *(len(prop.vertices) for prop in props)])
         parts = [
             self.surface.triangles,
             *(fans(p.faces) + first for p, first in zip(props, sizes[:-1], strict=True)),
         ]
         self.triangles = np.ascontiguousarray(np.concatenate(parts), dtype=np.int32)
+
+        # What the rasteriser looks up for each vertex or each triangle.
         counts = [len(part) for part in parts]
         self.uv = np.concatenate(
             [
@@ -279,10 +294,13 @@ class Geometry:
             [surroundings.segment, *(p.segment for p in props)], counts
         ).astype(np.uint8)
         self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
+
+        # Blender shades a prop smoothly but for sharp edges; normals of the ground truth do, too.
+        # The cloth is one smooth skin.
         skins: list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]] = [
             (np.arange(self.cloth_vertices), parts[0])
         ]
-        skins += [skin(p.vertices, fans(p.faces)) for p in props]
+        skins += [split_at_sharp_edges(p.vertices, fans(p.faces)) for p in props]
         ends = np.cumsum([0, *(len(vertices) for vertices, _ in skins)])
         self.shaded = np.concatenate(
             [v + first for (v, _), first in zip(skins, [0, *sizes[:-1]], strict=True)]
@@ -291,6 +309,8 @@ class Geometry:
             [t + first for (_, t), first in zip(skins, ends[:-1], strict=True)]
         )
         self.tints = np.concatenate([*(p.tints for p in props), np.zeros((1, 3), dtype=np.float32)])
+
+        # Sheets among the props, by their triangles among those of all props.
         ends = np.cumsum([0, *counts[1:]])
         self.printed = tuple(
             Printed(slice(begin, end), Textures([prop.sheet.picture]), prop.grey)
@@ -321,7 +341,7 @@ class Geometry:
         return track
 
 
-def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
+def split_at_sharp_edges(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
     """Split the vertices (V, 3) of triangles (T, 3) at edges sharper than `SHARP`.
 
     Blender shades them so.
@@ -332,21 +352,34 @@ def skin(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+
+    # Corners of triangles that share a vertex and a smooth edge get the same label, the least of
+    # their numbers. In this order the corners of a vertex stand beside each other.
     corners = triangles.ravel()
     label = np.arange(corners.size)
     order = np.argsort(corners, kind="stable")
-    for _ in range(most := int(np.bincount(corners).max())):  # a chain of corners has no more links
-        for shift in range(1, most):
-            one = order[:-shift]
-            other = order[shift:]
-            alike = (corners[one] == corners[other]) & (label[one] != label[other])
-            one = one[alike]
-            other = other[alike]
-            alike = (normals[one // 3] * normals[other // 3]).sum(axis=1) > np.cos(SHARP)
-            pair = np.concatenate([one[alike], other[alike]])
-            np.minimum.at(label, pair, np.tile(np.minimum(label[one], label[other])[alike], 2))
-    _, first, place = np.unique(label, return_index=True, return_inverse=True)
-    return corners[first], place.reshape(-1, 3).astype(np.int32)
+    most_corners = int(np.bincount(corners).max())
+    for _ in range(most_corners):  # a label passes along one link a round; no chain is longer
+        for shift in range(1, most_corners):
+            first_corner = order[:-shift]
+            second_corner = order[shift:]
+            is_open = (corners[first_corner] == corners[second_corner]) & (
+                label[first_corner] != label[second_corner]
+            )
+            first_corner = first_corner[is_open]
+            second_corner = second_corner[is_open]
+
+            # Triangles that are turned less than SHARP from each other are one smooth skin.
+            cosine = (normals[first_corner // 3] * normals[second_corner // 3]).sum(axis=1)
+            is_smooth = cosine > np.cos(SHARP)
+            first_corner = first_corner[is_smooth]
+            second_corner = second_corner[is_smooth]
+            least = np.minimum(label[first_corner], label[second_corner])
+            np.minimum.at(label, np.concatenate([first_corner, second_corner]), np.tile(least, 2))
+
+    # Each label is a vertex of the split skin.
+    _, first, vertex = np.unique(label, return_index=True, return_inverse=True)
+    return corners[first], vertex.reshape(-1, 3).astype(np.int32)
 
 
 def mirrored(points: Array, floor: float) -> Array:
@@ -356,12 +389,10 @@ def mirrored(points: Array, floor: float) -> Array:
     return image
 
 
-HOLDER = (
-    0.004,
-    0.01,
-    0.01,
-)  # of the clip at a corner [m]: across the cloth, and in its plane as in the simulation
-ROD = (0.003, 0.003, 0.5)  # of what the clip hangs on [m]
+HOLDER = (0.004, 0.01, 0.01)
+"""Sides of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
+ROD = (0.003, 0.003, 0.5)
+"""Sides of the rod that the clip hangs on [m]."""
 HOLDER_COLOR = np.array([[0.05, 0.05, 0.05]])
 HOLDER_ROUGHNESS = 0.45
 
@@ -376,24 +407,21 @@ class Holders:
     def __init__(self, rest: npt.ArrayLike) -> None:
         """Find the corners of a cloth, whose held edge is the last of its rest shape (V, 2) [m]."""
         flat = np.asarray(rest, dtype=np.float64)
+        # The vertices nearest to the two upper corners are those that the simulation holds.
         low = flat.min(axis=0)
         high = flat.max(axis=0)
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
-        self._grips = np.pad(
-            inward, ((0, 0), (1, 0))
-        )  # from a corner to the middle of its holder (x, y, z) [m]
-        boxes = [
-            box(HOLDER, (0.0, 0.0, 0.0)),
-            box(ROD, (0.0, 0.0, ROD[2] / 2)),
-        ]  # a clip and the rod it hangs on
-        vertices = np.concatenate([corners for corners, _ in boxes])
-        faces: list[tuple[int, ...]] = []
-        for number, (_, sides) in enumerate(boxes):
-            # Each box has eight vertices, which follow those of the boxes before it.
-            for side in sides:
-                faces.append(tuple(8 * number + index for index in side))
+        # From a corner to the middle of its holder (x, y, z) [m]: it grips the cloth's inside.
+        self._grips = np.pad(inward, ((0, 0), (1, 0)))
+
+        # One prop is a clip and the rod that it hangs on: faces of the rod count from its vertices.
+        clip_vertices, clip_faces = box(HOLDER, (0.0, 0.0, 0.0))
+        rod_vertices, rod_faces = box(ROD, (0.0, 0.0, ROD[2] / 2))
+        vertices = np.concatenate([clip_vertices, rod_vertices])
+        faces = list(clip_faces)
+        faces += [tuple(len(clip_vertices) + index for index in face) for face in rod_faces]
         self.props = tuple(
             Prop(f"holder-{n}", vertices, faces, HOLDER_COLOR, HOLDER_ROUGHNESS) for n in (1, 2)
         )

@@ -17,7 +17,7 @@ from stickslip_blender.cycles.pixels import encode
 from stickslip_blender.raster import Window, _raster, decoded, projected, see
 
 
-def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
+def apply_lens_distortion(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     """Return a video (frames, height, width, 3) as its camera shows it, 8-bit sRGB.
 
     The video was taken by the camera's `pinhole`.
@@ -27,17 +27,21 @@ def bent(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     if not any(camera.distortion):
         return video
     _, _, places = traced(camera)
+    # The upper left of the four pixels of the pinhole's frame, and the position between them.
     corner = np.floor(places).astype(int)
-    share = (places - corner)[..., None].astype(np.float32)
+    fraction = (places - corner)[..., None].astype(np.float32)
     column = corner[..., 0]
     row = corner[..., 1]
-    across = share[:, :, 0]
-    down = share[:, :, 1]
+    across = fraction[:, :, 0]
+    down = fraction[:, :, 1]
     result = np.empty((len(video), *column.shape, 3), dtype=np.uint8)
     for frame, picture in enumerate(video):
-        a, b, c, d = (decoded(picture[row + y, column + x]) for y in range(2) for x in range(2))
-        upper = a + across * (b - a)
-        lower = c + across * (d - c)
+        upper_left = decoded(picture[row, column])
+        upper_right = decoded(picture[row, column + 1])
+        lower_left = decoded(picture[row + 1, column])
+        lower_right = decoded(picture[row + 1, column + 1])
+        upper = upper_left + across * (upper_right - upper_left)
+        lower = lower_left + across * (lower_right - lower_left)
         result[frame] = encode(upper + down * (lower - upper))
     return result
 
@@ -72,21 +76,27 @@ def ground_truth(
       rows
     """
     pinhole, rays, places = traced(camera)
+    # The nearest triangle at the middle of each pixel; a lens moves the pixels.
     here = projected(pinhole, points)
     seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
     if pinhole is not camera:
         seen = seen.looked_up(places)
     values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
+
+    # Normals are smooth only within a skin: a sharp edge has a vertex for each of its sides.
     skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
     smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
     thing = seen.triangle >= 0
     cloth = thing & geometry.has_uv[seen.triangle]
 
+    # The floor has no triangles: it shows where nothing else does.
     floor = _floor_depth(camera, rays, geometry.surroundings.floor)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     moved, _ = camera.project(values[..., 3:6])
     segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
     segmentation[thing] = geometry.segments[seen.triangle[thing]]
+
+    # Normals into the camera's axes and towards it: cloth has two sides.
     normal = np.where(thing[..., None], smooth, (0.0, 0.0, 1.0)) @ np.asarray(camera.rotation).T
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.maximum(length, 1e-12)

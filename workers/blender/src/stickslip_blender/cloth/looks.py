@@ -69,12 +69,14 @@ PLAIN = Look(
 """Of a fabric that is not in fabrics.toml: a user's own."""
 
 
-def look_of(material: str) -> Look:
+def fabric_look(material: str) -> Look:
     """Return the look of a material, `PLAIN` for a custom one."""
     return LOOKS.get(material, PLAIN)
 
 
-def grained(picture: npt.NDArray[np.uint8], look: Look, surface: Surface) -> npt.NDArray[np.uint8]:
+def print_on_fabric(
+    picture: npt.NDArray[np.uint8], look: Look, surface: Surface
+) -> npt.NDArray[np.uint8]:
     """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet.
 
     The sheet has the grain of its fabric and a hem.
@@ -267,16 +269,21 @@ def floor_factor(
     """
     if height is None:
         return np.ones((camera.height, camera.width, 3), dtype=np.float32)
+    # Several rays through each pixel: marks far away are finer than one.
     step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
     rows, columns = (
         (np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width)
     )
     across, down = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
     ray = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.asarray(camera.rotation)
+    # Follow each ray down to the floor. Rays that do not go down reach a point far away.
     reach = (height - camera.position[2]) / np.minimum(ray[..., 2:], -1e-3)
     place = (camera.position[:2] + reach * ray[..., :2]) * (GRAIN_SIZE / GRAIN_EXTENT)
     low = np.floor(place).astype(int)
-    (right, lower), marks = np.moveaxis(place - low, -1, 0), _marks(substrate)
+    right, lower = np.moveaxis(place - low, -1, 0)
+    marks = _marks(substrate)
+
+    # Marks repeat over the floor: interpolate between the four around each sample.
     (i, j), (k, m) = (np.moveaxis(corner % GRAIN_SIZE, -1, 0) for corner in (low, low + 1))
     upper_row = marks[j, i] + right * (marks[j, k] - marks[j, i])
     lower_row = marks[m, i] + right * (marks[m, k] - marks[m, i])

@@ -15,8 +15,8 @@ of these over all frames, is the mean squared error; L: light on the cloth, B: w
 0.25 elsewhere adds to it. Blocks of pixels, and instants, tell the deviation.
 
 One rendering serves three textures: red, green and blue of its print are the green of the three.
-Trios are fixed: a clip gets the same numbers alone or with others. A user's picture is measured by
-itself.
+The groups of three are fixed: a clip gets the same numbers alone or with others. A user's picture
+is measured by itself.
 """
 
 from collections.abc import Sequence
@@ -33,18 +33,17 @@ from stickslip_blender.cloth.geometry import Geometry
 from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
-# per pixel of a shading of a direct rendering, after as many: the first is through the middle of
-# the pixel
 PATHS = 2
-WHOLE, OF_LANDED = (
-    3,
-    3,
-)  # direct renderings of all cloth, and of its landed part, usually half of it in area
-_FIXED, _SET_UP = (
-    22,
-    1,
-)  # what else a frame of a shading costs, and a rendering [paths per pixel of its window]
-_TRIO = 3  # textures that are measured together; eight make as many
+"""Paths per pixel of a shading in a direct rendering. As many are skipped before them, since Cycles
+sends the first path through the middle of the pixel.
+"""
+WHOLE = 3
+"""Direct renderings of all cloth in a measured frame."""
+OF_LANDED = 3
+"""Direct renderings of the landed cloth, which covers about half of the area of all cloth."""
+_FIXED_PATHS = 22  # cost of a frame of a shading beside its paths [paths per pixel of its window]
+_SET_UP_PATHS = 1  # cost of a rendering beside its paths [paths per pixel of its window]
+_GROUP_SIZE = 3  # textures that are measured together: one in each colour channel
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
 FEWEST = 30  # pixels of a region, over all measured instants, below which nothing is said of it
@@ -81,24 +80,29 @@ class Measured:
 
     @property
     def labels(self) -> dict[str, object]:
-        psnr, deviations = (
-            [None if np.isnan(x) else x for x in values] for values in (self.psnr, self.deviations)
-        )
-        return {f"psnr_{name}": x for name, x in zip(REGIONS, psnr, strict=True)} | {
-            "psnr_deviation": deviations
+        """The labels of a sample, with None for a region that no measured frame shows."""
+        labels: dict[str, object] = {
+            f"psnr_{name}": _number_or_none(psnr)
+            for name, psnr in zip(REGIONS, self.psnr, strict=True)
         }
+        labels["psnr_deviation"] = [_number_or_none(deviation) for deviation in self.deviations]
+        return labels
+
+
+def _number_or_none(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 UNMEASURED = Measured((np.nan,) * 3, (np.nan,) * 3)
 
 
-def trio(texture: str) -> tuple[str, ...]:
+def measured_group(texture: str) -> tuple[str, ...]:
     """Return the textures that are measured together with one."""
     names = [str(name) for name in Texture]
     if texture not in names:
         return (texture,)
-    first = names.index(texture) // _TRIO * _TRIO
-    return tuple(names[first : first + _TRIO])
+    first = names.index(texture) // _GROUP_SIZE * _GROUP_SIZE
+    return tuple(names[first : first + _GROUP_SIZE])
 
 
 def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
@@ -109,10 +113,13 @@ def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list
     To measure eight textures costs a share of their shading, which has so many paths in each part
     of a pixel.
     """
-    cost = (
-        _TRIO * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP) / (FINE**2 * paths + _FIXED)
-    )
+    # What it costs to measure a frame for all groups, over the cost of its shading.
+    reference_cost = _GROUP_SIZE * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP_PATHS)
+    shading_cost = FINE**2 * paths + _FIXED_PATHS
+    cost = reference_cost / shading_cost
     count = min(max(1, round(share * frames / cost)), frames)
+
+    # One draw in each of `count` equal parts: all of the clip is covered, at no fixed instants.
     draws = np.random.Generator(np.random.PCG64(seed)).random(count)
     return [int((k + draw) / count * frames) for k, draw in enumerate(draws)]
 
@@ -131,6 +138,7 @@ def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[n
         Window(0, 0, camera.width, camera.height),
         grid=1,
     )
+    # The cloth's triangles come first; a prop before the cloth takes its pixels.
     cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
     low = seen.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
     return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
@@ -151,62 +159,80 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
     levels = picture[..., 1]
     others = references[..., channel]
     light = decoded(levels).astype(np.float64)
+
+    # The slope of the sRGB curve turns differences of light into differences of levels.
     slope = 255.0 * np.where(
         light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0)
     )
     top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
-    known = np.isfinite(others).sum(axis=0)
-    off = np.nan_to_num(light - np.minimum(others, top))
-    pairs = off.sum(axis=0) ** 2 - (off**2).sum(axis=0)
-    return np.asarray(slope**2 * pairs / np.maximum(known * (known - 1), 1))
+    renderings = np.isfinite(others).sum(axis=0)
+    difference = np.nan_to_num(light - np.minimum(others, top))
+
+    # The sum of products over all pairs of different renderings: the square of the sum less the
+    # squares. A product of a rendering with itself would hold the square of its noise.
+    products = difference.sum(axis=0) ** 2 - (difference**2).sum(axis=0)
+    return np.asarray(slope**2 * products / np.maximum(renderings * (renderings - 1), 1))
 
 
-def pooled(
-    measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: Sequence[float] = (1.0,) * 3
+def pool_errors(
+    frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weights: Sequence[float] = (1.0,) * 3
 ) -> Measured:
-    """Return the PSNR from errors (height, width) of instants and weights by region.
+    """Return the PSNR of a clip by region, from the errors and weights of its measured frames.
 
-    Weights are (3, height, width), and 0 outside of a region.
+    Errors are (height, width), in squared 8-bit levels. Weights are (3, height, width), and 0
+    outside of a region.
 
-    `usual`: means of weights over the regions in all frames.
+    `mean_weights`: means of weights over the regions in all frames of the clip.
     """
-    # Each region has weights of its own: all cloth, landed cloth, and the edge.
-    values = []
-    for region in range(len(REGIONS)):
-        of_region = [(error, weights[region]) for error, weights in measured]
-        values.append(_pooled(of_region, usual[region]))
-    return Measured(*zip(*values, strict=True))
+    psnr: list[float] = []
+    deviations: list[float] = []
+    for region, mean_weight in zip(range(len(REGIONS)), mean_weights, strict=True):
+        region_frames = [(error, weights[region]) for error, weights in frames]
+        level, deviation = _pool_region(region_frames, mean_weight)
+        psnr.append(level)
+        deviations.append(deviation)
+    return Measured(tuple(psnr), tuple(deviations))
 
 
-def _pooled(
-    measured: Sequence[tuple[Floats, npt.NDArray[Any]]], usual: float
+def _pool_region(
+    frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weight: float
 ) -> tuple[float, float]:
-    sums = np.concatenate(
-        [_blocks(np.where(weights > 0, error, 0.0)) for error, weights in measured]
-    )
-    sizes = np.concatenate([_blocks(weights.astype(np.float64)) for _, weights in measured])
-    if sum(np.count_nonzero(weights) for _, weights in measured) < FEWEST:
+    """Return the PSNR of one region and its standard deviation [dB]; NaN if it is too small."""
+    if sum(np.count_nonzero(weights) for _, weights in frames) < FEWEST:
         return np.nan, np.nan
-    mean = sums.sum() / (size := sizes.sum())
-    spread = float(np.sqrt(((sums - mean * sizes) ** 2).sum())) / size
-    bounded = max(mean, spread)  # chance can make the mean of products negative
-    count = len(measured)
-    parts = np.array(
-        [
-            np.sum(np.where(weights > 0, error - bounded * weights, 0.0))
-            for error, weights in measured
-        ]
+
+    # Errors in proportion to the weights: their ratio estimates the error per weight.
+    block_errors = np.concatenate(
+        [_block_sums(np.where(weights > 0, error, 0.0)) for error, weights in frames]
     )
-    between = (
-        (np.sum((parts * count / size / bounded) ** 2) + _TRUST * _SPREAD**2)
-        / (count - 1 + _TRUST)
-        / count
+    block_weights = np.concatenate(
+        [_block_sums(weights.astype(np.float64)) for _, weights in frames]
     )
-    deviation = float(np.sqrt((spread / bounded) ** 2 + between))
-    return float(10.0 * np.log10(255.0**2 / (bounded * usual))), 10.0 / np.log(10.0) * deviation
+    total_weight = block_weights.sum()
+    ratio = block_errors.sum() / total_weight
+
+    # Errors of neighbouring pixels depend on each other, those of blocks do not: the residuals of
+    # the blocks give the deviation of the ratio within the measured frames.
+    residuals = block_errors - ratio * block_weights
+    within = float(np.sqrt((residuals**2).sum())) / total_weight
+    bounded = max(ratio, within)  # chance can make the mean of products negative
+
+    # Other frames would have other errors. Few frames say little about how much, so that the
+    # usual spread counts as _TRUST frames more.
+    frame_residuals = np.array(
+        [np.sum(np.where(weights > 0, error - bounded * weights, 0.0)) for error, weights in frames]
+    )
+    count = len(frames)
+    spread_squares = np.sum((frame_residuals * count / total_weight / bounded) ** 2)
+    between = (spread_squares + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
+
+    # The relative deviation of the squared error, in decibels.
+    deviation = float(np.sqrt((within / bounded) ** 2 + between))
+    psnr = float(10.0 * np.log10(255.0**2 / (bounded * mean_weight)))
+    return psnr, 10.0 / np.log(10.0) * deviation
 
 
-def _blocks(values: Floats) -> Floats:
+def _block_sums(values: Floats) -> Floats:
     height, width = (-(-size // _BLOCK) for size in values.shape)
     padded = np.zeros((height * _BLOCK, width * _BLOCK))
     padded[: values.shape[0], : values.shape[1]] = values

@@ -29,15 +29,11 @@ from stickslip_blender.raster import Points, Window, projected, window_about
 
 _LAMP_DISTANCE = 7.2  # [m]
 _LAMP_POWER = 940.0  # [W]
-_FLOOR_RADIUS, _FLOOR_RIM = (
-    8.0,
-    0.6,
-)  # [m]: the rim hides the horizon from a camera 8 degrees above the floor
+_FLOOR_RADIUS = 8.0  # [m]
+_FLOOR_RIM = 0.6  # [m]: it hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED, _RAMP = (
-    2,
-    4,
-)  # [px] at a window's border, where the denoiser errs; then, as it passes into the frame
+_DISCARDED = 2  # [px] at a window's border, where the denoiser errs
+_RAMP = 4  # [px] over which the window then passes into the frame
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
 _MIRROR_PATHS = 2  # times as many paths for the frame then
 
@@ -64,6 +60,9 @@ class ClothScene:
             self._floor = add_material(
                 add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor"
             )
+
+        # The vertices of the cloth and the props move from frame to frame; here only faces and
+        # texture coordinates count.
         faces = geometry.surface.triangles
         uv = geometry.surface.uv
         flat = np.column_stack([uv, np.zeros(len(uv))])
@@ -98,6 +97,7 @@ class ClothScene:
         self.substrate = substrate
         self._fabric.set_look(**_shader(look))
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
+        # The same distance for all clips: the lamp's power gives the same light.
         a = np.radians(light.azimuth)
         e = np.radians(light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -124,13 +124,19 @@ class ClothScene:
         """
         self._fabric.set_color(SHOWN, ELSEWHERE)
         self._place(points)
+
+        # The whole frame, with few paths: light on the floor varies slowly.
         paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
         set_sampling(self._scene, Sampling(paths, "quick", seed))
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
+
+        # The window of the cloth, with more paths and FINE x FINE values a pixel.
         part = self.window(points, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
-        down = _share(part.top, part.bottom, self._camera.height)
-        across = _share(part.left, part.right, self._camera.width)
+
+        # Blend the window into the frame, so that its border does not show.
+        down = _blend_weights(part.top, part.bottom, self._camera.height)
+        across = _blend_weights(part.left, part.right, self._camera.width)
         here = part.times(FINE).slices
         finer = self._reader.read_light(part, FINE).astype(np.float32) - light[here]
         light[here] += np.minimum.outer(down, across)[..., None] * finer
@@ -163,10 +169,10 @@ class ClothScene:
             move_mesh(mesh, part)
 
 
-def _share(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
-    """Return the share of a window [low, high) in a frame of a size [px], by finer pixels.
+def _blend_weights(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
+    """Return the weight of a window [low, high) in a frame of a size [px], by finer pixels.
 
-    It is smooth at its ends.
+    It is smooth at the window's ends, and 1 at the border of the frame.
     """
     inside = low + (np.arange(FINE * (high - low)) + 0.5) / FINE
     ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside
@@ -183,6 +189,7 @@ def _shader(look: Look) -> dict[str, float]:
 
 def _floor(height: float) -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
     """Return the vertices and faces of a round plate at a height [m], with a low rim."""
+    # The floor is one polygon; its rim is a ring of upright faces.
     around = 64
     angle = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS

@@ -59,6 +59,7 @@ _PROP_GRID = 3
 # radius of a box, twice applied, over the width of the lobe that it stands for; compared with
 # Cycles
 _LOBE = 1.9
+_SURE_COVERAGE = 0.02  # of mirrored cloth, from which on its own colour counts in full
 _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
 
 Floats = npt.NDArray[np.float32]
@@ -89,11 +90,15 @@ class Composer:
         height, width, 3). Returns the share of the frame that is cloth, and of the cloth that
         nothing hides, its area taken as it is turned to the camera.
         """
+        # What each finer pixel sees, and the mean albedo of the cloth there in each texture.
         window = self._window(points, camera).times(FINE)
         parts = scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
+
+        # On a floor that mirrors, the light from the cloth has the colour of its mirror image; on
+        # others, the mean colour of the cloth in sight.
         reflected = np.empty((0, 0, colors), dtype=np.float32)
         around = Window(0, 0, 0, 0)
         if substrate.mirrors and self._geometry.surroundings.floor is not None:
@@ -110,6 +115,7 @@ class Composer:
             self._tinted(floor, points, camera),
             pictures,
         )
+        # Samples of cloth that are seen, over those of its projected area.
         frame = parts.width * parts.height
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return float(sight.coverage.sum()) / frame, float(min(visible, 1.0))
@@ -124,6 +130,8 @@ class Composer:
         window = self._window(points, camera).times(fine)
         parts = scaled(camera, fine)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
+        # The direct rendering has the cloth's own colours: the factor is 1 as far as cloth covers a
+        # pixel.
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
         marks = (
@@ -143,16 +151,21 @@ class Composer:
         window = window_about(projections[geometry.cloth_vertices :], camera)
         if not window.area:
             return floor
+
+        # Colours of bodies and holders: the mean over the samples of a pixel.
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
         seen = see(projections, props, window, _PROP_GRID)
-        # The samples of a pixel form a grid; each entry has the same sample of all pixels.
-        samples = []
-        for r, c in product(range(_PROP_GRID), range(_PROP_GRID)):
-            samples.append(seen.triangle[r::_PROP_GRID, c::_PROP_GRID])
+        samples = [
+            seen.triangle[row::_PROP_GRID, column::_PROP_GRID]
+            for row, column in product(range(_PROP_GRID), repeat=2)
+        ]
         shown = sum(
             (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
         ) / len(samples)
-        for sheet in geometry.printed:  # see_albedo looks at the first triangles
+
+        # Further sheets have pictures. `see_albedo` reads the first triangles of a mesh: roll each
+        # sheet to the front.
+        for sheet in geometry.printed:
             count = sheet.triangles.stop - sheet.triangles.start
             first = sheet.triangles.start
             turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(
@@ -161,6 +174,8 @@ class Composer:
             rolled = replace(seen, triangles=np.roll(props, -first, axis=0), triangle=turned)
             sight = see_albedo(rolled, geometry.uv, sheet.textures, count)
             shown = shown + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
+
+        # A prop stands before the floor, as far as it covers a pixel.
         factor = floor.copy()
         factor[window.slices] = (
             shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
@@ -187,10 +202,15 @@ class Composer:
         nothing = np.empty((0, 0, 3 * textures.count), dtype=np.float32), Window(0, 0, 0, 0)
         if not window.area:
             return nothing
+
+        # The mirror image of the cloth, as if the floor were a window.
         seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)
         sight = see_albedo(seen, self._geometry.uv, textures, cloth)
         if not sight.coverage.any():
             return nothing
+
+        # How far behind the floor it appears decides how far a rough floor blurs it. At the edge of
+        # the cloth there is no depth: take the mean around.
         beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
         shown = sight.coverage[..., None]
         wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
@@ -198,6 +218,7 @@ class Composer:
             np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide
         )
         path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
+
         # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width
         # roughness^2 is narrower across the plane of incidence than in it, by the sine of the angle
         # at which the camera looks down.
@@ -205,13 +226,16 @@ class Composer:
             path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32
         )
         across = np.asarray(down * np.float32(-np.asarray(camera.rotation)[2, 2]), dtype=np.float32)
+
+        # Blur coverage and colour alike; their ratio is the colour. Where hardly any cloth is
+        # mirrored, the mean colour takes its part.
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
         blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
-        share = blurred[..., :1]
-        known = np.minimum(share / 0.02, 1.0)
-        color = blurred[..., 1:] / np.maximum(share, 1e-6)
+        coverage = blurred[..., :1]
+        confidence = np.minimum(coverage / _SURE_COVERAGE, 1.0)
+        color = blurred[..., 1:] / np.maximum(coverage, 1e-6)
         mean = overall.ravel()
-        return (mean + known * (color - mean)).astype(np.float32), window
+        return (mean + confidence * (color - mean)).astype(np.float32), window
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
@@ -226,7 +250,8 @@ def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
         [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)],
         axis=-1,
     )
+    # A ray that does not go down meets the floor nowhere near.
     down = (ray @ np.asarray(camera.rotation))[..., 2]
     floor = (height - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
-    share = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)
-    return np.clip(share, 0.0, 1.0).astype(np.float32)
+    fraction = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)
+    return np.clip(fraction, 0.0, 1.0).astype(np.float32)

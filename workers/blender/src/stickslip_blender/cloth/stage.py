@@ -28,7 +28,7 @@ from stickslip_blender.cloth.geometry import (
     square,
     tiled,
 )
-from stickslip_blender.cloth.looks import grained, look_of
+from stickslip_blender.cloth.looks import fabric_look, print_on_fabric
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
@@ -41,25 +41,15 @@ ROUNDING = 0.005  # radius of the edges of a box that gives none [m], as in the 
 MOVING = 0.005  # a vertex that goes farther than this moves [m]: cameras frame all that do
 PLAIN = (168, 164, 156)  # sRGB, of a sheet that neither a scene nor an axis gives a texture
 
-_USUAL_COLOR, _USUAL_ROUGHNESS = (0.2, 0.2, 0.2), 0.5  # as the document has them
-_TURNS = (
-    0.0,
-    30.0,
-    -30.0,
-    60.0,
-    -60.0,
-    90.0,
-    -90.0,
-    120.0,
-    -120.0,
-    150.0,
-    -150.0,
-    180.0,
-)  # [degree]
-# of the most that any turn shows of the cloth: the smallest turn that shows as much is taken
+_DEFAULT_COLOR = (0.2, 0.2, 0.2)  # linear, of a body without a look: the document's default
+_DEFAULT_ROUGHNESS = 0.5  # likewise
+# Turns of the camera about the scene [degree], the smallest first.
+_TURNS = (0.0, *(sign * 30.0 * step for step in range(1, 6) for sign in (1, -1)), 180.0)
+# Fraction of the most cloth that any turn shows: the smallest turn that shows as much is used.
 _ENOUGH = 0.6
 _WATCHED = 60  # instants at which it is found out what moves
-_LOOKS, _THUMB = 5, 56  # instants that are looked at, and the side of their pictures [px]
+_TURN_INSTANTS = 5  # instants at which the cloth in sight of a turn is measured
+_THUMB = 56  # side of their pictures [px]
 
 Array = npt.NDArray[Any]
 
@@ -92,6 +82,8 @@ class Stage:
         self.ground = BACKGROUND
         self._placers: list[Callable[[int], Array]] = []
         props: list[Prop] = []
+
+        # Sheets come first: the composer reads their pictures from the first triangles.
         for name, other in scene["sheets"].items():
             if name != sheet:
                 props.append(
@@ -99,16 +91,20 @@ class Stage:
                         name, other, scene["looks"]["sheets"].get(name), picture, codes[name]
                     )
                 )
+
+        # The first level plane is the floor, which has marks, a mirror image and no mesh.
         for number, (name, body) in enumerate(scene["bodies"].items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor = body["origin"][2] + FLOOR
                 self.ground = codes[name]
                 continue
             look = scene["looks"]["bodies"].get(name) or {
-                "color": _USUAL_COLOR,
-                "roughness": _USUAL_ROUGHNESS,
+                "color": _DEFAULT_COLOR,
+                "roughness": _DEFAULT_ROUGHNESS,
             }
             props.append(self._body(name, number, body, look, codes[name]))
+
+        # A holder is a box about what it holds; one that holds nothing has no box.
         for number, sides in enumerate(
             record["holder_box"].tolist() if "holder_box" in record else ()
         ):
@@ -129,6 +125,7 @@ class Stage:
         track = self._record[f"{self._sheet}.positions"]
         instants = np.unique(np.linspace(0, len(track) - 1, _WATCHED).astype(int))
         parts = [track.reshape(-1, 3)]
+        # Props that stand still do not count, however large.
         for place in self._placers:
             places = np.stack([place(instant) for instant in instants])
             moves = (np.ptp(places, axis=0) > MOVING).any(axis=1)
@@ -142,8 +139,9 @@ class Stage:
         """
         points = self.moving()
         track = self._record[f"{self._sheet}.positions"]
-        instants = np.linspace(0, len(track) - 1, _LOOKS).astype(int)
+        instants = np.linspace(0, len(track) - 1, _TURN_INSTANTS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
+        # The first turn that shows about as much as any: a camera far around would surprise.
         shown = [
             _shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes)
             for turn in _TURNS
@@ -163,14 +161,14 @@ class Stage:
     ) -> Prop:
         positions = self._record[f"{name}.positions"]
         skin = surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"])
-        look = look_of(sheet["material"])
-        skin.dress(hem=1e-3 * look.hem)
+        look = fabric_look(sheet["material"])
+        skin.apply_relief(hem=1e-3 * look.hem)
         texture = (
             np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
         )
         self._placers.append(lambda instant: skin(positions[instant]))
         faces = list(map(tuple, skin.triangles.tolist()))
-        printed = Print(skin.uv, grained(texture, look, skin), look)
+        printed = Print(skin.uv, print_on_fabric(texture, look, skin), look)
         return Prop(
             name,
             skin(positions[0]),

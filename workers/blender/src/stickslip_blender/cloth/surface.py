@@ -169,7 +169,10 @@ class Surface:
         self.size = width, height
         ab, ac = (flat[faces[:, k]] - flat[faces[:, 0]] for k in (1, 2))
         area = 0.5 * np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()
+        # A sheet whose triangles fill the box around it has four straight sides.
         self.is_rectangle = bool(area > 0.999 * width * height)
+
+        # Subdivide until facets are smaller than a pixel; positions pass the same levels.
         self._levels: list[Subdivision] = []
         while len(flat) < FINE_VERTICES:
             self._levels.append(subdivide(faces, flat))
@@ -177,6 +180,8 @@ class Surface:
             flat = self._levels[-1](flat)
         self._sheet = faces
         self._count = len(flat)
+
+        # The hem is a ring of further vertices around the rim, at offsets of its profile.
         rim = _rim(faces)
         self._profile = np.repeat(_PROFILE[:, 1], len(rim))[:, None]
         inside = np.concatenate(
@@ -186,11 +191,13 @@ class Surface:
         self.triangles = np.ascontiguousarray(
             np.concatenate([faces, _ring_faces(len(rim), self._count)])
         )
+
+        # The print goes on over the hem: its vertices have the coordinates of the sheet below.
         uv = (np.concatenate([flat, inside]) - low) / max(self.size)
         self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
-        self.dress(hem=0.0)
+        self.apply_relief(hem=0.0)
 
-    def dress(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
+    def apply_relief(self, *, hem: float, creases: float = 0.0, seed: int = 0) -> None:
         """Set half the hem's thickness [m], and the strength (0 to 1) and seed of the creases."""
         self._hem = hem * self._profile
         self._height = (
@@ -202,13 +209,16 @@ class Surface:
         sheet = np.asarray(positions, dtype=np.float64)
         for level in self._levels:
             sheet = level(sheet)
+
+        # Creases lift the sheet along its normals.
         normals = _raster.normals(sheet, self._sheet)
         if self._height is not None:
             lifted = sheet + self._height[:, None] * normals
-            lifted[:, 2] = np.maximum(
-                lifted[:, 2], np.minimum(sheet[:, 2], 0.0)
-            )  # not into the floor
+            # A crease never goes into the floor.
+            lifted[:, 2] = np.maximum(lifted[:, 2], np.minimum(sheet[:, 2], 0.0))
             sheet = lifted
+
+        # The hem follows the sheet that is already creased.
         middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
         upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
         return np.concatenate([sheet, middle + self._hem * upward])

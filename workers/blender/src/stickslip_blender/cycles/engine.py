@@ -179,7 +179,7 @@ class ClothSampling:
         """Trace more paths for the same cost if the window has a smaller area [px^2]."""
         return replace(
             self,
-            window=round(self.window * min(max(_USUAL_AREA / max(area, 1.0), 1.0), _MORE_PATHS)),
+            window=round(self.window * min(max(_FULL_AREA / max(area, 1.0), 1.0), _MAX_PATH_RATIO)),
         )
 
     @property
@@ -188,10 +188,8 @@ class ClothSampling:
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
-_USUAL_AREA, _MORE_PATHS = (
-    13_000.0,
-    1.6,
-)  # of a window that needs no more paths [px^2], and the most times as many
+_FULL_AREA = 13_000.0  # of a window from which on the paths of the quality suffice [px^2]
+_MAX_PATH_RATIO = 1.6  # most times as many paths in a smaller window
 
 # Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures
 # them.
@@ -217,14 +215,16 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     """
     bpy = import_bpy()
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    # Blender makes a directory for itself, which is never used, and a killed process leaves it
+    # behind.
     with suppress(OSError):
-        Path(
-            bpy.app.tempdir
-        ).rmdir()  # never used, empty, and left behind by a process that is killed
+        Path(bpy.app.tempdir).rmdir()
     scene = bpy.context.scene
     render = scene.render
     cycles = scene.cycles
     render.engine = "CYCLES"
+    # One thread: a worker runs as many renderers as it has processors, and bytes never depend on
+    # their number.
     render.threads_mode = "FIXED"
     render.threads = 1
     render.use_persistent_data = True
@@ -232,6 +232,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     render.use_sequencer = False
     render.resolution_percentage = 100
     use_device(scene)
+    # The same number of paths for every pixel, and no limit of time: no pixel depends on the
+    # machine's load.
     cycles.use_animated_seed = False
     cycles.use_adaptive_sampling = False
     cycles.time_limit = 0.0
@@ -242,6 +244,7 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     cycles.diffuse_bounces = diffuse_bounces
     cycles.glossy_bounces = 1
     cycles.use_light_tree = light_tree
+
     # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither: colors
     # keep meaning.
     scene.display_settings.display_device = "sRGB"

@@ -188,7 +188,9 @@ def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
     """Return the socket of a colour: `seen` for rays of the camera, `other` for the rest."""
     mix = tree.nodes.new("ShaderNodeMix")
     mix.data_type = "RGBA"
-    factor, a, b = (next(i for i in mix.inputs if i.identifier == n) for n in _MIX_INPUTS)
+    # A mix node has inputs of all data types; identifiers tell those of colours.
+    sockets = {socket.identifier: socket for socket in mix.inputs}
+    factor, a, b = (sockets[identifier] for identifier in _MIX_INPUTS)
     tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], factor)
     tree.links.new(other, a)
     tree.links.new(seen, b)
@@ -231,7 +233,8 @@ def set_view(scene: Any, camera: Camera) -> None:
     # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the
     # two.
     ratio = camera.fx / camera.fy  # a pixel's height over its width
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, 1.0 / ratio), max(1.0, ratio)
+    render.pixel_aspect_x = max(1.0, 1.0 / ratio)
+    render.pixel_aspect_y = max(1.0, ratio)
     view.data.lens = camera.fx / camera.width * SENSOR_WIDTH
     view.data.shift_x = ((camera.width - 1) / 2 - camera.cx) / camera.width
     view.data.shift_y = (camera.cy - (camera.height - 1) / 2) / camera.width * ratio

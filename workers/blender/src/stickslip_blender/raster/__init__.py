@@ -167,7 +167,7 @@ def decoded(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 
 def fans(faces: Sequence[Sequence[int]]) -> Indices:
     """Return convex polygons as fans of triangles, shape (T, 3)."""
-    triangles = []
+    triangles: list[tuple[int, int, int]] = []
     for face in faces:
         triangles += [(face[0], b, c) for b, c in pairwise(face[1:])]
     return np.array(triangles, dtype=np.int32)

@@ -79,6 +79,7 @@ def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
     angle = 2.0 * np.pi / SIDES * np.arange(SIDES)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (SIDES, 2)
     rings = centerline[:, None] + radius * circle @ normals  # (n, SIDES, 3)
+    # Rings of the half sphere on the free end, smaller and farther along the tangent.
     rise = np.pi / 2.0 / (CAP_RINGS + 1) * np.arange(1, CAP_RINGS + 1)[:, None, None]
     cap = centerline[-1] + radius * (
         np.cos(rise) * (circle @ normals[-1]) + np.sin(rise) * tangents[-1]
@@ -96,6 +97,7 @@ def tube_faces(points: int) -> list[tuple[int, ...]]:
     pole = rings * SIDES
     middle = rings * SIDES + 1
     faces: list[tuple[int, ...]] = []
+    # Quadrilaterals between neighbouring rings; then fans to the pole and to the flat end.
     for ring in range(rings - 1):
         for side in range(SIDES):
             a = ring * SIDES + side
@@ -213,18 +215,23 @@ class RodRenderer:
         together with one sample's worth of the pixels around, gets the coverage (h, w) that the
         rasteriser computes.
         """
+        # Light and hits of the 3 x 3 pixels around each.
         padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
         rows, columns = coverage.shape
-        # The sum over the 3 x 3 pixels around each pixel.
-        shifted = []
-        for r, c in product(range(3), range(3)):
-            shifted.append(padded[r : r + rows, c : c + columns])
+        shifted = [
+            padded[down : down + rows, across : across + columns]
+            for down, across in product(range(3), repeat=2)
+        ]
         around = np.sum(shifted, axis=0)
+
+        # Their mean counts as one more sample that hit: a pixel at the edge may have none itself.
         hit = around[..., 3:] > 0.0
-        help_ = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
-        mean = (light + help_)[..., :3] / np.where(hit, (light + help_)[..., 3:], 1.0)
-        share = np.where(hit, coverage[..., None], 0.0)
-        return np.asarray(share * mean + (1.0 - share) * np.float32(GROUND), dtype=np.float32)
+        prior = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
+        mean = (light + prior)[..., :3] / np.where(hit, (light + prior)[..., 3:], 1.0)
+
+        # The exact coverage in place of the share of hits, which is noisy.
+        alpha = np.where(hit, coverage[..., None], 0.0)
+        return np.asarray(alpha * mean + (1.0 - alpha) * np.float32(GROUND), dtype=np.float32)
 
 
 def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> TaskResult:
@@ -237,6 +244,7 @@ def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> Tas
     renderer = context.renderer(
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality)
     )
+    # The seed of the colour is that of the noise, too: rods of a dataset differ in both.
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
     preview = (
         context.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
