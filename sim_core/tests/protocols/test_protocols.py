@@ -64,7 +64,7 @@ class TestBendTwist:
         assert 0.75 * upper < lower < upper
 
     def test_certificate_is_that_of_solve_rods(self) -> None:
-        """Just above and below the measured boundary, solve_rods says the same of the planar rod."""
+        """Just above and below the measured boundary, solve_rods says the same of planar rods."""
         boundary = rods.upper_boundary(6.0, 0.5, 128)
         solved = solve_rods([boundary * 0.999, boundary * 1.001], [0.0, 0.0], [6.0, 6.0])
         assert solved.converged.all()

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, root
 from scipy.special import jv
 
-from stickslip_sim_core.reference import master_curves
+from stickslip_sim_core.reference import bend_twist, boundary_values, master_curves
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class TestCantilever:
         """
         gamma = 10.0 ** np.arange(-3.0, 5.1)
         fine = master_curves.cantilever(gamma)
-        monkeypatch.setattr(master_curves, "TOLERANCE", 1e-7)
+        monkeypatch.setattr(boundary_values, "TOLERANCE", 1e-7)
         coarse = master_curves.cantilever(gamma)
         np.testing.assert_allclose(coarse, fine, rtol=1e-9)
         assert (coarse != fine).any()
@@ -127,7 +127,7 @@ class TestStickSlip:
     def test_refined(self, monkeypatch: pytest.MonkeyPatch) -> None:
         strain = np.array([1e-6, 1e-2, 0.1, 0.33])
         fine = master_curves.stick_slip(strain)
-        monkeypatch.setattr(master_curves, "TOLERANCE", 1e-7)
+        monkeypatch.setattr(boundary_values, "TOLERANCE", 1e-7)
         coarse = master_curves.stick_slip(strain)
         np.testing.assert_allclose(coarse, fine, rtol=1e-9)
         assert (coarse != fine).any()
@@ -205,9 +205,9 @@ class TestBendTwist:
 
     @pytest.mark.slow
     def test_independent_of_what_was_asked_before(self) -> None:
-        master_curves._boundary.cache_clear()
+        bend_twist._boundary.cache_clear()
         first = master_curves.bend_twist(10.0, 0.4)
-        master_curves._boundary.cache_clear()
+        bend_twist._boundary.cache_clear()
         master_curves.bend_twist([8.0, 12.0, 6.0], 0.4)
         assert first.tobytes() == master_curves.bend_twist(10.0, 0.4).tobytes()
 
@@ -300,7 +300,9 @@ def test_no_solution() -> None:
     """y' = 1 + y^2 keeps y finite over less than pi only."""
     s = np.linspace(0, 4, 5)
     with np.errstate(all="ignore"), pytest.raises(master_curves.NotSolvedError):
-        master_curves._solved(lambda s, y: 1 + y**2, lambda first, last: first, s, np.zeros((1, 5)))
+        boundary_values.solve_boundary_values(
+            lambda s, y: 1 + y**2, lambda first, last: first, s, np.zeros((1, 5))
+        )
 
 
 def test_arguments() -> None:

@@ -36,7 +36,7 @@ def continuous_quaternions(frames: Rotation) -> Floats:
 def derivatives(
     frames: Rotation, rod: tuple[float, float, float, float], omega: Floats
 ) -> tuple[float, Floats, Floats]:
-    """Energy, gradient and Hessian with nodes 1 ... N turned by omega, shape (3 N,), in world axes."""
+    """Energy, gradient and Hessian with nodes 1 ... N turned by omega (3 N,), in world axes."""
     turns = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), omega.reshape(-1, 3)]))
     gamma, phi0, phi1, C = rod
     return _testing.rod_derivatives(gamma, phi0, phi1, C, continuous_quaternions(turns * frames))

@@ -14,7 +14,7 @@ from stickslip_sim_core import (
     solve_general_rods,
     solve_rods,
 )
-from stickslip_sim_core.rods.fit import _Model, _parameters, _State
+from stickslip_sim_core.rods.hung_rod import HungRod, HungRodModel, parameters_of
 from stickslip_sim_core.rods.solve import bspline_matrix
 
 pytestmark = pytest.mark.physics
@@ -54,8 +54,8 @@ def outside() -> tuple[Floats, Floats, RodSolution]:
 class TestModel:
     STIFFNESS = (0.6, 0.8, 1.3)
 
-    def hung(self, points: int) -> tuple[_Model, _State, RodSolution]:
-        model = _Model.of(points, self.STIFFNESS, intervals=5)
+    def hung(self, points: int) -> tuple[HungRodModel, HungRod, RodSolution]:
+        model = HungRodModel.of(points, self.STIFFNESS, intervals=5)
         rng = np.random.default_rng(1)
         coefficients = np.array([4.0, 0.5, 11.0]) + rng.normal(size=(8, 3))
         natural = bspline_matrix(5, S) @ coefficients
@@ -76,8 +76,8 @@ class TestModel:
         model, state, _ = self.hung(points)
         jacobian = model.jacobian(state)
         step = 1e-4
-        for column in range(len(_parameters(state))):
-            direction = np.zeros(len(_parameters(state)))
+        for column in range(len(parameters_of(state))):
+            direction = np.zeros(len(parameters_of(state)))
             direction[column] = step
             moved = [model.moved(state, k * direction) for k in (-2, -1, 1, 2)]
             values = [m.centerline.ravel() for m in moved if m is not None]

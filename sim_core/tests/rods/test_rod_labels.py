@@ -32,7 +32,7 @@ def test_tight_helix_is_a_pitch_away_from_itself() -> None:
 
 
 def test_crossing_strands() -> None:
-    """An overhand crossing whose strands pass each other at distance 0.03, between sampled points."""
+    """An overhand crossing whose strands pass each other at distance 0.03, between points."""
     t = np.linspace(-1, 1, 151)
     loop = np.stack([t**3 - 0.6 * t, t**2, 0.015 * t / np.sqrt(0.6)], axis=1)
     np.testing.assert_allclose(self_contact_distance(loop[None]), 0.03, rtol=1e-2)

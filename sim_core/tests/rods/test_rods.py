@@ -172,7 +172,7 @@ class TestSymmetry:
             np.testing.assert_allclose(other.curvature, solved.curvature[::10] * signs, atol=1e-6)
 
     def test_poisson_sets_twist_stiffness(self) -> None:
-        """At a given pull, a rod that is stiffer in twist twists less away from its natural twist."""
+        """At a given pull, a rod that is stiffer in twist turns less from its natural twist."""
         soft, stiff = (solve_rods([500.0], [5.0], [10.0], poisson=p) for p in (0.5, -0.9))
         assert (
             np.abs(stiff.curvature[0, :, 0] - 5.0).max()

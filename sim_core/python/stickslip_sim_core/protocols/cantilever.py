@@ -28,7 +28,8 @@ STRETCHING = 3e3
 
 DAMPING = 3.0  # 1/s
 STEADY_STEPS = 60  # of the preset's length; then they grow
-GROWTH, LONGEST = 1.2, 1.0  # s
+GROWTH = 1.2  # ratio of a time step to the one before
+LONGEST = 1.0  # time step [s]
 STEPS_MAX = 600
 REST = 2e-5  # of the length: a long step in which nothing moves by more is the last
 FORCE_SHARE = 0.1  # of a node's weight: the force that residuals are measured in

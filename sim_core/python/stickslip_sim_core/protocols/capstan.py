@@ -21,14 +21,18 @@ from stickslip_sim_core.reference import master_curves
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 BENDING = (1e-4, 0.05)  # B / T1, B = D / (2 R^2)
-RADIUS, WRAP, WIDTH = 0.05, 2.0, 2  # m, rad, cells
+RADIUS = 0.05  # m
+WRAP = 2.0  # rad
+WIDTH = 2  # cells
 CELLS_PER_TURN = 72  # 5 degrees each
 FREE = (
     2.0 * np.pi / 3.0
 )  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
 LIGHT = 2.0  # T1, N/m
-DENSITY, STRETCHING = 0.1, 2e4  # kg/m^2, N/m
-SPEED, DAMPING = 0.01, 2.0  # m/s, 1/s
+DENSITY = 0.1  # kg/m^2
+STRETCHING = 2e4  # N/m
+SPEED = 0.01  # m/s
+DAMPING = 2.0  # 1/s
 SLIDING = 1.2  # s: after which the heavy pull is measured
 MEASURED = 0.8  # s: over which its mean is taken, two cells of way
 

@@ -24,7 +24,8 @@ BENDING_LENGTH = 0.02  # L_gb, m
 DENSITY = 0.2  # kg/m^2
 GAP = 1.0 / 16.0  # thickness over L_gb
 STRETCHING = 1.5e4  # over rho g L_gb
-LOWER, UPPER = 4.0, 3.0  # length of the layers that lie, over L_gb
+LOWER = 4.0  # length of the lower layer that lies, over L_gb
+UPPER = 3.0  # the same of the upper layer
 FRICTION = (0.3, 1.0)
 
 # Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing

@@ -171,10 +171,8 @@ def patch(mesh: meshes.Mesh, mu: float, preset: SolverSettings) -> OnSlope:
 
 STACK_FRICTION = (0.1, 0.3, 0.8, 1.5)
 SHEETS = (2, 4)
-TOP, WIDER = (
-    0.1,
-    0.01,
-)  # m: side of the sheet on top, and by how much each one below is wider on each side
+TOP = 0.1  # side of the sheet on top [m]
+WIDER = 0.01  # by which each sheet below is wider on each side [m]
 THICKNESS = 5e-4  # m
 ROUGHER = 1.5  # friction of all other interfaces, over the least
 

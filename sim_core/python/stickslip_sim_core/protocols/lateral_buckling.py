@@ -29,10 +29,12 @@ from stickslip_sim_core.reference import master_curves
 ASPECT = (0.1, 0.2, 0.5)
 POISSON = (0.0, 0.3)
 
-DENSITY, RIGIDITY = 0.2, 1e-5  # kg/m^2, N m
+DENSITY = 0.2  # kg/m^2
+RIGIDITY = 1e-5  # N m
 STRETCHING = 1e5  # over rho_A g L: the strip sags by 1e-3 L at most
 FORCE_SHARE = 0.01  # of a node's weight: the force that residuals are measured in
-STEPS, GROWTH = 30, 1.5  # of the time step, until inertia is nothing beside stiffness
+STEPS = 30  # until inertia is nothing beside stiffness
+GROWTH = 1.5  # ratio of a time step to the one before
 DIFFERENCE = 1e-7  # of the length
 REACH = 6.0  # cells: no force of bending acts between vertices that are further apart
 

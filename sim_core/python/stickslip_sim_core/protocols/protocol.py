@@ -155,14 +155,10 @@ class Protocol(ABC):
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         """Measure the points x of the curve with the parameters `at`."""
-        measured = []
-        master = []
-        for point in x:
-            value, expected = self.measure(point, at)
-            measured.append(float(value))
-            master.append(float(expected))
-        parameters = {name: float(value) for name, value in at.items()}
-        return Curve(parameters, x, tuple(measured), tuple(master))
+        pairs = [self.measure(point, at) for point in x]
+        measured = tuple(float(value) for value, _ in pairs)
+        master = tuple(float(value) for _, value in pairs)
+        return Curve({name: float(value) for name, value in at.items()}, x, measured, master)
 
     constants: ClassVar[Mapping[str, Setting]] = {}
     """Numbers of the protocol that no setting changes, for the result."""
@@ -305,16 +301,16 @@ class RefinedProtocol(MeshedProtocol):
         return self.measure_with(self.finer(x) * self.cells[-1], x, at), self.master(x, at)
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
-        # A row for each of the three meshes, the coarsest first.
-        cells = []
-        measured = []
-        sizes = []
+        cells: list[tuple[int, ...]] = []
+        sizes: list[tuple[float, ...]] = []
+        measured: list[tuple[float, ...]] = []
+        # The whole curve on one mesh after the other, the coarsest first.
         for count in self.cells:
             counts = tuple(self.finer(point) * count for point in x)
-            values = [self.measure_with(n, point, at) for n, point in zip(counts, x, strict=True)]
+            pairs = zip(counts, x, strict=True)
             cells.append(counts)
-            measured.append(tuple(values))
-            sizes.append(tuple(cell_of(n) / LENGTH for n in counts))
+            sizes.append(tuple(cell_of(count) / LENGTH for count in counts))
+            measured.append(tuple(self.measure_with(count, point, at) for count, point in pairs))
         return Curve(
             {name: float(value) for name, value in at.items()},
             x,

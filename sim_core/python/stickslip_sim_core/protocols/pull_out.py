@@ -18,8 +18,10 @@ from stickslip_sim_core.protocols.protocol import MeshedProtocol, MeshKind, rect
 
 FRICTION = (0.1, 0.3, 0.8, 1.5)
 LOADS = (1.0, 4.0)  # weight of the upper sheet, over that of the fabric
-UPPER, OVER_LOWER = 1.0, 0.5  # friction with the sheet above and below, over mu
-SIDE, THICKNESS = 0.1, 5e-4  # m
+UPPER = 1.0  # friction with the sheet above, over mu
+OVER_LOWER = 0.5  # friction with the sheet below, over mu
+SIDE = 0.1  # m
+THICKNESS = 5e-4  # m
 FABRIC = "gray-interlock"
 SPEED = 0.01  # m/s
 SLIDING = 1.0  # s: after which the force is measured

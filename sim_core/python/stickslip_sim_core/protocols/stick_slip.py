@@ -25,7 +25,9 @@ from stickslip_sim_core.reference import master_curves
 FRICTION = (0.05, 0.1, 0.2, 0.3, 0.34)
 CELLS_ACROSS = 2
 
-DENSITY, RIGIDITY, STRETCHING = 0.05, 1e-4, 3e4  # kg/m^2, N m, N/m
+DENSITY = 0.05  # kg/m^2
+RIGIDITY = 1e-4  # N m
+STRETCHING = 3e4  # N/m
 # 1/s: root of the strain; less where the tip slips below this root, so that steps resolve it as
 # well
 RATE = 5e-3
@@ -40,10 +42,8 @@ BIAS_UNTIL = 2e-3  # strain
 # Force in which a node's residual is measured, over its share of the buckling load.
 FORCE_SHARE = 0.03
 
-MOVED = 2e-4  # of the length: a tip that has come so far has slipped,
-LET_GO = (
-    1e-6  # and it began with the step, the last of its kind, before it moved by more than this.
-)
+MOVED = 2e-4  # of the length: a tip that has come so far has slipped
+LET_GO = 1e-6  # of the length: the slip began with the step after the last that moved it by less
 
 # Strains of the phase diagram, and frictions beyond the triple point.
 PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))

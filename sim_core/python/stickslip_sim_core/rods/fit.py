@@ -2,35 +2,31 @@
 
 A fit has three parameters, or natural curvature along the rod.
 
-Both move the natural rod until the *hung* rod, as the forward solver finds it, meets the
-centreline. The model is exact in its derivatives: two chains whose nodes include the P points,
-extrapolated (4 r_h - r_2h) / 3 with an error O(h^4), each differentiated through its equilibrium
-(rods/chain.hpp).
+Both move the natural rod until the *hung* rod, as the forward solver finds it (`hung_rod`), meets
+the centreline.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.hung_rod import (
+    HungRod,
+    HungRodModel,
+    minimise,
+    ridge,
+    root_mean_square,
+)
 from stickslip_sim_core.rods.solve import (
-    CLAMP_FRAME,
-    ELEMENT_TURN_MAX,
     STIFFNESS,
     RodSolution,
     bspline_matrix,
-    clamp_quaternions,
     finite_array,
-    interpolation_matrix,
-    rod_stiffness,
     solve_general_rods,
 )
-
-ELEMENTS_MIN = 96
-"""Elements of the coarser chain are at least this many."""
 
 CANDIDATES = 4
 """Rods of the library from which a fit starts."""
@@ -40,9 +36,6 @@ RANGES = ((60.0, 2000.0), (0.0, 14.0), (4.0, 22.0))
 
 INTERVALS = 24
 """Knot intervals of the splines of natural curvature."""
-
-ITERATIONS_MAX = 40
-"""Accepted and refused steps of one minimisation together."""
 
 STEP_TOLERANCE = 1e-7
 """A minimisation ends when a step moves the centreline by less than this [L, root mean square]."""
@@ -134,8 +127,11 @@ def fit_parameters(
         equilibrium.
     """
     data = _centerline(centerline)
-    model = _Model.of(len(data), stiffness, intervals=None)
+    model = HungRodModel.of(len(data), stiffness, intervals=None)
     state = _fit_constant(model, data, gamma, components=(0, 2))
+
+    # Standard errors of the parameters that were fitted, from the curvature of the squared error.
+    # The clamped point has no error: its three coordinates are no data.
     jacobian = model.jacobian(state)[:, [0, 1, 3]]
     used = np.array([gamma is None, True, True])
     variance = (state.residual(data) ** 2).sum() / (data.size - 3 - used.sum())
@@ -150,7 +146,7 @@ def fit_parameters(
         float(phi0),
         float(phi1),
         error,
-        _rms(state.residual(data)),
+        root_mean_square(state.residual(data)),
         model.solution(state, len(data)),
     )
 
@@ -191,52 +187,63 @@ def fit_natural_curvature(
     data = _centerline(centerline)
     if noise is not None and not noise > 0:
         raise ValueError(f"noise: must be > 0, got {noise}")
-    constant = _Model.of(len(data), stiffness, intervals=None)
+
+    # The path begins with a uniform rod, the limit of a large weight of smoothness.
+    constant = HungRodModel.of(len(data), stiffness, intervals=None)
     uniform = _fit_constant(constant, data, gamma, components=(0, 1, 2))
-    model = _Model.of(len(data), stiffness, intervals=INTERVALS)
+    model = HungRodModel.of(len(data), stiffness, intervals=INTERVALS)
     coefficients = np.tile(uniform.coefficients, (INTERVALS + 3, 1))
     state = model.relax(uniform.gamma, coefficients, uniform.frames)
     assert state is not None  # the same rod as before
 
+    # |D c|^2 as a matrix; the weight of smoothness is relative to the scale of the data.
     free = np.arange(0 if gamma is None else 1, 1 + 3 * (INTERVALS + 3))
     penalty = np.zeros((1 + 3 * (INTERVALS + 3),) * 2)
     differences = np.diff(np.eye(INTERVALS + 3), axis=0)
     penalty[1:, 1:] = np.kron(np.eye(3), differences.T @ differences)
     jacobian = model.jacobian(state)
     scale = np.trace(jacobian.T @ jacobian) / np.trace(penalty)
-    best: tuple[float, _State, float, float] | None = None
+    best: tuple[float, HungRod, float, float] | None = None
+
+    # From weight to weight the fit begins at the last one, which is near.
     for decade in PENALTY_DECADES:
         weighted = 10.0**decade * scale * penalty
-        state = _minimise(model, state, data, free, weighted, PATH_TOLERANCE)
+        state = minimise(model, state, data, free, weighted, PATH_TOLERANCE)
+
+        # Effective degrees of freedom: the trace of the matrix that maps data to the fit.
         jacobian = model.jacobian(state)[:, free]
         normal = jacobian.T @ jacobian
         used = float(
-            np.trace(
-                np.linalg.solve(normal + weighted[np.ix_(free, free)] + _ridge(normal), normal)
-            )
+            np.trace(np.linalg.solve(normal + weighted[np.ix_(free, free)] + ridge(normal), normal))
         )
         misfit = float((state.residual(data) ** 2).sum())
-        left = data.size - 3 - DEGREES_FACTOR * used
-        if left <= 0:
+        effective_size = data.size - 3 - DEGREES_FACTOR * used
+        if effective_size <= 0:
             break
-        score = misfit / left**2
+        score = misfit / effective_size**2
+
+        # The residual is down at the noise: a smaller weight would fit the noise itself.
         degrees_left = data.size - 3 - used
-        quiet = noise is not None and misfit <= noise**2 * (
+        is_at_noise = noise is not None and misfit <= noise**2 * (
             degrees_left + np.sqrt(2.0 * degrees_left)
         )
-        if quiet or best is None or score < best[0]:
+        if is_at_noise or best is None or score < best[0]:
             best = (score, state, used, float(decade))
-        if quiet or score > 1.5 * best[0]:
+
+        # The score has one minimum on the path, and rounding makes small rises.
+        if is_at_noise or score > 1.5 * best[0]:
             break
     assert best is not None  # the first weight leaves degrees of freedom
+
+    # Bring the chosen fit down to the tolerance of a result.
     _, state, used, decade = best
-    state = _minimise(model, state, data, free, 10.0**decade * scale * penalty, STEP_TOLERANCE)
+    state = minimise(model, state, data, free, 10.0**decade * scale * penalty, STEP_TOLERANCE)
     misfit = float((state.residual(data) ** 2).sum())
     samples = bspline_matrix(INTERVALS, np.linspace(0.0, 1.0, len(data))) @ state.coefficients
     return NaturalFit(
         samples,
         state.gamma,
-        _rms(state.residual(data)),
+        root_mean_square(state.residual(data)),
         float(np.sqrt(misfit / (data.size - 3 - used))),
         used,
         float(10.0**decade),
@@ -244,174 +251,28 @@ def fit_natural_curvature(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """A hung rod, with its extrapolated centreline (P, 3).
-
-    Spline coefficients are (B, 3); each chain has its frames.
-    """
-
-    gamma: float
-    coefficients: Floats
-    frames: tuple[Floats, ...]
-    centerline: Floats
-
-    def residual(self, data: Floats) -> Floats:
-        return (self.centerline - data).ravel()
-
-
-@dataclass(frozen=True, eq=False)
-class _Model:
-    """From gamma and spline coefficients to the hung centreline at P points."""
-
-    stiffness: Floats
-    clamp: Floats  # quaternion
-    intervals: int | None  # None: constant
-    strides: tuple[int, ...]  # of the chains, in elements per point
-    bases: tuple[Floats, ...]  # spline values in the middles of each chain's elements
-
-    @staticmethod
-    def of(points: int, stiffness: ArrayLike, intervals: int | None) -> "_Model":
-        stride = -(-ELEMENTS_MIN // (points - 1))
-        strides = (stride, 2 * stride)
-        bases = []
-        for k in strides:
-            n = k * (points - 1)
-            middles = (np.arange(n) + 0.5) / n
-            bases.append(
-                np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles)
-            )
-        K = rod_stiffness(stiffness, 1)[0]
-        clamp = clamp_quaternions(CLAMP_FRAME, 1)[0]
-        return _Model(K, clamp, intervals, strides, tuple(bases))
-
-    def relax(
-        self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]
-    ) -> _State | None:
-        """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
-        hung = []
-        curves = []
-        for k, basis, start in zip(self.strides, self.bases, frames, strict=True):
-            q, stable = _sim_core.relax_chain(gamma, self.stiffness, basis @ coefficients, start)
-            if not stable:
-                return None
-            hung.append(q)
-            curves.append(_sim_core.chain_centerline(q)[::k])
-        return _State(gamma, coefficients, tuple(hung), (4.0 * curves[1] - curves[0]) / 3.0)
-
-    def hang(self, gamma: float, coefficients: Floats, curvature: Floats) -> _State | None:
-        """Hang the rod from a shape of this curvature, (m, 3) at uniform arc length."""
-        frames = []
-        for basis in self.bases:
-            n = len(basis)
-            middles = interpolation_matrix(len(curvature), (np.arange(n) + 0.5) / n) @ curvature
-            frames.append(_sim_core.chain_frames(middles, self.clamp))
-        return self.relax(gamma, coefficients, tuple(frames))
-
-    def jacobian(self, state: _State) -> Floats:
-        """Return derivatives of the centreline by log gamma and the coefficients: (3 P, 1 + 3 B).
-
-        Coefficients are ordered component by component.
-        """
-        parts = [
-            _sim_core.chain_jacobian(
-                state.gamma, self.stiffness, basis @ state.coefficients, q, basis, k
-            )
-            for k, basis, q in zip(self.strides, self.bases, state.frames, strict=True)
-        ]
-        jacobian = (4.0 * parts[1] - parts[0]) / 3.0
-        jacobian[:, 0] *= state.gamma
-        return jacobian
-
-    def moved(self, state: _State, step: Floats) -> _State | None:
-        """Hang the rod again after a step of (log gamma, coefficients)."""
-        if abs(step[0]) > 1.0:  # e-fold: such a step has left where the derivatives mean anything
-            return None
-        coefficients = state.coefficients + step[1:].reshape(3, -1).T
-        return self.relax(state.gamma * float(np.exp(step[0])), coefficients, state.frames)
-
-    def solution(self, state: _State, points: int) -> RodSolution:
-        """Solve the fitted rod with the general solver, from the frames of the fit."""
-        s = np.linspace(0.0, 1.0, points)
-        B = np.ones((points, 1)) if self.intervals is None else bspline_matrix(self.intervals, s)
-        natural = B @ state.coefficients
-        start = _chain_curvature(state.frames[0])
-        largest = max(np.linalg.norm(f, axis=1).max() for f in (natural, start))
-        elements = 4 * int(np.ceil(max(largest / (0.8 * ELEMENT_TURN_MAX), 32)))
-        return solve_general_rods(
-            natural[None],
-            [state.gamma],
-            stiffness=self.stiffness,
-            start_curvature=start[None],
-            elements=elements,
-            points=points,
-        )
-
-
-def _minimise(
-    model: _Model,
-    state: _State,
-    data: Floats,
-    free: NDArray[np.int64],
-    penalty: Floats,
-    tolerance: float,
-) -> _State:
-    """Minimise |residual|^2 + c^T penalty c by damped Gauss-Newton steps.
-
-    `free` are the indices of the parameters (log gamma, coefficients) that may change.
-    """
-
-    def cost(of: _State) -> float:
-        c = _parameters(of)
-        return float((of.residual(data) ** 2).sum() + c @ penalty @ c)
-
-    value = cost(state)
-    damping = 0.0
-    fresh = True
-    for _ in range(ITERATIONS_MAX):
-        if fresh:
-            J = model.jacobian(state)[:, free]
-            normal = J.T @ J
-            hessian = normal + penalty[np.ix_(free, free)]
-            gradient = J.T @ state.residual(data) + (penalty @ _parameters(state))[free]
-        diagonal = np.diag(damping * np.diag(normal))
-        step = np.zeros(len(penalty))
-        step[free] = -np.linalg.solve(hessian + diagonal + _ridge(normal), gradient)
-        trial = model.moved(state, step)
-        fresh = trial is not None and (trial_value := cost(trial)) <= value
-        if fresh:
-            assert trial is not None
-            change = _rms(trial.centerline - state.centerline)
-            state = trial
-            value = trial_value
-            damping = 0.0 if damping < 1e-4 else 0.1 * damping
-            if change <= tolerance:
-                break
-        else:
-            if _rms(J @ step[free]) <= tolerance:
-                break  # nothing left but rounding
-            damping = max(1e-3, 10.0 * damping)
-    return state
-
-
 def _fit_constant(
-    model: _Model, data: Floats, known_gamma: float | None, components: tuple[int, ...]
-) -> _State:
+    model: HungRodModel, data: Floats, known_gamma: float | None, components: tuple[int, ...]
+) -> HungRod:
     """Fit a uniform rod from the nearest rods of the library."""
     if known_gamma is not None and not (np.isfinite(known_gamma) and known_gamma > 0):
         raise ValueError(f"gamma: must be > 0, got {known_gamma}")
     gammas, natural, centerlines, curvature = _library(
         len(data), tuple(model.stiffness), known_gamma
     )
+
+    # The squared error has several minima: start from the rods that hang nearest.
     distance = np.linalg.norm(centerlines - data, axis=(1, 2))
     free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
-    best: _State | None = None
+    best: HungRod | None = None
     for i in np.argsort(distance)[:CANDIDATES]:
         state = model.hang(float(gammas[i]), natural[i][None], curvature[i])
         if state is None:
             continue
-        state = _minimise(model, state, data, free, np.zeros((4, 4)), STEP_TOLERANCE)
-        if best is None or _rms(state.residual(data)) < _rms(best.residual(data)):
+        state = minimise(model, state, data, free, np.zeros((4, 4)), STEP_TOLERANCE)
+        if best is None or root_mean_square(state.residual(data)) < root_mean_square(
+            best.residual(data)
+        ):
             best = state
     if best is None:
         raise RuntimeError("no rod near the centreline hangs in a stable equilibrium")
@@ -447,35 +308,3 @@ def _centerline(centerline: ArrayLike) -> Floats:
     if len(data) < 8:
         raise ValueError(f"centerline: must have at least 8 points, got {len(data)}")
     return data
-
-
-def _chain_curvature(quaternions: Floats) -> Floats:
-    """Return the curvature of a chain at its nodes, shape (N + 1, 3).
-
-    It averages the curvatures of the elements, and repeats those at the ends.
-    """
-    p = quaternions[:-1]
-    q = quaternions[1:]
-    w = (p * q).sum(axis=1)
-    v = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
-    sine = np.linalg.norm(v, axis=1)
-    kappa = (
-        2.0
-        * len(p)
-        * np.where(sine > 1e-8, np.arctan2(sine, w) / np.maximum(sine, 1e-8), 1.0)[:, None]
-        * v
-    )
-    return np.concatenate([kappa[:1], 0.5 * (kappa[1:] + kappa[:-1]), kappa[-1:]])
-
-
-def _parameters(state: _State) -> Floats:
-    return np.concatenate([[np.log(state.gamma)], state.coefficients.T.ravel()])
-
-
-def _ridge(normal: Floats) -> Floats:
-    """Keep rounding from making a normal matrix singular."""
-    return np.asarray(1e-13 * np.trace(normal) * np.eye(len(normal)))
-
-
-def _rms(f: Floats) -> float:
-    return float(np.sqrt((f**2).mean()))

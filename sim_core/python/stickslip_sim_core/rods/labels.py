@@ -1,6 +1,7 @@
 """Labels of hanging rods: distance from themselves, sideways reach, and other stable equilibria."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,8 +66,7 @@ def _self_contact_distance(r: Floats) -> float:
     padded[1:-1, 1:-1] = distance2
     around = [
         padded[1 + i : p + 1 + i, 1 + j : p + 1 + j]
-        for i in (-1, 0, 1)
-        for j in (-1, 0, 1)
+        for i, j in product((-1, 0, 1), repeat=2)
         if (i, j) != (0, 0)
     ]
     minimal = distance2 <= np.minimum.reduce(around)
@@ -76,6 +76,7 @@ def _self_contact_distance(r: Floats) -> float:
     # The minimum lies on one of the segments that meet at the two points.
     a, b = (np.stack([np.clip(x - 1, 0, p - 2), np.clip(x, 0, p - 2)]) for x in (first, second))
     i, j = (x.ravel() for x in np.broadcast_arrays(a[:, None], b[None, :]))
+    # Segments that have a point in common touch without being a contact.
     apart = j - i >= 2
     return float(
         _segment_distance(r[i[apart]], r[i[apart] + 1], r[j[apart]], r[j[apart] + 1]).min(

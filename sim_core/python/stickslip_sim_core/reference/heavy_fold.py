@@ -1,0 +1,113 @@
+"""Master curve of a strip that is folded onto itself and lies under its own weight."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.reference.boundary_values import (
+    NotSolvedError,
+    solve_boundary_values,
+    within,
+)
+
+
+@dataclass(frozen=True)
+class HeavyFold:
+    """A fold at rest, in units of the gravito-bending length L_gb = (D / (rho g))^(1/3)."""
+
+    height: float
+    """Of its highest point over the layer below."""
+
+    loop_length: float
+    """Of the strip between where it lifts off and where it lands."""
+
+    nose_to_landing: float
+    """Horizontal distance."""
+
+    landing_force: float
+    """Of the layer below on the strip where it lands, over rho g L_gb."""
+
+    tension: float
+    """Of the strip where it lands, likewise: what holds the upper layer back besides friction."""
+
+    def pull(self, mu: ArrayLike, tail: ArrayLike) -> Floats:
+        """Return the force over rho g L_gb, away from the loop, at which the upper layer slips.
+
+        The force is horizontal.
+
+        Friction bears mu (weight of the tail + landing force), and the loop holds back by its
+        tension.
+
+        Args:
+            mu: Friction of the strip with itself.
+            tail: Length of the strip beyond the landing, over L_gb.
+        """
+        return np.asarray(mu) * (np.asarray(tail) + self.landing_force) + self.tension
+
+
+@lru_cache
+def heavy_fold(gap: float) -> HeavyFold:
+    """Return the shape of a strip that is folded onto itself on a floor under its own weight.
+
+    With theta the angle of the tangent, which lifts off at s = 0 and lands on the layer below at
+    the height `gap`, kappa = theta', and the force (H, V + s) in the strip,
+
+        kappa' = H sin(theta) - (V + s) cos(theta),   x' = cos(theta),   y' = sin(theta),
+        theta = kappa = y = 0 at s = 0,   theta = pi, kappa = 0, y = gap at the end.
+
+    kappa^2/2 + n . t - y is constant, so that H = -gap/2: friction changes nothing.
+
+    Args:
+        gap: Height of the upper layer over the lower one where it lands, over L_gb, in (0, 0.5].
+
+    Raises:
+        ValueError: The gap breaks its rule.
+    """
+    within("gap", gap, 0.0, 0.5, open_below=True)
+
+    def change(s: Floats, y: Floats, p: Floats) -> Floats:
+        (theta, kappa, _, _) = y
+        (H, V, length) = p
+        bend = H * np.sin(theta) - (V + s * length) * np.cos(theta)
+        return np.asarray(length * np.stack([kappa, bend, np.cos(theta), np.sin(theta)]))
+
+    def ends(first: Floats, last: Floats, _: Floats) -> Floats:
+        return np.array([*first, last[0] - np.pi, last[1], last[3] - gap])
+
+    # A guess that rises to 1.3 pi and comes back, by eye.
+    s = np.linspace(0.0, 1.0, 101)
+    theta = np.where(
+        s < 0.5, np.pi * 1.3 * np.sin(np.pi * s) ** 2, np.pi * (1.0 + 0.3 * np.sin(np.pi * s) ** 2)
+    )
+    x, y = (0.05 * np.cumsum(rate(theta)) for rate in (np.cos, np.sin))
+    found = solve_boundary_values(
+        change,
+        ends,
+        s,
+        np.stack([theta, np.gradient(theta, 0.05), x, y]),
+        np.array([0.0, -3.0, 5.0]),
+    )
+
+    # The nose is where the tangent is upright, the top where it is level again.
+    H, V, length = found.p
+    nose, top = (
+        found.sol(
+            brentq(
+                lambda s, angle=angle: found.sol(s)[0] - angle, 0.0, found.x[found.y[0].argmax()]
+            )
+        )
+        for angle in (np.pi / 2.0, np.pi)
+    )
+    if not (found.y[0].max() > np.pi and length > 0.0 and V < 0.0):
+        raise NotSolvedError(f"heavy_fold: the solution at gap = {gap} is not the fold")
+    return HeavyFold(
+        height=float(top[3]),
+        loop_length=float(length),
+        nose_to_landing=float(nose[2] - found.y[2, -1]),
+        landing_force=float(V + length),
+        tension=-float(H),
+    )
