@@ -122,6 +122,7 @@ def test_a_clip_below_its_floor_says_so() -> None:
         == "psnr_edge must be at least 28 dB; got 27.0 dB (deviation 0.1 dB)"
     )
     assert UNMEASURED.shortfall((99.0, 99.0, 99.0)) == ""
+    assert Measured((30.0,) * 3, (1.0,) * 3).shortfall((32.0,) * 3) == ""  # within two deviations
     assert UNMEASURED.labels["psnr_landed"] is None
 
 
@@ -133,6 +134,11 @@ def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
     assert instants(5, 9.0, 16, (1, 3)) == [0, 1, 2, 3, 4]
     assert len(instants(2, 0.0, 4, (1, 3))) == 1
     assert measured_group("checker") == ("checker", "dots", "stripes")
+    names = [str(texture) for texture in Texture]
+    for number, name in enumerate(names):
+        group = measured_group(name)
+        assert group == tuple(names[number - number % 3 : number - number % 3 + 3])
+        assert group.index(name) < 3
     assert measured_group("sha256:0") == ("sha256:0",)
 
 
