@@ -230,7 +230,7 @@ def fit_natural_curvature(
         if is_at_noise or best is None or score < best[0]:
             best = (score, state, used, float(decade))
 
-        # The score has one minimum on the path, and rounding makes small rises.
+        # Stop well past the least score, since small rises may come before it.
         if is_at_noise or score > 1.5 * best[0]:
             break
     assert best is not None  # the first weight leaves degrees of freedom

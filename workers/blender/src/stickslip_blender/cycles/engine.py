@@ -223,7 +223,7 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     render = scene.render
     cycles = scene.cycles
     render.engine = "CYCLES"
-    # One thread: a worker runs as many renderers as it has processors, and bytes never depend on
+    # One thread: workers run several renderers beside each other, and bytes never depend on
     # their number.
     render.threads_mode = "FIXED"
     render.threads = 1
