@@ -280,9 +280,7 @@ def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
 
 
 def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
-    """Yield what the packs of a job of rods without pictures might have made: curves that are all
-    the same.
-    """
+    """Yield outputs of the packs of a job of rods without pictures: curves that are all equal."""
     with made.database.read() as connection:
         row = connection.execute(text("SELECT seq, spec FROM jobs")).one()
         of_spec = parsed(json.loads(row.spec))

@@ -1,5 +1,4 @@
-"""What the coordinator costs: leasing and completing tasks, many watchers of one job, many clients
-at once.
+"""The cost of the coordinator: leases, reports, many watchers of a job, many clients at once.
 
     python benchmarks/queue_costs.py [--watchers 500] [--seconds 10] [--database postgresql://...]
 
@@ -46,9 +45,7 @@ def cpu_seconds(server: ServerProcess) -> float:
 
 
 def database_seconds() -> float:
-    """Return the CPU time of the PostgreSQL servers of this machine, with all sessions that have
-    ended [s].
-    """
+    """Return the CPU time [s] of the PostgreSQL servers of this machine, with ended sessions."""
     ticks = 0
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):  # it has just ended
@@ -187,6 +184,49 @@ async def report_clients(
     )
 
 
+def use_api(
+    server: ServerProcess, worker: PretendWorker, job: str, seconds: float
+) -> dict[str, list[float]]:
+    """Use the API for a while; return the times of the calls by what they are for [s]."""
+    times_of: dict[str, list[float]] = {"worker API": [], "reads": []}
+
+    def timed(name: str, call: Callable[[], object]) -> Any:
+        begin = time.perf_counter()
+        answer = call()
+        times_of[name].append(time.perf_counter() - begin)
+        return answer
+
+    with httpx.Client(trust_env=False, timeout=30) as client:
+        end = time.perf_counter() + seconds
+        while time.perf_counter() < end:
+            leases = timed("worker API", partial(worker.lease, simulate=1))
+            timed("worker API", partial(worker.start, *leases))
+            timed("worker API", partial(worker.finish, *leases))
+            for path in ("/v1/jobs", f"/v1/jobs/{job}", "/v1/workers"):
+                timed("reads", partial(client.get, server.url + path))
+            time.sleep(0.1)
+    return times_of
+
+
+async def print_times(
+    server: ServerProcess, worker: PretendWorker, job: str, seconds: float, title: str
+) -> None:
+    """Use the API for a while, and print the CPU time, the memory and the times of calls."""
+    cpu_before = cpu_seconds(server)
+    times_of = await asyncio.to_thread(use_api, server, worker, job, seconds)
+    fraction = (cpu_seconds(server) - cpu_before) / seconds
+    load = os.getloadavg()[0]
+    print(f"{title}: {fraction:.0%} of a core, {memory(server):.0f} MiB, load {load:.1f}")
+    for name, times in times_of.items():
+        times.sort()
+        p50 = 1e3 * times[int(0.5 * len(times))]
+        p99 = 1e3 * times[int(0.99 * len(times))]
+        print(
+            f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest "
+            f"{1e3 * times[-1]:.0f} ms"
+        )
+
+
 async def report_idle_streams(
     server: ServerProcess, worker: PretendWorker, count: int, seconds: float
 ) -> None:
@@ -219,44 +259,7 @@ async def report_idle_streams(
             while await reader.read(65536):  # what nobody reads would stay in the server
                 pass
 
-    took: dict[str, list[float]] = {"worker API": [], "reads": []}
-
-    def use(client: httpx.Client) -> None:
-        def timed(what: str, call: Callable[[], object]) -> Any:
-            begin = time.perf_counter()
-            answer = call()
-            took[what].append(time.perf_counter() - begin)
-            return answer
-
-        end = time.perf_counter() + seconds
-        while time.perf_counter() < end:
-            leases = timed("worker API", partial(worker.lease, simulate=1))
-            timed("worker API", partial(worker.start, *leases))
-            timed("worker API", partial(worker.finish, *leases))
-            for path in ("/v1/jobs", f"/v1/jobs/{job}", "/v1/workers"):
-                timed("reads", partial(client.get, server.url + path))
-            time.sleep(0.1)
-
-    async def measure(what: str) -> None:
-        for times in took.values():
-            times.clear()
-        cpu = cpu_seconds(server)
-        with httpx.Client(trust_env=False, timeout=30) as client:
-            await asyncio.to_thread(use, client)
-        share = (cpu_seconds(server) - cpu) / seconds
-        print(
-            f"{what}: {share:.0%} of a core, {memory(server):.0f} MiB, load "
-            f"{os.getloadavg()[0]:.1f}"
-        )
-        for name, times in took.items():
-            times.sort()
-            p50, p99 = (1e3 * times[int(part * len(times))] for part in (0.5, 0.99))
-            print(
-                f"    {name}: {len(times)} calls, p50 {p50:.0f}, p99 {p99:.0f}, longest "
-                f"{1e3 * times[-1]:.0f} ms"
-            )
-
-    await measure("no stream")
+    await print_times(server, worker, job, seconds, "no stream")
     readers = []
     for number in range(count + 100):
         readers.append(asyncio.create_task(open_stream(number)))
@@ -264,7 +267,8 @@ async def report_idle_streams(
             await asyncio.sleep(0.1)
     while statuses.total() < count + 100:
         await asyncio.sleep(0.1)
-    await measure(f"{count} idle streams and 100 too many, {dict(statuses)}")
+    title = f"{count} idle streams and 100 too many, {dict(statuses)}"
+    await print_times(server, worker, job, seconds, title)
     for reader, writer in zip(readers, writers, strict=True):
         writer.close()
         reader.cancel()

@@ -57,7 +57,7 @@ def test_a_ray_that_does_not_start_says_why_and_gives_up(
 
 
 def test_ray_that_dies_after_half_a_minute_has_failed_to_start(tmp_path: Path) -> None:
-    """It waits so long for its own processes, and was restarted for ever."""
+    """It waits so long for its own processes, and was restarted forever."""
     ray = process(tmp_path, FAIL)
     for _ in range(MAX_FAILED_STARTS):
         ray.restart_if_dead()

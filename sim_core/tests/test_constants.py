@@ -34,22 +34,25 @@ COST = 3.0
 CASES: dict[str, str] = {
     name: scene
     for scene, names in {
-        "pile": """contact.closing_gap contact.crossing_least contact.proximal contact.turn_max contact.law_stiffness
-            factor.changed_share newton.longest newton.pairs_tolerance stepping.inside""",
+        "pile": """contact.closing_gap contact.crossing_least contact.proximal contact.turn_max
+            contact.law_stiffness factor.changed_share newton.longest
+            newton.pairs_tolerance stepping.inside""",
         "fold": """contact.end_share contact.match_cosine contact.merge_radius contact.penalty_growth
-            contact.transfer_radius contact.length_tolerance contact.stall_ratio contact.stall_up_to contact.mean_share
-            factor.hold_change factor.hold_least factor.missing_share factor.stiffening_change
-            newton.halving_iterations newton.hops newton.linear_share newton.reversals_from newton.nearly
-            newton.rounds_max newton.cuts_max newton.window contact.penalty path.rest path.floor path.keep
-            path.margin""",
+            contact.transfer_radius contact.length_tolerance contact.stall_ratio
+            contact.stall_up_to contact.mean_share factor.hold_change factor.hold_least
+            factor.missing_share factor.stiffening_change newton.halving_iterations
+            newton.hops newton.linear_share newton.reversals_from newton.nearly
+            newton.rounds_max newton.cuts_max newton.window contact.penalty path.rest
+            path.floor path.keep path.margin""",
         "squeeze": "contact.surface_share",
-        "crumple": """contact.detection_range contact.penalty_max contact.smooth_proximal contact.stiff_mean_share
-            smooth.body_first path.rounds_max
+        "crumple": """contact.detection_range contact.penalty_max contact.smooth_proximal
+            contact.stiff_mean_share smooth.body_first path.rounds_max
             factor.fold_smallest newton.common_least newton.slow newton.smooth_hops
-            newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio stepping.easy
-            stepping.smooth_iterations stepping.stalled_long""",
-        "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at control.newton_work
-            control.looks control.novelty control.reject_at control.rejected_work factor.pool""",
+            newton.smooth_near newton.smooth_tolerance newton.smoothing_ratio
+            stepping.easy stepping.smooth_iterations stepping.stalled_long""",
+        "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at
+            control.newton_work control.looks control.novelty control.reject_at
+            control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
             smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",

@@ -264,7 +264,7 @@ class Settings(BaseSettings):
 def options(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Give a command options for some settings.
 
-    It gets the settings first, with the defaults of those that have no option.
+    It gets the settings first, with defaults for settings without an option.
     """
 
     def decorate(command: Callable[..., R]) -> Callable[..., R]:

@@ -36,7 +36,7 @@ class Weld(NamedTuple):
 def weld(columns: Floats) -> Weld:
     """Return the weld of vertices whose rows of `columns` (N, K) are equal.
 
-    Equal means equal to the bit, but for the sign of zero: files write one position in one way.
+    Equal means equal bit by bit, but for the sign of zero: files write one position in one way.
     """
     # Adding 0.0 turns -0.0 into 0.0.
     _, first, inverse = np.unique(columns + 0.0, axis=0, return_index=True, return_inverse=True)

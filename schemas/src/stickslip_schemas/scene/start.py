@@ -81,7 +81,7 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     faults = list(_sheet_faults(document, sheets))
     faults += _holder_faults(document, sheets)
     faults += _motion_faults(document, sheets)
-    # Geometry of a wrong unit or shape would only repeat in many places what is said already.
+    # Geometry of a wrong unit or shape would only repeat these faults in many other words.
     if not faults:
         faults += _body_faults(document, sheets)
     if not faults:

@@ -49,7 +49,7 @@ def register_certificate(
     database: Database, store: Store, certificate: Certificate, now: float
 ) -> CertificateEntry:
     """Store a certificate, and register it; a known one becomes the newest again."""
-    # The file is written first: a row without its file would be an error for ever, a file without
+    # The file is written first: a row without its file would be an error forever, a file without
     # a row is garbage that `stickslip gc` collects.
     artifact = store.publish(certificate.canonical())
     values = {

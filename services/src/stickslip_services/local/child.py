@@ -50,7 +50,7 @@ class Child:
     private: dict[str, str] = field(default_factory=dict)
     """Variables for this process only."""
     never_gives_up: bool = False
-    """Whether it is started again for ever, since the others can go on without it."""
+    """Whether it is started again forever, since the others can go on without it."""
     process: subprocess.Popen[bytes] | None = None
     started_at: float = 0.0
     failed_starts: int = 0

@@ -6,7 +6,7 @@ files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (
 
 Children that die are restarted with growing delays. A Ray or a dispatcher that fails to start five
 times in a row ends the supervisor, which prints the end of its log. A coordinator that has answered
-once is restarted for ever, since work that is running needs no coordinator for a while.
+once is restarted forever, since work that is running needs no coordinator for a while.
 """
 
 import ctypes
@@ -162,7 +162,8 @@ def run(
             coordinator.start()
             if not _wait_until_ready(settings, coordinator, signals):
                 return 0
-            # Other commands find the service by this file, so it appears when requests are answered.
+            # Other commands find the service by this file, so it appears when requests are
+            # answered.
             write_durably(data / "url", f"{settings.url}\n".encode())
             on_ready(settings.url)
             # Ray and the dispatcher start here, like children that have died.

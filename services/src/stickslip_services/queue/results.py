@@ -64,7 +64,7 @@ class EndedTask(NamedTuple):
 
 @dataclass(slots=True)
 class _Judgement:
-    """The verdicts on a batch of reports, and the tasks of those that were accepted."""
+    """The verdicts on a batch of reports, and the tasks of the accepted ones."""
 
     verdicts: list[ReportVerdict] = field(default_factory=list)
     released: list[LeasedTask] = field(default_factory=list)

@@ -2,7 +2,7 @@
 
 A total changes once a task: when it gets its result, or when that is discarded. Leases, retries and
 pauses change none. Tasks in flight (on lease, or waiting for a retry) are few: they are counted
-when somebody asks, from their side, by indexes that have no others. What is left is pending.
+when somebody asks, from their side, by indexes that have no others. All other tasks are pending.
 
 The totals of a job that has ended stay as they were. Its pending tasks are shown as `cancelled`.
 """
