@@ -37,8 +37,9 @@ CASES: dict[str, str] = {
         "pile": """contact.closing_gap contact.crossing_least contact.proximal contact.turn_max
             contact.law_stiffness factor.changed_share newton.longest
             newton.pairs_tolerance stepping.inside""",
-        "fold": """contact.end_share contact.match_cosine contact.merge_radius contact.penalty_growth
-            contact.transfer_radius contact.length_tolerance contact.stall_ratio
+        "fold": """contact.end_share contact.match_cosine contact.merge_radius
+            contact.penalty_growth contact.transfer_radius contact.length_tolerance
+            contact.stall_ratio
             contact.stall_up_to contact.mean_share factor.hold_change factor.hold_least
             factor.missing_share factor.stiffening_change newton.halving_iterations
             newton.hops newton.linear_share newton.reversals_from newton.nearly
@@ -53,8 +54,8 @@ CASES: dict[str, str] = {
         "strip": """stepping.lag control.dearer control.factor_work control.forgiven control.grow_at
             control.newton_work control.looks control.novelty control.reject_at
             control.rejected_work factor.pool""",
-        "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over smooth.reach
-            smooth.same_normal""",
+        "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over
+            smooth.reach smooth.same_normal""",
         "edges": "skeleton.radius_max skeleton.thickness_max skeleton.beyond stepping.sweep",
         "valley": "contact.fillet",
         "push": "stepping.near_patience stepping.stalled_soon",
