@@ -7,6 +7,7 @@ written to a JSON file, longest first.
 
 import gc
 import json
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,8 @@ from pathlib import Path
 import pytest
 from _pytest.nodeid import NodeId
 
-for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE"):  # no test is to write into what is in use
+# No test may write into a store in use, and pytest-xdist sets the size of a terminal.
+for _name in ("STICKSLIP_DATABASE", "STICKSLIP_STORE", "COLUMNS", "LINES"):
     os.environ.pop(_name, None)
 
 os.environ.setdefault(
@@ -91,6 +93,18 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     }
     for name, item in last.items():
         item.stash.setdefault(LAST_OF, []).append(name)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Iterator[object]:
+    """Let the handlers of logging that a test adds end with it: their stream does, too."""
+    root = logging.getLogger()
+    handlers = list(root.handlers)
+    level = root.level
+    result = yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    return result
 
 
 @pytest.hookimpl(wrapper=True)

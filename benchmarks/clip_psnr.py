@@ -74,7 +74,9 @@ def main() -> None:
         made = time.process_time()
         groups = list(dict.fromkeys(map(measured_group, TEXTURES)))
         own = [
-            list(clip.references([pictures[x] for x in g], clip.measured(options.measured, g)))
+            list(
+                clip.references([pictures[x] for x in g], clip.measured_frames(options.measured, g))
+            )
             for g in groups
         ]
         weights, usual = clip.weights(shading)

@@ -15,17 +15,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core.reference import master_curves, plate_buckling
+from stickslip_sim_core.reference import boundary_values, master_curves, plate_buckling
 
 Floats = NDArray[np.float64]
 
 
 def with_tolerance(tolerance: float, curve: Callable[[], Floats]) -> Floats:
-    usual, master_curves.TOLERANCE = master_curves.TOLERANCE, tolerance
+    usual, boundary_values.TOLERANCE = boundary_values.TOLERANCE, tolerance
     try:
         return curve()
     finally:
-        master_curves.TOLERANCE = usual
+        boundary_values.TOLERANCE = usual
 
 
 def collocated(name: str, x: Floats, curve: Callable[[Floats], Floats]) -> None:

@@ -29,7 +29,7 @@ from stickslip_schemas.documents.worker_api import Heartbeat, LeaseState
 from stickslip_services.access.keys import create_key
 from stickslip_services.access.principals import Scope
 from stickslip_services.api.protocol import allow_many_files
-from stickslip_services.api.sse import MOST_STREAMS
+from stickslip_services.api.sse import MAX_STREAMS
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import connect
 from stickslip_services.settings import Settings
@@ -239,7 +239,7 @@ async def report_idle_streams(
     host, port = server.url.removeprefix("http://").split(":")
     database = connect(Settings.chosen(data=server.data), Role.visitor)
     with database.write() as connection:
-        names = [f"stream-{number}" for number in range(1 + count // MOST_STREAMS)]
+        names = [f"stream-{number}" for number in range(1 + count // MAX_STREAMS)]
         keys = [create_key(connection, name, [Scope.admin], time.time())[1] for name in names]
     database.close()
     await asyncio.sleep(2)  # a coordinator looks for new keys once a second
@@ -248,7 +248,7 @@ async def report_idle_streams(
     writers: list[asyncio.StreamWriter] = []
 
     async def open_stream(number: int) -> None:
-        which = number // MOST_STREAMS
+        which = number // MAX_STREAMS
         reader, writer = await asyncio.open_connection(
             host, int(port), local_addr=(f"127.0.0.{1 + which}", 0)
         )

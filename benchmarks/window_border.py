@@ -60,7 +60,7 @@ def main() -> None:
         sides: dict[str, list[list[npt.NDArray[np.float64]]]] = {
             name: [[], []] for name in ("left", "right", "above", "below")
         }
-        for shot, frame, codes in zip(clip.shots, video, segments, strict=True):
+        for shot, frame, codes in zip(clip.frames, video, segments, strict=True):
             direct = clip.scene.direct(shot, picture, Sampling(PATHS, "plain", seed + 1000))
             off = frame[..., 1].astype(float) - encode(direct.astype(np.float32))[..., 1]
             off[codes != GROUND] = np.nan

@@ -315,14 +315,12 @@ def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> No
     usual, costs = before["estimate"], after["estimate"]
     assert (usual["measured"], usual["wall_seconds"]) == ([], None)
     assert 0.1 < usual["cpu_seconds"]["median"] < 10
-    assert costs["measured"] == ["pack", "simulate", "render"]
-    assert costs["cpu_seconds"]["median"] == pytest.approx(
-        2 * (6 + 6 + 3), abs=1
-    )  # PretendWorker reports 2 s each
-    assert costs["cpu_seconds"]["low"] < 30 < costs["cpu_seconds"]["high"]
-    assert costs["wall_seconds"]["median"] == pytest.approx(
-        costs["cpu_seconds"]["median"] / worker.slots
-    )
+    # Two shards are too few to know the cost of packing. PretendWorker reports 2 s for each task.
+    assert costs["measured"] == ["simulate", "render"]
+    assert costs["cpu_seconds"]["median"] == pytest.approx(2 * (6 + 6), abs=1)
+    assert costs["cpu_seconds"]["low"] < 24 < costs["cpu_seconds"]["high"]
+    # Stages run one after the other, and shards are fewer than slots.
+    assert costs["wall_seconds"]["median"] > costs["cpu_seconds"]["median"] / worker.slots
     assert len(client.get("/v1/jobs").json()["items"]) == 1
 
 
