@@ -1,4 +1,1 @@
-"""Runs tasks: the dispatcher, which is a Ray driver, and the stages, which are functions.
-
-See the modules.
-"""
+"""Workers run tasks: the dispatcher is a Ray driver, and the stages are functions."""

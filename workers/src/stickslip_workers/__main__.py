@@ -22,9 +22,9 @@ from stickslip_workers.settings import Settings, default_blender_python
 log = logging.getLogger(__name__)
 
 FRAMES_SECONDS = 5.0
-"""Between two reports of a replay's progress [s]."""
+"""Time between two reports of a replay's progress [s]."""
 STEADY_SECONDS = 60.0
-"""A dispatcher that has run for so long starts again without a wait that has grown [s]."""
+"""Least run time of a dispatcher that resets the growing wait before its next start [s]."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -131,7 +131,7 @@ def _describe(_options: argparse.Namespace) -> int:
 
 
 def _store(place: str) -> str:
-    """Return the place of a store; raise ArgumentTypeError where it cannot be opened."""
+    """Return the place of a store; raise ArgumentTypeError if it cannot be opened."""
     try:
         open_store(place)
     except ValueError as error:
@@ -165,7 +165,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         tls_certificate=options.tls_certificate,
         max_cpus=options.max_cpus,
         render_gpus=options.render_gpus,
-        # Not resolved: a virtual environment is known by the path of its link.
+        # Do not resolve the path: Python knows a virtual environment by the path of its link.
         blender_python=options.blender_python.absolute(),
     )
     from stickslip_workers.cluster import RayCluster, head_directory
@@ -177,7 +177,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         data = Path(settings.name)
         command = [sys.executable, "-m", "stickslip_workers", "head", "--ray-data", str(data)]
         command += [] if settings.max_cpus is None else ["--cpus", str(settings.max_cpus)]
-        # It ends after this process: Ray aborts a driver whose head ends at the same time.
+        # The head ends after this process. Ray aborts a driver whose head ends at the same time.
         subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
     if data is None:
         cluster = RayCluster(address or "")
@@ -203,9 +203,9 @@ def _dispatch(options: argparse.Namespace) -> int:
 
 
 def run_for_ever(command: list[str], backoff: Backoff) -> int:
-    """Run a dispatcher, again where it fails; return its status when it was stopped.
+    """Run a dispatcher, and start it again if it fails; return its status after a stop.
 
-    A driver of Ray may die with its cluster, whatever it does, and cannot connect to another one.
+    A driver of Ray may die with its cluster in any state, and it cannot connect to another cluster.
     """
     stopped: list[int] = []
     child: subprocess.Popen[bytes] | None = None
@@ -219,7 +219,8 @@ def run_for_ever(command: list[str], backoff: Backoff) -> int:
         signal.signal(number, stop)
     while True:
         began = time.monotonic()
-        # In a group of its own: what Ctrl-C sends is passed on once, and not also sent to it.
+        # The child has its own process group. It gets the signal of Ctrl-C once, from this process,
+        # and not also from the terminal.
         child = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
         status = child.wait()
         if stopped or status in (0, 2):  # 2: its arguments make no sense
@@ -239,7 +240,7 @@ def run_for_ever(command: list[str], backoff: Backoff) -> int:
 
 
 def _die_with_parent() -> None:
-    """Let the kernel end this process when its parent dies, however it dies [prctl(2)]."""
+    """Let the kernel end this process when its parent dies for any reason [prctl(2)]."""
     ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM)
 
 
@@ -265,7 +266,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _show_frames(over: threading.Event) -> None:
-    """Write to standard error how far the simulation of this process is."""
+    """Write the progress of the simulation in this process to standard error."""
     from stickslip_workers.stages import run
 
     while not over.wait(FRAMES_SECONDS):
@@ -274,7 +275,7 @@ def _show_frames(over: threading.Event) -> None:
 
 
 def _certify(options: argparse.Namespace) -> int:
-    """Return 0 if the preset passed, 1 if not, 2 if there was nothing to run."""
+    """Return 0 if the preset passed, 1 if it did not, and 2 if an error ended the run."""
     from stickslip_workers.commands import certify
 
     # Long protocols may log their progress.

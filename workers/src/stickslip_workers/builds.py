@@ -1,7 +1,8 @@
 """Builds: digests of the code of each kind and stage, for content keys.
 
-A build covers the files that a stage imports (see `stickslip_schemas.plan.builds`), the compiled
-core where it is used, and the versions of the libraries that the output depends on.
+A build covers the files that a stage imports (see `stickslip_schemas.plan.builds`) and the versions
+of the libraries that the output depends on. If the stage uses the compiled core, the build covers
+the core too.
 """
 
 from importlib import import_module, metadata
@@ -22,7 +23,7 @@ def scene_module(name: str) -> str:
 
 
 def kind(name: str) -> "Kind":
-    """Return how a kind is simulated; raise UnknownKindError."""
+    """Return the simulation of a kind; raise UnknownKindError."""
     simulated: Kind = import_module(scene_module(name)).KIND
     return simulated
 
@@ -60,8 +61,9 @@ def build(stage: str, name: str) -> str:
 def solver_build(module: str) -> str:
     """Return the digest of a solver.
 
-    It covers a module of sim_core, all that it imports, and the compiled core.
-    The level of its kernels is not part of it: levels differ by less than a certificate can see.
+    It covers a module of sim_core, everything that the module imports, and the compiled core. It
+    does not cover the level of the kernels, because a certificate cannot see the difference between
+    levels.
     """
     return content_key(
         "build/sim_core", {"core": _core(), "sources": digests(sources([module], cut=UNCOUNTED))}
@@ -82,6 +84,6 @@ def _core(kernel: str = "") -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that people ask for first, by name."""
+    """Return the versions of the main packages, by name."""
     names = ("stickslip-workers", "stickslip-schemas", "stickslip-sim-core", "ray", "zarr")
     return {name: metadata.version(name) for name in names}

@@ -1,7 +1,7 @@
 """The remote function that Ray runs.
 
-Ray gets this module by value, so that it also runs in Blender's environment, which does not have
-stickslip_workers: it may import nothing of ours.
+Ray sends this module by value, because it also runs in Blender's environment. That environment does
+not have stickslip_workers, so this module may not import any part of the project.
 """
 
 import importlib
@@ -10,10 +10,13 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 FRAMES_SECONDS = 2.0
-"""Time between two messages about how far a simulation is [s]."""
+"""Time between two progress messages of a simulation [s]."""
 
 _objects: dict[tuple[str, str], tuple[Any, Any]] = {}
-"""Objects that factories have made in this process, by factory and store, with their builds."""
+"""Objects that factories have made in this process, with their builds.
+
+The key is the factory and the store.
+"""
 
 _used: set[str] = set()
 """Factories that have run tasks in this process."""
@@ -30,10 +33,10 @@ def run(
     """Yield the messages of a call: its node, perhaps its progress, and its answers.
 
     The first message is a dict: the node, whether the builds of the process are `foreign`, and
-    whether it is `cold`. Progress is a tuple (frames done, frames in total). The last message is
-    the list of answers. A call on foreign builds ends after the first message.
+    whether the process is `cold`. Progress is a tuple (frames done, frames in total). The last
+    message is the list of answers. A call on foreign builds ends after the first message.
 
-    The object that `factory` (`module:Class`) makes stays in the process for later calls.
+    `factory` (`module:Class`) makes an object that stays in the process for later calls.
     """
     import ray
 
@@ -42,7 +45,7 @@ def run(
         new = getattr(importlib.import_module(module), name)(store)
         _objects[factory, store] = (new, new.describe()["builds"])
     actor, process_builds = _objects[factory, store]
-    # The first tasks of a process also import what their kind needs.
+    # The first tasks of a process also import the modules of their kind.
     is_cold = bool(arguments) and factory not in _used
     if arguments:
         _used.add(factory)
@@ -58,7 +61,7 @@ def run(
     if not reports_frames:
         yield work()
         return
-    # The work runs in a thread, so that this one can look at its progress.
+    # The work runs in a separate thread, so this thread can read its progress.
     answers = ThreadPoolExecutor(1).submit(work)
     while wait([answers], FRAMES_SECONDS).not_done:
         frames = actor.frames()

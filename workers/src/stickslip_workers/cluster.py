@@ -19,8 +19,10 @@ from stickslip_schemas.base import sha256
 log = logging.getLogger(__name__)
 
 RECONNECT_SECONDS, OWN_RECONNECT_SECONDS = "15", "2"
-"""How long Ray looks for a head that is gone; then it ends the driver, and another one is started
-[s]. The next head of this machine has another port."""
+"""Time that Ray looks for a lost head [s].
+
+Ray then ends the driver, and another driver starts. The next head of this machine has another port.
+"""
 
 RETRY_SECONDS = 1.0
 """Time between two attempts to connect [s]."""
@@ -28,7 +30,7 @@ RETRY_SECONDS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RayCluster:
-    """A cluster at an address, or the one whose head `run_head` runs in a directory."""
+    """A cluster at an address, or a cluster whose head `run_head` runs in a directory."""
 
     location: str | Path
     log: Path | None = None
@@ -41,7 +43,7 @@ class RayCluster:
             "RAY_ENABLE_AUTO_CONNECT": "0",
         }  # a late call starts no cluster
         if isinstance(self.location, Path):
-            # With 0, Ray does not take another address of this machine for loopback.
+            # With 0, Ray does not replace loopback by another address of this machine.
             os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
             os.environ["RAY_AUTH_TOKEN_PATH"] = str(self.location / "token")
             seconds = OWN_RECONNECT_SECONDS
@@ -75,11 +77,11 @@ class RayCluster:
                 time.sleep(RETRY_SECONDS)
 
     def describe_problem(self) -> str:
-        """Return what the files of a head that does not answer say, or the address."""
+        """Return the last line in the files of a head that does not answer, or the address."""
         if isinstance(self.location, str):
             return f"none answers at {self.location}"
         logs = self.location / "session_latest" / "logs"
-        # A head that does not even start its processes says why in its own output only.
+        # If a head does not even start its processes, only its own output gives the reason.
         paths = [logs / name for name in ("raylet.err", "raylet.out", "gcs_server.out")]
         for path in [*paths, *filter(None, [self.log])]:
             with contextlib.suppress(OSError):  # a head that starts again removes them
@@ -98,11 +100,11 @@ SETTINGS = {
     "RAY_event_stats": "0",
     "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
     "RAY_prestart_worker_first_driver": "0",
-    # Ray also starts so many for calls that wait, and they come too late
+    # Ray also starts as many processes for waiting calls, and they come too late
     "RAY_num_workers_soft_limit": "0",
-    # Blender takes seconds to start: idle processes stay
+    # Blender takes seconds to start, so idle processes stay
     "RAY_idle_worker_killing_time_threshold_ms": "86400000",
-    # small tasks cost less where Ray looks seldom
+    # small tasks cost less if Ray polls seldom
     "RAY_raylet_report_resources_period_milliseconds": "1000",
     "RAY_gcs_pull_resource_loads_period_milliseconds": "10000",
     "RAY_memory_monitor_refresh_ms": "1000",
@@ -126,7 +128,10 @@ def head_directory(data: Path) -> Path:
 
 
 OBJECT_STORE_BYTES = 128 * 2**20
-"""Memory for the objects of Ray [bytes]: tasks and results are small, and files go elsewhere."""
+"""Memory for the objects of Ray [bytes].
+
+Tasks and results are small, and files go elsewhere.
+"""
 
 AGENT_PORTS = (
     "dashboard-agent-listen-port",
@@ -140,7 +145,7 @@ AGENT_PORTS = (
 def run_head(directory: Path, cpus: int | None) -> None:
     """Run `ray start --head --block` on loopback, with a token.
 
-    Write `token` and `address` to a directory before.
+    Before the start, write `token` and `address` to the directory.
     """
     shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
     directory.mkdir(exist_ok=True)
@@ -168,7 +173,7 @@ def run_head(directory: Path, cpus: int | None) -> None:
 
 
 def _free_ports(count: int) -> list[int]:
-    """Return ports of loopback on which nothing listens."""
+    """Return free ports of loopback."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [int(listening.getsockname()[1]) for listening in sockets]
     for listening in sockets:
@@ -177,14 +182,15 @@ def _free_ports(count: int) -> list[int]:
 
 
 def _prepare_raylet(agent_port: int) -> None:
-    """Let `ray start` of this process tell the raylet a port, and end with the raylet.
+    """Let `ray start` of this process give a port to the raylet, and end with the raylet.
 
-    Ray has no public way for either, so its private function that starts processes is wrapped:
+    Ray has no public way for either, so this function wraps Ray's private function that starts
+    processes:
 
-    - The raylet waits 15 s for a Python process of its own to tell its ports, and aborts then
+    - The raylet waits 15 s for the ports of its Python process, and then aborts
       (ray-project/ray#65983). It does not wait for ports that it knows already. `ray start` passes
-      all of them on but this one.
-    - A raylet that has lost an agent exits with 0, which `--block` takes for an ordinary end.
+      on all of them except this one.
+    - A raylet that has lost an agent exits with 0. `--block` takes this for an ordinary end.
     """
     from ray._private import services
 
@@ -197,7 +203,7 @@ def _prepare_raylet(agent_port: int) -> None:
             [*command, f"--dashboard_agent_listen_port={agent_port}"], *arguments, **options
         )
 
-        # This process ends with the raylet, and the kernel ends its other children then.
+        # This process ends with the raylet, and the kernel then ends its other children.
         def end_with_raylet() -> None:
             os._exit(raylet.process.wait() or 1)
 

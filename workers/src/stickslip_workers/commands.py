@@ -37,8 +37,8 @@ from stickslip_workers.stages.run import failed, run_tasks
 
 log = logging.getLogger(__name__)
 
-# Runs in Blender's interpreter. The answer goes to a file: Blender writes to standard output what
-# it likes.
+# This script runs in Blender's interpreter. The answer goes to a file, because Blender also writes
+# to standard output.
 _RENDER = """
 import importlib, json, sys
 factory, store, task, answer = sys.argv[1:]
@@ -68,19 +68,23 @@ def replay(
 
 
 FRAMES = 24
-"""Of the animation."""
+"""Number of frames of the animation."""
 
 
 def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list[str]:
     """Draw the start and the motions of a scene.
 
-    Return the names of the pictures: of each camera, and an animation.
+    Return the names of the pictures: one of each camera, and an animation.
 
-    Cloth is not simulated: it stays as it starts. A sheet that starts hung is drawn flat.
+    Cloth is not simulated: it stays as it starts. A sheet with a hung start is drawn flat.
 
-    `store` has the files that it names; `out`, a directory, is made where it does not exist. Raises
-    ValueError, whose message begins with the place of the wrong value, OSError, or RuntimeError
-    where the drawing failed.
+    `store` has the files that the scene names. `out` is a directory, and is made if it does not
+    exist.
+
+    Raises:
+        ValueError: The message begins with the place of the wrong value.
+        OSError: A file cannot be read or written.
+        RuntimeError: The drawing failed.
     """
     given = scene.looks.cameras
     views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
@@ -141,8 +145,8 @@ Say = Callable[[str], None]
 def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     """Certify a preset: write `certificate.json` into `out`.
 
-    A protocol that raises has not passed; the others run all the same. Raises ValueError for an
-    unknown preset.
+    A protocol that raises has not passed, and the other protocols still run. Raises ValueError for
+    an unknown preset.
     """
     if preset not in protocols.CERTIFICATION:
         raise ValueError(
@@ -165,7 +169,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
                 )
             report = ProtocolReport.model_validate(document)
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
-        # Any error becomes part of the certificate, and the other protocols run all the same.
+        # Any error becomes part of the certificate, and the other protocols still run.
         except Exception as error:
             log.exception("the protocol %s broke off", name)
             report = _broken_off(name, error)
@@ -191,7 +195,7 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
 
 
 def verdict(report: ProtocolReport) -> str:
-    """Return one line that says whether a protocol passed, and by how much."""
+    """Return one line with the verdict on a protocol and its largest error."""
     if report.message:
         return f"broke off: {report.message}"
     error = "infinite" if report.error is None else f"{report.error:.1e}"

@@ -28,33 +28,37 @@ SHORT_TIMEOUT = httpx.Timeout(30, connect=5)
 LONG_TIMEOUT = httpx.Timeout(300, connect=5)
 """Timeout of a lease and a report [s].
 
-For a version of a million samples, the coordinator lists or checks all files."""
+For a version of a million samples, the coordinator lists or checks all files.
+"""
 
 REPORTS_A_REQUEST = 512
-"""The most results in a request: a few MB, which the coordinator stores in one transaction."""
+"""The most results in a request.
+
+They take a few MB, and the coordinator stores them in one transaction.
+"""
 
 REPORT_SECONDS = 1.0
-"""How long a result waits for others to be reported with, while there is other work [s]."""
+"""Time that a result waits for other results, while the dispatcher has other work [s]."""
 
 HEARTBEATS_A_LEASE = 3
 """Heartbeats in the duration of a lease: two may be lost before it ends."""
 
 START_BEAT_SECONDS = 2.0
-"""Time between two heartbeats of a dispatcher that starts, which tell how far it is [s]."""
+"""Time between two heartbeats of a starting dispatcher, which report its progress [s]."""
 
 LAST_BEAT_SECONDS = 5.0
-"""Time limit of a heartbeat in progress when the thread is stopped."""
+"""Time limit of a heartbeat in progress after a stop of the thread [s]."""
 
 
 class CoordinatorError(Exception):
     """The coordinator refuses this dispatcher.
 
-    A newer one has its name, or a request would fail every time.
+    For example, a newer dispatcher has its name, or a request would fail every time.
     """
 
 
 class UnreachableError(CoordinatorError):
-    """No answer, or an answer that asks for another attempt later."""
+    """The coordinator gave no answer, or asked for another attempt later."""
 
 
 class UnknownWorkerError(UnreachableError):
@@ -70,7 +74,7 @@ def pinned(certificate: Path) -> ssl.SSLContext:
 
 
 class CoordinatorClient:
-    """Client of the worker API. Thread-safe."""
+    """Client of the worker API. It is thread-safe."""
 
     def __init__(
         self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None
@@ -78,11 +82,12 @@ class CoordinatorClient:
         headers = {"Content-Type": "application/json"}
         if key is not None:
             headers["Authorization"] = f"Bearer {key}"
-        # trust_env=False: the coordinator is not reached through a proxy of the environment.
+        # trust_env=False: the client does not reach the coordinator through a proxy of the
+        # environment.
         verify = True if tls_certificate is None else pinned(tls_certificate)
         self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
         self._urls = deque(url.rstrip("/") for url in urls)
-        """Of coordinators with one database; the first one is asked."""
+        """URLs of coordinators with one database. The client asks the first one."""
 
     def register(self, registration: api.WorkerRegistration) -> api.WorkerSession:
         """Open a session; raise CoordinatorError."""
@@ -117,7 +122,7 @@ class CoordinatorClient:
                 url + path, content=document.model_dump_json(), timeout=timeout
             )
         except httpx.TransportError as error:
-            # The next one is asked, unless another thread has turned from this one already.
+            # Ask the next URL, unless another thread has already turned away from this one.
             if self._urls[0] == url:
                 self._urls.rotate(-1)
             raise UnreachableError(f"{url}{path}: {type(error).__name__}: {error}") from error
@@ -144,7 +149,7 @@ class Backoff:
         """Earliest time of the next attempt, on the monotonic clock [s]."""
 
     def failed(self) -> float:
-        """Record a failure and double the wait; return it [s]."""
+        """Record a failure and double the wait; return the time until the next attempt [s]."""
         delay = self._delay * random.uniform(0.5, 1.0)
         self._delay = min(2 * self._delay, self._most)
         self.next_try = time.monotonic() + delay
@@ -157,12 +162,15 @@ class Backoff:
 
 
 class Outbox:
-    """The results that wait to be reported, by task. `LeaseTable` locks it."""
+    """The results that wait for a report, by task.
+
+    `LeaseTable` locks it.
+    """
 
     def __init__(self) -> None:
         self._reports: dict[str, api.Report] = {}
         self.report_at = math.inf
-        """When to report at the latest, on the monotonic clock [s]; inf without a result."""
+        """Latest time of the next report, on the monotonic clock [s]; inf without a result."""
 
     def put(self, report: api.Report) -> None:
         """Add a report, in place of an older one of the same task."""
@@ -170,7 +178,7 @@ class Outbox:
         self._reports[report.task_id] = report
 
     def drop(self, task_id: str) -> None:
-        """Remove the report of a task, if there is one."""
+        """Remove the report of a task, if it exists."""
         self._reports.pop(task_id, None)
 
     def has_report(self, task_id: str) -> bool:
@@ -178,12 +186,15 @@ class Outbox:
         return task_id in self._reports
 
     def reports(self) -> tuple[api.Report, ...]:
-        """Return all reports that wait."""
+        """Return all waiting reports."""
         return tuple(self._reports.values())
 
 
 class LeaseTable:
-    """The leases that the dispatcher holds, and the outbox of their results. Thread-safe."""
+    """The leases that the dispatcher holds, and the outbox of their results.
+
+    It is thread-safe.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -192,17 +203,17 @@ class LeaseTable:
 
     @property
     def report_at(self) -> float:
-        """When to report at the latest, on the monotonic clock [s]; inf without a result."""
+        """Latest time of the next report, on the monotonic clock [s]; inf without a result."""
         return self._outbox.report_at
 
     def add(self, leases: Iterable[api.Lease]) -> None:
-        """Add leases; they take the place of older ones of the same tasks."""
+        """Add leases; they replace older ones of the same tasks."""
         with self._lock:
             for lease in leases:
                 self._states[lease.task_id] = api.LeaseState(
                     task_id=lease.task_id, token=lease.token, started=False
                 )
-                # A result of the older lease would be refused as stale.
+                # The coordinator would refuse a result of the older lease as stale.
                 self._outbox.drop(lease.task_id)
 
     def update(self, leases: Iterable[api.Lease], **changes: object) -> None:
@@ -215,7 +226,7 @@ class LeaseTable:
                     )
 
     def put_result(self, lease: api.Lease | api.LeaseState, result: TaskResult | None) -> None:
-        """Put the result of a lease that is still held, or its return, into the outbox."""
+        """Put the result of a held lease, or its return, into the outbox."""
         with self._lock:
             if self.holds(lease):
                 self._outbox.put(
@@ -223,7 +234,10 @@ class LeaseTable:
                 )
 
     def return_unfinished(self, *, started: bool) -> None:
-        """Return the leases that have no result, those of started tasks only if `started`."""
+        """Return the leases without a result.
+
+        Leases of started tasks are returned only if `started` is true.
+        """
         for state in self.states():
             is_returned = started or not state.started
             if is_returned and not self._outbox.has_report(state.task_id):
@@ -243,7 +257,7 @@ class LeaseTable:
         self._outbox.report_at = math.inf
 
     def holds(self, lease: api.Lease | api.LeaseState | api.Report) -> bool:
-        """Return whether a lease is held, and no newer one of its task."""
+        """Return whether the dispatcher holds a lease, and no newer one of its task."""
         state = self._states.get(lease.task_id)
         return state is not None and state.token == lease.token
 
@@ -253,7 +267,7 @@ class LeaseTable:
             return tuple(self._states.values())
 
     def reports(self) -> tuple[api.Report, ...]:
-        """Return the results that wait to be reported."""
+        """Return the results that wait for a report."""
         with self._lock:
             return self._outbox.reports()
 
@@ -275,17 +289,17 @@ class Session(threading.Thread):
         self._worker_id = ""
         self._interval = 0.0
         self._requested_sessions = 1
-        """How many sessions there should have been."""
+        """Number of sessions requested so far."""
         self._open_session = 0
-        """The number of the session that is open; 0 before the first."""
+        """Number of the open session; 0 before the first."""
         self._ended = False
         self._wake = threading.Event()
         self.error: CoordinatorError | None = None
-        """Why the coordinator refuses this dispatcher."""
+        """Error of a coordinator that refuses this dispatcher."""
 
     @property
     def worker_id(self) -> str | None:
-        """The worker that this dispatcher is to the coordinator; None while no session is open."""
+        """ID of this dispatcher at the coordinator; None without an open session."""
         if self.error is not None:
             raise self.error
         is_open = self._open_session == self._requested_sessions
@@ -294,7 +308,7 @@ class Session(threading.Thread):
     def register_again(self) -> None:
         """Register anew at the next heartbeat.
 
-        The coordinator does not know the session, or the dispatcher has more to say about itself.
+        The coordinator does not know the session, or the dispatcher has new facts to register.
         """
         self._requested_sessions += 1
         self._wake.set()
@@ -308,13 +322,13 @@ class Session(threading.Thread):
         if dropped:
             log.info("dropping %d tasks", len(dropped))
             self.leases.remove(state for state in states if state.task_id in dropped)
-        # People watch a worker that starts, so it tells more often how far it is.
+        # People watch a starting worker, so it reports its progress more often.
         if condition.state == "ready":
             return self._interval
         return min(START_BEAT_SECONDS, self._interval)
 
     def report(self, worker_id: str) -> bool:
-        """Send all results that wait; return whether there were any."""
+        """Send all waiting results; return whether any waited."""
         reports = self.leases.reports()
         for first in range(0, len(reports), REPORTS_A_REQUEST):
             batch = reports[first : first + REPORTS_A_REQUEST]
@@ -329,11 +343,11 @@ class Session(threading.Thread):
         return bool(reports)
 
     def wake_heartbeat(self) -> None:
-        """Send the next heartbeat at once: the coordinator should know how the dispatcher is."""
+        """Send the next heartbeat at once, so that the coordinator learns the condition."""
         self._wake.set()
 
     def close(self) -> None:
-        """End the session: return all leases and say why, if the coordinator answers."""
+        """End the session: return all leases and send the condition, if the coordinator answers."""
         self.leases.return_unfinished(started=True)
         with contextlib.suppress(CoordinatorError):
             worker_id = self.worker_id
@@ -360,7 +374,7 @@ class Session(threading.Thread):
             except UnreachableError as error:
                 log.warning("the coordinator is away: %s", error)
                 wait = backoff.failed()
-            # The dispatcher finds it in `error`, which `worker_id` raises.
+            # The dispatcher finds the error in `error`, and `worker_id` raises it.
             except CoordinatorError as error:
                 log.exception("the coordinator refuses this dispatcher")
                 self.error = error
@@ -371,9 +385,9 @@ class Session(threading.Thread):
     def _open(self) -> None:
         """Register.
 
-        The leases of an earlier session are lost; the coordinator gives their tasks out again.
+        The leases of an earlier session are lost. The coordinator leases their tasks again.
         """
-        # Another thread may ask for yet another session meanwhile, which is opened next.
+        # Another thread may request yet another session meanwhile. That session is opened next.
         requested = self._requested_sessions
         session = self._coordinator.register(self._registration())
         self.leases.remove(self.leases.states())

@@ -1,12 +1,12 @@
-"""How fast this machine is: a short drag of cloth, timed on some of its CPUs at the same time.
+"""The speed of this machine: a short drag of cloth, timed on some of its CPUs at the same time.
 
-The packaged costs of specs are CPU seconds of the machine that `REFERENCE_CPU_SECONDS` was measured
-on. Two numbers carry them over to another machine:
+The packaged costs of specs are CPU seconds of a reference machine, on which `REFERENCE_CPU_SECONDS`
+was measured. Two numbers convert them to another machine:
 
     cpu_speed     = REFERENCE_CPU_SECONDS / CPU seconds of the drag here
     cpu_available = CPU seconds of the drag here / its wall time
 
-The second one is below 1 if a quota or other programs leave less than a CPU to each process.
+The second number is below 1 if a quota or other programs leave less than a CPU to each process.
 
     python -m stickslip_workers.machine     runs the drag and prints its times as JSON
 """
@@ -28,36 +28,44 @@ from stickslip_schemas.plan.costs import MachineSpeed
 log = logging.getLogger(__name__)
 
 REFERENCE_CPU_SECONDS = 0.235
-"""CPU time of the drag on the machine of the packaged costs [s]: one core of a virtual AMD EPYC
-with AVX-512, benchmarks/results/job-costs.json."""
+"""CPU time of the drag on the machine of the packaged costs [s].
+
+The machine is one core of a virtual AMD EPYC with AVX-512, benchmarks/results/job-costs.json.
+"""
 
 DRAG_VERTICES = 11
 DRAG_SECONDS = 10.0
-"""Mesh and duration [s] of the drag: long enough to time, and two of them take a second of CPU."""
+"""Mesh and duration [s] of the drag.
+
+It is long enough to time, and two drags take a second of CPU.
+"""
 
 MAX_PROCESSES = 2
-"""Drags at the same time: a quota shows with two, and the measurement stays below 2 CPU s."""
+"""Number of drags at the same time.
+
+A quota shows with two, and the measurement stays below 2 CPU s.
+"""
 
 TIMEOUT_SECONDS = 60.0
-"""A machine that is so slow that the drag takes longer is not measured [s]."""
+"""Limit of the drag [s]. A slower machine is not measured."""
 
 
 class StoredSpeed(Document):
-    """A measured speed, and the machine that it is of."""
+    """A measured speed, and its machine."""
 
     machine: str
     speed: MachineSpeed
 
 
 class DragTimes(Document):
-    """What the drag took in one process [s]."""
+    """Times of the drag in one process [s]."""
 
     cpu_seconds: Float
     wall_seconds: Float
 
 
 def machine_name() -> str:
-    """Return a text that changes when the CPUs do: their model, number and quota."""
+    """Return a text that changes with the CPUs: their model, number and quota."""
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -73,10 +81,10 @@ def machine_name() -> str:
 
 
 def _cpu_quota() -> str:
-    """Return the CPU quotas of this process's control groups, `max` if there is none."""
+    """Return the CPU quotas of this process's control groups, or `max` without a quota."""
     quotas = []
     for folder in _control_groups():
-        # Version 2 has a file with quota and period, version 1 has the quota [us] alone.
+        # Version 2 has a file with quota and period. Version 1 has a file with only the quota [us].
         for name, unlimited in (("cpu.max", "max"), ("cpu.cfs_quota_us", "-1")):
             try:
                 text = (folder / name).read_text(encoding="ascii").strip()
@@ -90,8 +98,8 @@ def _cpu_quota() -> str:
 def _control_groups() -> Iterator[Path]:
     """Yield the folders of the control groups that may limit the CPU time of this process.
 
-    A group's quota holds for the groups below it, too. `/proc/self/cgroup` has a line
-    `number:controllers:group` for each hierarchy; in version 2 the controllers are empty.
+    A group's quota also holds for the groups below it. `/proc/self/cgroup` has a line
+    `number:controllers:group` for each hierarchy. In version 2, the controllers are empty.
     """
     try:
         mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8").splitlines()
@@ -123,9 +131,9 @@ def speed_file() -> Path:
 
 
 def machine_speed(file: Path, slots: int) -> MachineSpeed:
-    """Return the speed of this machine; measure it if `file` has none or that of another machine.
+    """Return the speed of this machine; measure it if `file` does not have it.
 
-    A machine that cannot be measured counts as the reference machine; the log says why.
+    A machine that cannot be measured counts as the reference machine, and the log gives the reason.
     """
     name = machine_name()
     try:
@@ -171,7 +179,7 @@ def measure_speed(processes: int) -> MachineSpeed:
 
 
 def drag() -> DragTimes:
-    """Drop and drag a coarse cloth for a short time, and return what that took."""
+    """Drop and drag a coarse cloth for a short time, and return the times."""
     from stickslip_sim_core.scenes import cloth_drag
 
     frames = round(DRAG_SECONDS * cloth_drag.FRAME_RATE) + 1

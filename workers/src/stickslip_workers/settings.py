@@ -14,34 +14,45 @@ RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Options of a dispatcher. Times are in seconds."""
+    """Options of a dispatcher.
+
+    Times are in seconds.
+    """
 
     urls: tuple[str, ...]
-    """Base URLs of coordinators with one database: the next one is asked where one does not answer.
+    """Base URLs of coordinators with one database.
+
+    If one does not answer, the dispatcher asks the next one.
     """
     store: str
     """Place of the store, see `store_place`. A directory is the same on every node."""
     name: str
-    """Name of this dispatcher; a second one of the same name takes the first one's place."""
+    """Name of this dispatcher. A second dispatcher with the same name replaces the first one."""
     key: str | None = None
-    """What the coordinator wants to be shown by workers; None if it wants nothing."""
+    """Key of the coordinator's worker API, or None if the coordinator wants no key."""
     tls_certificate: Path | None = None
-    """Certificate of the coordinator, trusted by itself; None: the usual check of certificates."""
+    """Certificate of the coordinator.
+
+    The dispatcher trusts exactly this certificate. None stands for the usual check of certificates.
+    """
     max_cpus: int | None = None
-    """The most CPUs of the Ray cluster to use at once; by default as many as there are, and what it
-    may grow by.
+    """The most CPUs of the Ray cluster to use at once.
+
+    By default, the dispatcher uses all CPUs, and submits more calls so that the cluster may grow.
     """
 
     blender_python: Path = field(default_factory=lambda: default_blender_python())
     render_device: str = field(default_factory=lambda: os.environ.get(RENDER_DEVICE) or CPU)
-    """What Cycles computes on: `cpu`, or a sort of GPU."""
+    """Device of Cycles: `cpu`, or a sort of GPU."""
     render_gpus: float = 1.0
-    """GPUs that a render process takes of those of Ray, where it computes on one; fractions share a
-    GPU.
+    """GPUs of Ray that a render process takes if it computes on a GPU.
+
+    Fractions share a GPU.
     """
     render_actor: str = RENDER_ACTOR
-    """Class, in the Blender interpreter, that is made with the root of the store and has `describe`
-    and `render`.
+    """Class in the Blender interpreter, with the methods `describe` and `render`.
+
+    Its constructor takes the root of the store.
     """
 
     exec_seconds: dict[Stage, float] = field(
@@ -52,16 +63,19 @@ class Settings:
             Stage.publish: 3600,
         }
     )
-    """Limit of one task, or batch of simulations, by stage; then its process is killed. Cloth takes
-    minutes, and hours with the thesis's time steps."""
+    """Limit of one task, or batch of simulations, by stage.
+
+    After the limit, the process is killed. Cloth takes minutes, and hours with the thesis's time
+    steps.
+    """
     clog_seconds: float = 10
-    """With all CPUs taken for longer than this, tasks that take less go on beside them."""
+    """If calls occupy all CPUs for longer than this, shorter tasks run beside them."""
     start_seconds: float = 120
-    """The coordinator hears of a call that Ray has not started for longer, with CPUs free."""
+    """Wait of a call for its start, with CPUs free, before the coordinator gets a report."""
     stop_seconds: float = 8
-    """How long running work may go on after SIGTERM."""
+    """Time that running work may continue after SIGTERM."""
 
 
 def default_blender_python() -> Path:
-    """Return the interpreter of the Blender environment beside the running one."""
+    """Return the interpreter of the Blender environment beside the running environment."""
     return Path(sys.prefix).parent / ".venv-blender" / "bin" / "python"

@@ -1,1 +1,4 @@
-"""Render stickslip's simulations with headless Blender. The only distribution that imports bpy."""
+"""Render the simulations of stickslip with headless Blender.
+
+No other distribution imports bpy.
+"""

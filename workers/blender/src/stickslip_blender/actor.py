@@ -1,8 +1,9 @@
-"""The object in a render process: render tasks in, results out, both as JSON.
+"""The object in a render process takes render tasks and returns results, both as JSON.
 
-It knows neither Ray nor any kind: the module of the kind renders. A fault of the sample gives a
-rejection; any other error is raised, and the owner of the process handles it. Results are published
-by renaming whole files, so a crash of Blender leaves no partial result.
+It depends on neither Ray nor any kind, because the module of the kind renders. A fault of the
+sample gives a rejection. The actor raises any other error, and the owner of the process handles it.
+The actor publishes a result by renaming whole files, so a crash of Blender leaves no partial
+result.
 """
 
 import time
@@ -20,16 +21,16 @@ from stickslip_blender.render_context import RenderContext, build_digest, check_
 class RenderActor:
     """Renders samples from the store into the store.
 
-    One per process, because Blender holds one scene.
+    A process has one actor, because Blender holds one scene.
     """
 
     def __init__(self, store_root: str) -> None:
         self._context = RenderContext(store_root)
 
     def describe(self) -> dict[str, Any]:
-        """Return the build of each kind, and versions.
+        """Return the build of each kind, and the versions.
 
-        They are equal in all processes of one installation.
+        All processes of one installation return equal answers.
         """
         return {
             "builds": {kind: build_digest(kind) for kind in KINDS},
@@ -53,9 +54,9 @@ class RenderActor:
 def renders(kind: str) -> Callable[[Any, RenderTask, RenderContext], TaskResult]:
     """Return the function that renders a kind.
 
-    It takes the render document, its task and a context, and returns a result.
+    The function takes the render document, its task and a context, and returns a result.
 
-    Raises UnknownKindError where the contract does not have the kind.
+    Raises UnknownKindError if the contract does not have the kind.
     """
     kind_named(kind)
     render: Callable[[Any, RenderTask, RenderContext], TaskResult] = import_module(

@@ -1,10 +1,10 @@
-"""Drawings of a scene before it is simulated.
+"""Drawings of a scene before its simulation.
 
-They show the starts of all parts, and how bodies and holders move.
+They show the starts of all parts, and the motion of bodies and holders.
 
 `python -m stickslip_blender.preview RECORD.npz SCENE.json DIR` writes `CAMERA.png` of the start and
-`motion.webp`, all cameras side by side. The record has the arrays of `cloth_scene` that the cameras
-and bodies need; no light is traced.
+`motion.webp`, which has all cameras side by side. The record has the arrays of `cloth_scene` that
+the cameras and bodies need. The drawing traces no light.
 """
 
 import json
@@ -25,7 +25,7 @@ from stickslip_blender.cloth.textures import custom_texture, texture_image
 from stickslip_blender.raster import Window, projected, scaled, see
 
 SIDE = 320
-"""Of a picture [px]."""
+"""Side of a picture [px]."""
 _SHARPNESS = 2  # samples across a pixel
 _LIGHT = np.array([0.35, -0.45, 0.82])
 _DIFFUSE = 0.6
@@ -46,10 +46,12 @@ Array = npt.NDArray[Any]
 def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> list[str]:
     """Draw a scene; return the names of the pictures.
 
-    Args: scene: `scene`: `Staged`, as JSON; `sheet`: the sheet that takes the texture; `segments`:
-        names of the codes; `cameras`: those of the scene, as JSON, none where cameras frame what
-        moves. Files are paths. record: Arrays of the scene at the instants of the animation. out:
-        Directory for the pictures.
+    Args:
+        scene: Four entries. `scene`: `Staged`, as JSON, with paths of files. `sheet`: the sheet that
+            takes the texture. `segments`: names of the codes. `cameras`: cameras of the scene, as JSON,
+            or none if cameras frame everything that moves.
+        record: Arrays of the scene at the instants of the animation.
+        out: Directory for the pictures.
     """
 
     def picture(name: str) -> npt.NDArray[np.uint8]:
@@ -78,7 +80,7 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
 def _colors(geometry: Geometry) -> Array:
     """Return the colour of each triangle (T, 3), sRGB from 0 to 1.
 
-    A triangle of a sheet has the colour of its picture in its middle.
+    A triangle of a sheet has the colour of the picture at the middle of the triangle.
     """
     corners = geometry.uv[geometry.triangles].mean(axis=1)
     squares = np.floor(_SQUARES * corners).astype(int).sum(axis=1) % 2
@@ -123,9 +125,9 @@ def _drawn(
 def _floor(
     geometry: Geometry, points: Array, camera: Camera, shape: tuple[int, ...], light: Array
 ) -> Array:
-    """Return how bright each sample of the background is.
+    """Return the brightness of each sample of the background.
 
-    It is the sky, or the floor with its lines and shadows.
+    The background is the sky, or the floor with its lines and shadows.
     """
     height = geometry.surroundings.floor
     if height is None:
@@ -136,7 +138,7 @@ def _floor(
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.where(ray[..., 2] < 0.0, (height - camera.position[2]) / ray[..., 2], np.inf)
         place = camera.position[:2] + depth[..., None] * ray[..., :2]
-        # Distance from the nearest line, along each axis of the floor.
+        # Find the distance from the nearest line, along each axis of the floor.
         distance = np.abs((place + 0.5 * _LINE_DISTANCE) % _LINE_DISTANCE - 0.5 * _LINE_DISTANCE)
         lines = (distance < _LINE_WIDTH).any(axis=-1)
     shadow = points - (points[:, 2:] - height) / light[2] * light

@@ -1,6 +1,6 @@
 """Services for the scenes of all kinds.
 
-They are the build, records and pictures in the store, and a renderer at a time.
+They give a build, records and pictures in the store, and one renderer at a time.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ if TYPE_CHECKING:  # content keys hold whole documents; the modules that define 
     from stickslip_schemas.spec.jobs import Render
 
 ShadingArray = npt.NDArray[np.float16]
-"""A shading: linear, (frames, FINE height, FINE width, 3), at the albedos of `shading.SHOWN` as
-channels.
+"""A linear shading, shape (frames, FINE height, FINE width, 3).
+
+The channels belong to the albedos of `shading.SHOWN`.
 """
 
 FRAME_MARGIN = 1.0
@@ -46,7 +47,7 @@ Array = npt.NDArray[Any]
 
 
 def roots(kind: str) -> tuple[str, ...]:
-    """Return the modules that the build of a kind's renderer begins with."""
+    """Return the modules that start the build of a kind's renderer."""
     return ("stickslip_blender.actor", f"stickslip_blender.scenes.{kind}")
 
 
@@ -54,7 +55,7 @@ def roots(kind: str) -> tuple[str, ...]:
 def build_digest(kind: str) -> str:
     """Return the SHA-256 over the sources that render a kind, and versions.
 
-    No path, time or machine is part of it.
+    No path, time or host name is part of it.
     """
     content = {
         "kind": kind,
@@ -70,21 +71,24 @@ def build_digest(kind: str) -> str:
 class RenderContext:
     """Reads records and publishes pictures.
 
-    It keeps the last record and, because Blender holds one scene per process, one renderer: several
+    It keeps the last record and one renderer, because Blender holds one scene per process. Several
     tasks share them.
     """
 
     def __init__(self, store: str) -> None:
         self.store = open_store(store)
         self.shadings: OrderedDict[str, ShadingArray] = OrderedDict()
-        """The last shadings of cloth, by key; clips that differ only in their texture share one."""
+        """The last shadings of cloth, by key.
+
+        Clips that differ only in their texture share a shading.
+        """
         self._renderer: tuple[object, Any] | None = None
         self._records: tuple[str, dict[str, Array]] = ("", {})
 
     def kept_shading(self, key: str) -> bytes | None:
         """Return a shading that any process kept in the store.
 
-        None if there is none, or a damaged one.
+        Return None for a missing or damaged shading.
         """
         path = self._shading_path(key)
         if path is None:
@@ -99,11 +103,10 @@ class RenderContext:
         return body if hashlib.sha256(body).digest() == digest else None
 
     def keep_shading(self, key: str, data: bytes) -> None:
-        """Keep a shading in the store for textures to come.
+        """Keep a shading in the store for later textures.
 
-        The oldest are deleted where all take too much room.
-
-        No result depends on it; if it cannot be written, it is rendered again.
+        If the shadings exceed SHADING_BYTES, the oldest are deleted. No result depends on a kept
+        shading: if it cannot be written, it is rendered again.
         """
         path = self._shading_path(key)
         if path is None:
@@ -149,7 +152,7 @@ class RenderContext:
 
 
 def check_rig(render: Render) -> None:
-    """Raise a ValueError if the cameras of a render document are not those of this installation."""
+    """Raise ValueError if a render document has other cameras than this installation."""
     if render.rig is not None and render.rig_digest != rig_digest(render.rig):
         raise ValueError(
             f"render.rig_digest must be that of {render.rig} here, {rig_digest(render.rig)}; got "
@@ -160,9 +163,9 @@ def check_rig(render: Render) -> None:
 def why_unfit(
     what: str, points: Array, radius: float, cameras: tuple[Camera, ...]
 ) -> TaskResult | None:
-    """Return why points (..., 3) are rejected, or None.
+    """Return a rejection of points (..., 3) that cannot be rendered, or None.
 
-    They are not finite, or leave the frame of a camera.
+    Such points are not finite, or they leave the frame of a camera.
     """
     if not np.isfinite(points).all():
         return rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")

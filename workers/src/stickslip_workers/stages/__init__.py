@@ -1,4 +1,4 @@
-"""What the stages do, as functions from a task and a store to an output.
+"""The work of the stages, as functions from a task and a store to an output.
 
-No Ray and no coordinator here.
+The functions use no coordinator and start no Ray calls.
 """

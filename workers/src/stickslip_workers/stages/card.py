@@ -19,13 +19,13 @@ from stickslip_schemas.spec.jobs import JobSpec
 CARD_NAME = "README.md"
 PREVIEW_NAME = "preview.webp"
 SHOWN_VALUES = 12
-"""Values of an axis that the card lists, at most."""
+"""The most values of an axis that the card lists."""
 
 SHOWN_SAMPLES = 12
-"""Samples in the preview, at most."""
+"""The most samples in the preview."""
 
 FRAMES = 20
-"""Instants in the preview, at most."""
+"""The most instants in the preview."""
 
 _COLUMNS = 4
 _SIDE = 120
@@ -35,7 +35,7 @@ _SIDE = 120
 def card(manifest: Manifest) -> bytes:
     """Return the card of a version.
 
-    It says what the version holds, how it was made, and how to read, check and cite it.
+    It describes the contents of the version and their making, and how to read, check and cite it.
     """
     spec = manifest.spec
     name = f"{manifest.dataset}:v{manifest.version}"
@@ -177,7 +177,7 @@ def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def pictured(spec: JobSpec) -> ArrayLayout | None:
-    """Return the array that a dataset of `spec` is best seen by; None if it has no pictures."""
+    """Return the array that shows a dataset of `spec` best; None if it has no pictures."""
     seen = (
         array
         for array in layout(spec)
@@ -191,9 +191,8 @@ def preview(
 ) -> bytes | None:
     """Return a WebP of valid slots, evenly spread, with the values of their axes.
 
-    None where none is valid.
-
-    `chunk` returns the encoded chunk of a slot. A clip moves; of several views, the first is shown.
+    Return None without a valid slot. `chunk` returns the encoded chunk of a slot. A clip moves. A
+    sample of several views shows the first view.
     """
     if not valid:
         return None

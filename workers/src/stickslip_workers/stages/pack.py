@@ -1,7 +1,7 @@
 """Pack: the files of one shard group, one for each array.
 
-They are byte for byte those of zarr-python. Labels are no files yet: the task that publishes writes
-those of many shard groups into one file.
+They are byte for byte the files of zarr-python. Labels are not files yet: the task that publishes
+writes the labels of many shard groups into one file.
 """
 
 import numpy as np
@@ -47,15 +47,18 @@ def _check_slots(task: PackTask) -> None:
 
 
 class _Shard:
-    """A shard group, filled sample by sample; a record has megabytes and is read once."""
+    """A shard group, filled sample by sample.
+
+    A record has megabytes and is read once.
+    """
 
     def __init__(self, task: PackTask, store: Store) -> None:
         self._store = store
         self._records = Records(store)
         self._arrays = layout(task.spec)
         size = task.spec.samples_per_shard
-        # A sample that is not there has no chunk; in a column, it keeps the fill value, for a chunk
-        # is always whole.
+        # A missing sample has no chunk. In a column it keeps the fill value, because a chunk is
+        # always whole.
         self._chunks: dict[str, list[bytes | None]] = {
             array.name: [None] * size for array in self._arrays if array.per_sample
         }
@@ -84,7 +87,7 @@ class _Shard:
                 self._chunks[array.name][row] = self._rendered(array, slot)
 
     def _check_labels(self, slot: PackSlot) -> None:
-        """Raise a ValueError for a label without an array: it would be lost silently."""
+        """Raise ValueError for a label without an array: it would be lost silently."""
         columns = {
             array.name for array in self._arrays if not array.per_sample and not array.is_recorded
         }
@@ -143,7 +146,7 @@ def _record(slot: PackSlot) -> RecordRef:
 def _label(array: ArrayLayout, slot: PackSlot) -> npt.ArrayLike:
     """Return the value of a label.
 
-    A rejected slot has its parameters too; what no stage could add is fill.
+    A rejected slot also has its parameters. A label that no stage could add has the fill value.
     """
     if array.name == "valid":
         return slot.valid

@@ -69,8 +69,8 @@ def metadata_files(
             group, array, sample_count=sample_count, samples_per_file=spec.samples_per_file(array)
         )
     with warnings.catch_warnings():
-        # Not in the Zarr v3 text yet, but the only way to open a group over plain HTTP [zarr-specs
-        # #383].
+        # The Zarr v3 text does not have it yet, but it is the only way to open a group over plain
+        # HTTP [zarr-specs #383].
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(group.store)
     return {path: buffer.to_bytes() for path, buffer in files.items()}  # type: ignore[attr-defined]
@@ -107,17 +107,21 @@ def create_array(
 
 
 def publish(task: PublishTask, store: Store) -> PublishOutput:
-    """Make the shards a dataset version. Repeating it, also after a crash, gives the same bytes."""
+    """Turn the shards into a dataset version.
+
+    A repetition, even after a crash, gives the same bytes.
+    """
     parts = [PublishSection.model_validate_json(store.read(digest)) for digest in task.sections]
     _check_complete(task, parts, store)
     labels = _Labels(task, parts, store)
     metadata = metadata_files(
         task.spec, dataset=task.dataset, version=task.version, sample_count=labels.count
     )
-    # The group's metadata will have the digest of the manifest, so it is written after it.
+    # The group's metadata will have the digest of the manifest, so it is written after the
+    # manifest.
     group = metadata.pop(GROUP_NAME)
 
-    # What the shards do not hold already: labels, metadata and the preview.
+    # Store the files that the shards do not have: labels, metadata and the preview.
     files = labels.files()
     for path, data in metadata.items():
         files.append(_stored(store, path, data))
@@ -130,7 +134,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     manifest = _manifest(task, parts, labels, files, sections)
     files.append(_stored(store, CARD_NAME, card(manifest)))
     of_shards = [file for part in parts for file in part.files]
-    # With sections, these list the files of the shards.
+    # If the manifest has sections, they list the files of the shards.
     listed = files if sections else [*files, *of_shards]
     in_order = tuple(sorted(listed, key=lambda file: file.path))
     manifest = manifest.model_copy(update={"files": in_order})
@@ -153,7 +157,10 @@ def _manifest(
     files: Sequence[FileEntry],
     sections: tuple[FileEntry, ...],
 ) -> Manifest:
-    """Return the manifest; lists of samples are in the sections, if there are any."""
+    """Return the manifest.
+
+    If it has sections, they hold the lists of samples.
+    """
     rejections = [rejection for part in parts for rejection in part.rejections]
     counts = Counter(str(rejection.reason) for rejection in rejections)
     sample_keys = [key for part in parts for key in part.sample_keys]
@@ -185,7 +192,7 @@ class _Seal(NamedTuple):
     group: str
     """Digest of the group's metadata, which names the manifest."""
     size: int
-    """Of these and of the seal [bytes]."""
+    """Size of these files and of the seal [bytes]."""
 
 
 def _show(
@@ -203,7 +210,7 @@ def _show(
     group_with_digest = with_manifest_digest(group, digest)
     group_digest = store.publish(group_with_digest)
     seal = seal_text(digest, group_digest)
-    # A version with a manifest is complete, so nothing may follow it.
+    # A version with a manifest is complete, so no file may follow the manifest.
     store.show(group_digest, *version, GROUP_NAME)
     store.show(store.publish(seal), *version, SEAL_NAME)
     store.show(digest, *version, MANIFEST_NAME)
@@ -248,7 +255,7 @@ def _check_complete(task: PublishTask, parts: Sequence[PublishSection], store: S
 
 
 class _Labels:
-    """The labels of all samples, by name, from what the shards have."""
+    """The labels of all samples, by name, from the shards."""
 
     def __init__(self, task: PublishTask, parts: Sequence[PublishSection], store: Store) -> None:
         self.count = task.spec.sample_count
@@ -292,7 +299,7 @@ class _Labels:
 def _sections(
     task: PublishTask, parts: Sequence[PublishSection], store: Store
 ) -> tuple[FileEntry, ...]:
-    """Write the sections of the manifest; none where all of it has room in one file."""
+    """Write the sections of the manifest; none if the whole manifest fits into one file."""
     if not has_sections(task.spec):
         return ()
     size = section_samples(task.spec)
@@ -322,7 +329,10 @@ def _split_counts(labels: _Labels, rejections: Sequence[Rejection]) -> dict[str,
 
 
 def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
-    """Return how good the pictures are, as each clip was measured; None if it has none."""
+    """Return the quality of the pictures, from the measurement of each clip.
+
+    Return None if the version has no pictures.
+    """
     if pictured(task.spec) is None:
         return None
     valid = labels["valid"]
@@ -338,13 +348,13 @@ def _pictures(task: PublishTask, labels: _Labels) -> Pictures | None:
 
 
 def _psnr_by_region(labels: _Labels) -> dict[str, Psnr]:
-    """Return the PSNR of the valid clips in each region in which some were measured."""
+    """Return the PSNR of the valid clips in each region with a measurement."""
     valid = labels["valid"]
     psnr: dict[str, Psnr] = {}
     for number, region in enumerate(REGIONS):
         values = labels[f"psnr_{region}"][valid]
         deviations = labels["psnr_deviation"][valid, number]
-        # NaN: the clip was not measured.
+        # NaN marks a clip without a measurement.
         measured = np.isfinite(values)
         if not measured.any():
             continue
@@ -360,7 +370,7 @@ def _psnr_by_region(labels: _Labels) -> dict[str, Psnr]:
 def _preview(
     task: PublishTask, parts: Sequence[PublishSection], labels: _Labels, store: Store
 ) -> bytes | None:
-    """Return the picture of the version; None if nothing is rendered, or valid."""
+    """Return the picture of the version; None without pictures or valid samples."""
     array = pictured(task.spec)
     if array is None:
         return None
@@ -369,7 +379,7 @@ def _preview(
     index_bytes = shard_index_size(samples_per_shard)
 
     def read_chunk(slot: int) -> bytes:
-        # Only the index of a shard and one chunk are read: a shard may have gigabytes.
+        # Read only the index of a shard and one chunk, because a shard may have gigabytes.
         shard, row = divmod(slot, samples_per_shard)
         file = files[array.shard_path(shard)]
         tail = store.read(file.sha256, offset=file.size - index_bytes, length=index_bytes)

@@ -1,6 +1,6 @@
 """Run tasks in this process, simulations first of all.
 
-Exceptions become results here, and time is measured here.
+This module turns exceptions into results, and measures time.
 """
 
 import io
@@ -37,13 +37,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 frames: tuple[int, int] | None = None
-"""Frames done and frames in all of the simulation that runs in this process; None if none reports
-progress.
+"""Progress of the simulation in this process: frames done and frames in all.
+
+None stands for no simulation that reports progress.
 """
 MESSAGE_LENGTH = 2000
-"""Limit of the message of a result [characters]; the log has all of it."""
+"""Limit of the message of a result [characters].
+
+The log has the whole message.
+"""
 KEPT_BYTES = 256 * 2**20
-"""Of records that are kept in memory."""
+"""Size of the records that are kept in memory [bytes]."""
 
 Array = npt.NDArray[np.generic]
 
@@ -51,7 +55,7 @@ Array = npt.NDArray[np.generic]
 def encode_records(arrays: Mapping[str, Array]) -> bytes:
     """Return the file of `arrays`.
 
-    The same arrays give the same bytes: numpy dates every member 1980-01-01.
+    The same arrays give the same bytes, because numpy dates every member 1980-01-01.
     """
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
@@ -61,7 +65,8 @@ def encode_records(arrays: Mapping[str, Array]) -> bytes:
 class Records:
     """Reads records.
 
-    An artifact that several slots share is read and checked once, while it is among the last ones.
+    An artifact that several slots share is read and checked once, as long as the memory has room
+    for it.
     """
 
     def __init__(self, store: Store, *, kept_bytes: int = KEPT_BYTES) -> None:
@@ -122,8 +127,8 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
     wall_begin = time.perf_counter()
     try:
         results = _run(tasks, store)
-    # Nothing that a task raises may end this process. It is logged with its traceback, and reported
-    # with the task, which a replay runs again.
+    # No error of a task may end this process. The log has its traceback, and the result reports it
+    # with the task. A replay runs the task again.
     except Exception as error:
         log.exception("%s of %d tasks failed", tasks[0].stage, len(tasks))
         results = [with_damaged_inputs(failure(error), task, store) for task in tasks]
@@ -137,8 +142,8 @@ def run_tasks(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
 def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> TaskResult:
     """Return the result of a failed task with the digests of its damaged inputs.
 
-    They are then recomputed at once. All inputs are read. While the store is unavailable, they
-    cannot be checked.
+    They can then be recomputed at once. The function reads all inputs. While the store is
+    unavailable, it cannot check them.
     """
     if result.reason is Reason.store_unavailable:
         return result
@@ -151,7 +156,10 @@ def with_damaged_inputs(result: TaskResult, task: AnyTask, store: Store) -> Task
 
 
 def _run(tasks: Sequence[AnyTask], store: Store) -> list[TaskResult]:
-    """Call the module of another stage, imported here: simulating needs no packer."""
+    """Run tasks of any stage.
+
+    The module of another stage is imported here, because simulating needs no packer.
+    """
     (stage,) = {task.stage for task in tasks}
     if stage == "simulate":
         return simulate([task for task in tasks if isinstance(task, SimulateTask)], store)
@@ -176,7 +184,7 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
     try:
         simulations = [task.simulation.inputs(store.read) for task in tasks]
     except UnfitStartError as error:
-        # Only scenes have a start that may be impossible, and each is a batch of its own.
+        # Only scenes have a start that may be impossible, and each scene is a batch alone.
         return [_rejected(Reason.impossible_start, str(error))] * len(tasks)
     outcomes = simulated_kind.simulate(simulations, _set_frames)
     records = _store_records(outcomes, simulated_kind.batch, store)
@@ -194,7 +202,7 @@ def simulate(tasks: Sequence[SimulateTask], store: Store) -> list[TaskResult]:
 def _store_records(outcomes: Sequence["Outcome"], batch: int, store: Store) -> dict[int, RecordRef]:
     """Store the records of valid outcomes, at most `batch` of the same shapes in an artifact.
 
-    Return where they are.
+    Return the places of the records.
     """
     alike: dict[Any, list[int]] = {}
     for number, outcome in enumerate(outcomes):
@@ -216,7 +224,7 @@ def _store_records(outcomes: Sequence["Outcome"], batch: int, store: Store) -> d
 
 
 def _rejection(physics: Mapping[str, Any], outcome: "Outcome") -> TaskResult:
-    # People look for the sample by its numbers and names; arrays say nothing in a sentence.
+    # People look for the sample by its numbers and names. Arrays would be unreadable in a sentence.
     values = []
     for name, value in physics.items():
         if isinstance(value, float):

@@ -1,10 +1,10 @@
 """The triangles of a scene of cloth: the refined cloth, and props.
 
-Props may be further sheets of cloth.
+A prop may be another sheet of cloth.
 
-The scene in Blender and the rasteriser are built from the same triangles. Cycles sees all props
-grey, so that the light of the cloth stays a function of its albedo alone; the composer lays their
-colours on top, as it does with the floor's.
+The Blender scene and the rasteriser use the same triangles. Cycles sees all props grey, so the
+light of the cloth depends on its albedo alone. The composer lays the colours of the props on top,
+in the same way as the colours of the floor.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,9 @@ BACKGROUND, GROUND, CLOTH, PROP = range(4)
 """Codes of the segmentation, in the order of `stickslip_schemas.kinds.cloth.spec.SEGMENTS`."""
 
 FLOOR = -0.0005
-"""Height at which the floor is seen [m]: half a thickness below the middle surface of a cloth that
-lies on it.
+"""Height of the visible floor [m].
+
+It lies half a thickness below the middle surface of a cloth that lies on the floor.
 """
 
 Array = npt.NDArray[np.float64]
@@ -34,23 +35,24 @@ Faces = list[tuple[int, ...]]
 
 ARC = 12  # faces of a quarter of a circle
 GORE = 6
-"""Faces across one gore: gores are bright and dark by turns, so that a turn can be seen."""
+"""Faces across one gore. Bright and dark gores alternate, so a viewer can see the body turn."""
 _JOINT = 1e-7  # [m]: vertices that are closer are one
 DARK = 0.15
-"""Colour of a dark gore over that of a bright one."""
+"""Ratio of the colour of a dark gore to the colour of a bright one."""
 
 
 def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
     """Return the vertices (n, 3) [m] of a round body about its middle, and its convex faces.
 
-    A round body is a core, a box of half sizes (3,) [m] that may be 0, grown by a radius [m]: a
-    ball's core is a point, a capsule's a segment, a rounded box's a box. Its mesh is that of a
-    ball, pulled apart between its eight octants.
+    A round body is a core grown by a radius [m]. The core is a box of half sizes (3,) [m], and each
+    half size may be 0. For example, the core of a ball is a point, the core of a capsule is a
+    segment, and the core of a rounded box is a box. The mesh is the mesh of a ball, pulled apart
+    between its eight octants.
     """
     quarter = np.linspace(0.0, 0.5 * np.pi, ARC + 1)
     polar = np.concatenate([quarter, quarter + 0.5 * np.pi])
     azimuth = np.concatenate([quarter + side * 0.5 * np.pi for side in range(4)])
-    # Azimuths of the middles of the octants, which say along which axes a vertex is pulled.
+    # The azimuth of the middle of each octant gives the axes along which its vertices are pulled.
     middle = np.repeat(0.25 * np.pi + 0.5 * np.pi * np.arange(4), ARC + 1)
     p, a = np.meshgrid(polar, azimuth, indexing="ij")
     direction = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
@@ -60,8 +62,8 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
     octant[..., 2] = np.repeat([1.0, -1.0], ARC + 1)[:, None]
     vertices = (radius * direction + np.asarray(core, dtype=np.float64) * octant).reshape(-1, 3)
 
-    # Quadrilaterals between neighbouring rings. Edges of octants are doubled: without a core the
-    # faces between them have no area.
+    # Make quadrilaterals between neighbouring rings. The edges of the octants are doubled, so the
+    # faces between them have no area if the body has no core.
     rings, around = p.shape
     faces: Faces = []
     for ring in range(rings - 1):
@@ -82,7 +84,7 @@ def rounded(core: npt.ArrayLike, radius: float) -> tuple[Array, Faces]:
 def gores(color: Array, count: int) -> Array:
     """Return a colour for each face of a round body, (count, 3).
 
-    Gores are bright and dark by turns.
+    Bright and dark gores alternate.
     """
     around = 4 * (ARC + 1)
     place = np.arange(count) % around
@@ -108,7 +110,7 @@ def box(
 
 
 def square(normal: npt.ArrayLike, side: float) -> tuple[Array, Faces]:
-    """Return a square across a normal (3,): a plane that is no floor."""
+    """Return a square perpendicular to a normal (3,), for a plane that is not the floor."""
     n = np.asarray(normal, dtype=np.float64) / np.linalg.norm(normal)
     u = np.cross(n, np.eye(3)[np.abs(n).argmin()])
     u /= np.linalg.norm(u)
@@ -119,17 +121,17 @@ def square(normal: npt.ArrayLike, side: float) -> tuple[Array, Faces]:
 def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt.NDArray[np.int64]]:
     """Cut quadrilaterals into tiles of at most a side [m].
 
-    Return also the face that each tile is of.
+    Also return the number of the original face of each tile.
 
-    Vertices in one place are joined, so that a skin has no seams. The rasteriser leaves out what
-    reaches behind the camera: a large face would vanish as a whole.
+    Vertices at the same place become one vertex, so a skin has no seams. The rasteriser leaves out
+    any face that reaches behind the camera. Without tiles, a large face would vanish as a whole.
     """
     points = [vertices]
     pieces: Faces = []
     owners: list[int] = []
     count = len(vertices)
     for number, face in enumerate(faces):
-        # A tile's side is that of the longer of two opposite edges.
+        # The longer of two opposite edges gives the number of tiles.
         a, b, c, d = vertices[list(face)]
         across = max(1, int(np.ceil(max(np.linalg.norm(b - a), np.linalg.norm(c - d)) / side)))
         along = max(1, int(np.ceil(max(np.linalg.norm(d - a), np.linalg.norm(c - b)) / side)))
@@ -138,7 +140,7 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
             owners.append(number)
             continue
 
-        # Bilinear coordinates of a grid of vertices over the quadrilateral.
+        # Use bilinear coordinates for a grid of vertices over the quadrilateral.
         u, v = (
             line[..., None]
             for line in np.mgrid[0 : across + 1, 0 : along + 1] / np.array([[[across]], [[along]]])
@@ -151,26 +153,26 @@ def tiled(vertices: Array, faces: Faces, side: float) -> tuple[Array, Faces, npt
         owners += [number] * len(corners)
         count += len(points[-1])
 
-    # Grids of neighbouring faces have vertices in common: equal positions become one vertex.
+    # The grids of neighbouring faces share vertices. Equal positions become one vertex.
     candidates = np.concatenate(points)
     _, first, joint = np.unique(
         np.round(candidates / _JOINT), axis=0, return_index=True, return_inverse=True
     )
     rings = [tuple(dict.fromkeys(joint.ravel()[list(piece)].tolist())) for piece in pieces]
 
-    # A face between doubled edges has shrunk to a line or a point, and goes.
+    # A face between doubled edges has shrunk to a line or a point. Remove it.
     solid = [number for number, ring in enumerate(rings) if len(ring) > 2]
     return candidates[first], [rings[number] for number in solid], np.array(owners)[solid]
 
 
 @dataclass(frozen=True)
 class Print:
-    """What makes a prop a sheet of cloth."""
+    """The print of a prop that is a sheet of cloth."""
 
     uv: Array
-    """Texture coordinates in [0, 1] of its vertices, shape (n, 2)."""
+    """Texture coordinates of the vertices in [0, 1], shape (n, 2)."""
     picture: npt.NDArray[np.uint8]
-    """With the grain of the fabric, 8-bit sRGB, shape (size, size, 3)."""
+    """The picture with the grain of the fabric, 8-bit sRGB, shape (size, size, 3)."""
     look: Look
 
 
@@ -180,27 +182,30 @@ class Prop:
 
     name: str
     vertices: Array
-    """In its own axes, shape (n, 3) [m]."""
+    """Vertices in the axes of the prop, shape (n, 3) [m]."""
     faces: Faces
-    """Convex polygons."""
+    """Faces as convex polygons."""
     colors: Array
-    """Linear, of each face (n, 3) or of all (1, 3); a sheet's is that of its picture."""
+    """Linear colour of each face (n, 3), or of all faces (1, 3).
+
+    A sheet has the colours of its picture.
+    """
     roughness: float
     segment: int = PROP
-    """Its code in the segmentation."""
+    """Code of the prop in the segmentation."""
     sheet: Print | None = None
 
     @cached_property
     def grey(self) -> float:
-        """The albedo that Cycles sees: the mean of its colours."""
+        """The albedo that Cycles sees: the mean of the colours, at least 0.01."""
         given = self.colors if self.sheet is None else decoded(self.sheet.picture)
         return max(float(given.mean()), 0.01)
 
     @property
     def tints(self) -> npt.NDArray[np.float32]:
-        """Colours over `grey` of each triangle (T, 3).
+        """Colour of each triangle over `grey`, shape (T, 3).
 
-        0 of a sheet, whose colour is in its picture.
+        A sheet has 0 here, because its picture has the colour.
         """
         corners = [len(face) - 2 for face in self.faces]
         if self.sheet is not None:
@@ -210,12 +215,12 @@ class Prop:
 
 
 class Surroundings(Protocol):
-    """The props of a scene, and where they are."""
+    """The props of a scene, and their places."""
 
     props: tuple[Prop, ...]
-    """Sheets of cloth first."""
+    """The props, with sheets of cloth first."""
     floor: float | None
-    """Height at which the floor is seen [m]; None: there is none."""
+    """Height of the visible floor [m], or None if the scene has no floor."""
     ground: int
     """Code of the floor in the segmentation."""
     segment: int
@@ -224,16 +229,16 @@ class Surroundings(Protocol):
     def placed(self, instant: int, vertices: Array) -> list[Array]:
         """Return the vertices of each prop (n, 3) [m] at an instant.
 
-        The cloth is at vertices (V, 3) [m].
+        The cloth has the vertices (V, 3) [m].
         """
 
 
 @dataclass(frozen=True)
 class Printed:
-    """A sheet of cloth among the props, as the rasteriser looks its colour up."""
+    """A sheet of cloth among the props, with the data to look up its colour."""
 
     triangles: slice
-    """Among those of all props."""
+    """The triangles of the sheet among the triangles of all props."""
     textures: Textures
     grey: float
 
@@ -242,23 +247,27 @@ class Geometry:
     """The triangles of a scene, from the solver's positions."""
 
     triangles: Indices
-    """Shape (T, 3): those of the cloth, then those of the props."""
+    """Triangles of the cloth, then triangles of the props, shape (T, 3)."""
     cloth_triangles: int
-    """How many of them are the cloth's."""
+    """Number of triangles that belong to the cloth."""
     uv: Array
-    """Texture coordinates of all vertices; 0 elsewhere."""
+    """Texture coordinates of all vertices, 0 for vertices without a texture."""
     segments: npt.NDArray[np.uint8]
     """Code of each triangle in the segmentation, shape (T,)."""
     has_uv: npt.NDArray[np.bool_]
     """Whether each triangle is cloth, shape (T,)."""
     shaded: Indices
-    """The vertices, shape (S,): those of props once for each smooth skin that meets there."""
+    """Vertices for shading, shape (S,).
+
+    A vertex of a prop occurs once for each smooth skin that meets there.
+    """
     shaded_triangles: Indices
-    """The triangles by their places in `shaded`, shape (T, 3): only triangles of one skin share a
-    corner.
+    """Triangles by their places in `shaded`, shape (T, 3).
+
+    Two triangles share a corner only if they belong to one skin.
     """
     tints: npt.NDArray[np.float32]
-    """Of each triangle of the props, and a row of zeros at the end, shape (T' + 1, 3)."""
+    """Tint of each triangle of the props, and a row of zeros at the end, shape (T' + 1, 3)."""
     printed: tuple[Printed, ...]
     """The sheets among the props."""
 
@@ -273,8 +282,8 @@ class Geometry:
         self.cloth_triangles = len(self.surface.triangles)
         props = surroundings.props
 
-        # All vertices stand in one array, those of the cloth first: a prop's triangles count from
-        # its first vertex.
+        # One array has all vertices, with the cloth first. The triangles of a prop therefore count
+        # from the first vertex of the prop.
         sizes = np.cumsum([self.cloth_vertices, *(len(prop.vertices) for prop in props)])
         parts = [
             self.surface.triangles,
@@ -282,7 +291,7 @@ class Geometry:
         ]
         self.triangles = np.ascontiguousarray(np.concatenate(parts), dtype=np.int32)
 
-        # What the rasteriser looks up for each vertex or each triangle.
+        # The rasteriser looks these values up for each vertex or triangle.
         counts = [len(part) for part in parts]
         self.uv = np.concatenate(
             [
@@ -295,8 +304,8 @@ class Geometry:
         ).astype(np.uint8)
         self.has_uv = np.repeat([True, *(p.sheet is not None for p in props)], counts)
 
-        # Blender shades a prop smoothly but for sharp edges; normals of the ground truth do, too.
-        # The cloth is one smooth skin.
+        # Blender shades a prop smoothly except at sharp edges. The normals of the ground truth
+        # follow the same rule. The cloth is one smooth skin.
         skins: list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]] = [
             (np.arange(self.cloth_vertices), parts[0])
         ]
@@ -310,7 +319,7 @@ class Geometry:
         )
         self.tints = np.concatenate([*(p.tints for p in props), np.zeros((1, 3), dtype=np.float32)])
 
-        # Sheets among the props, by their triangles among those of all props.
+        # Each sheet among the props has a range in the triangles of all props.
         ends = np.cumsum([0, *counts[1:]])
         self.printed = tuple(
             Printed(slice(begin, end), Textures([prop.sheet.picture]), prop.grey)
@@ -324,7 +333,7 @@ class Geometry:
         return np.concatenate([self.surface(given), *self.surroundings.placed(instant, given)])
 
     def parts(self, points: Array) -> list[Array]:
-        """Split all vertices (V, 3) into those of the cloth and of each prop, (n, 3) each."""
+        """Split all vertices (V, 3) into the vertices (n, 3) of the cloth and of each prop."""
         ends = np.cumsum(
             [0, self.cloth_vertices, *(len(prop.vertices) for prop in self.surroundings.props)]
         )
@@ -344,17 +353,17 @@ class Geometry:
 def split_at_sharp_edges(vertices: Array, triangles: Indices) -> tuple[Indices, Indices]:
     """Split the vertices (V, 3) of triangles (T, 3) at edges sharper than `SHARP`.
 
-    Blender shades them so.
+    Blender shades a mesh in this way.
 
-    Returns the vertices (S,), once for each smooth skin that meets there, and the triangles (T, 3)
-    of those.
+    Returns the vertices (S,) and the triangles (T, 3). A vertex occurs once for each smooth skin
+    that meets there, and the triangles refer to these vertices.
     """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
-    # Corners of triangles that share a vertex and a smooth edge get the same label, the least of
-    # their numbers. In this order the corners of a vertex stand beside each other.
+    # Two corners that share a vertex and a smooth edge get the same label, the least of their
+    # numbers. In this order, the corners of a vertex are neighbours.
     corners = triangles.ravel()
     label = np.arange(corners.size)
     order = np.argsort(corners, kind="stable")
@@ -369,7 +378,8 @@ def split_at_sharp_edges(vertices: Array, triangles: Indices) -> tuple[Indices, 
             first_corner = first_corner[is_open]
             second_corner = second_corner[is_open]
 
-            # Triangles that are turned less than SHARP from each other are one smooth skin.
+            # Two triangles belong to one smooth skin if the angle between their normals is less
+            # than SHARP.
             cosine = (normals[first_corner // 3] * normals[second_corner // 3]).sum(axis=1)
             is_smooth = cosine > np.cos(SHARP)
             first_corner = first_corner[is_smooth]
@@ -383,7 +393,7 @@ def split_at_sharp_edges(vertices: Array, triangles: Indices) -> tuple[Indices, 
 
 
 def mirrored(points: Array, floor: float) -> Array:
-    """Return points as a floor at a height mirrors them [m]."""
+    """Return the mirror image of points in a floor at a height [m]."""
     image = points.copy()
     image[:, 2] = 2.0 * floor - image[:, 2]
     return image
@@ -392,7 +402,7 @@ def mirrored(points: Array, floor: float) -> Array:
 HOLDER = (0.004, 0.01, 0.01)
 """Sides of the clip at a corner [m]: across the cloth, and in its plane as in the simulation."""
 ROD = (0.003, 0.003, 0.5)
-"""Sides of the rod that the clip hangs on [m]."""
+"""Sides of the rod that carries the clip [m]."""
 HOLDER_COLOR = np.array([[0.05, 0.05, 0.05]])
 HOLDER_ROUGHNESS = 0.45
 
@@ -405,18 +415,23 @@ class Holders:
     segment = CLOTH
 
     def __init__(self, rest: npt.ArrayLike) -> None:
-        """Find the corners of a cloth, whose held edge is the last of its rest shape (V, 2) [m]."""
+        """Find the held corners of a cloth from its rest shape (V, 2) [m].
+
+        The held edge has the largest second coordinate.
+        """
         flat = np.asarray(rest, dtype=np.float64)
-        # The vertices nearest to the two upper corners are those that the simulation holds.
+        # The simulation holds the two vertices that are nearest to the upper corners.
         low = flat.min(axis=0)
         high = flat.max(axis=0)
         corners = np.array([(low[0], high[1]), (high[0], high[1])])
         self._held = np.abs(flat[:, None] - corners).sum(axis=2).argmin(axis=0)
         inward = np.sign((low + high) / 2 - corners) * HOLDER[1] / 2
-        # From a corner to the middle of its holder (x, y, z) [m]: it grips the cloth's inside.
+        # Offset from a corner to the middle of its holder (x, y, z) [m]. The holder grips the
+        # inside of the cloth.
         self._grips = np.pad(inward, ((0, 0), (1, 0)))
 
-        # One prop is a clip and the rod that it hangs on: faces of the rod count from its vertices.
+        # One prop has both the clip and its rod. The vertices of the rod follow the vertices of the
+        # clip.
         clip_vertices, clip_faces = box(HOLDER, (0.0, 0.0, 0.0))
         rod_vertices, rod_faces = box(ROD, (0.0, 0.0, ROD[2] / 2))
         vertices = np.concatenate([clip_vertices, rod_vertices])

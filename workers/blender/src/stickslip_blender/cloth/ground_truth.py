@@ -1,7 +1,7 @@
 """Ground truth of every pixel: depth, segmentation, normals, texture coordinates, optical flow.
 
-All of it is what the ray through the middle of a pixel meets first: the cloth, a prop, or the
-floor.
+Every value describes the first thing that the ray through the middle of a pixel meets: the cloth, a
+prop, or the floor.
 """
 
 from dataclasses import replace
@@ -20,14 +20,13 @@ from stickslip_blender.raster import Window, _raster, decoded, projected, see
 def apply_lens_distortion(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     """Return a video (frames, height, width, 3) as its camera shows it, 8-bit sRGB.
 
-    The video was taken by the camera's `pinhole`.
-
-    A pixel is interpolated between four, in linear light.
+    The input shows the view of the camera's `pinhole`. The function interpolates each pixel between
+    four pixels, in linear light.
     """
     if not any(camera.distortion):
         return video
     _, _, places = traced(camera)
-    # The upper left of the four pixels of the pinhole's frame, and the position between them.
+    # Find the upper left of the four pixels in the pinhole's frame, and the position between them.
     corner = np.floor(places).astype(int)
     fraction = (places - corner)[..., None].astype(np.float32)
     column = corner[..., 0]
@@ -67,36 +66,36 @@ def ground_truth(
 
     It needs all vertices (V, 3) [m] at the instant and at the next frame.
 
-    - `depth` (height, width): along the optical axis [m], infinite where there is nothing
+    - `depth` (height, width): along the optical axis [m], infinite for the background
     - `segmentation` (height, width): codes
     - `normals` (height, width, 3): of length 1, towards the camera, in its axes (right, down,
-      forward); 0 for nothing
+      forward); 0 for the background
     - `uv` (height, width, 2): texture coordinates of the cloth, NaN elsewhere
     - `flow` (height, width, 2): motion of the visible points until the next frame [px], columns and
       rows
     """
     pinhole, rays, places = traced(camera)
-    # The nearest triangle at the middle of each pixel; a lens moves the pixels.
+    # Find the nearest triangle at the middle of each pixel. A lens moves the pixels.
     here = projected(pinhole, points)
     seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
     if pinhole is not camera:
         seen = seen.looked_up(places)
     values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
 
-    # Normals are smooth only within a skin: a sharp edge has a vertex for each of its sides.
+    # Normals are smooth only within a skin. A sharp edge has a vertex for each of its sides.
     skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
     smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
     thing = seen.triangle >= 0
     cloth = thing & geometry.has_uv[seen.triangle]
 
-    # The floor has no triangles: it shows where nothing else does.
+    # The floor has no triangles. It is visible in pixels without any other object.
     floor = _floor_depth(camera, rays, geometry.surroundings.floor)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     moved, _ = camera.project(values[..., 3:6])
     segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
     segmentation[thing] = geometry.segments[seen.triangle[thing]]
 
-    # Normals into the camera's axes and towards it: cloth has two sides.
+    # Turn the normals into the axes of the camera and towards it, because cloth has two sides.
     normal = np.where(thing[..., None], smooth, (0.0, 0.0, 1.0)) @ np.asarray(camera.rotation).T
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.maximum(length, 1e-12)

@@ -1,4 +1,4 @@
-"""Looks of fabrics, lamps and floors, drawn from a seed.
+"""Looks of fabrics, lamps and floors. The lamps and floors are drawn from a seed.
 
 A fabric has a shader, a hem and the grain of its material.
 """
@@ -35,19 +35,22 @@ class Look:
     """The look of one fabric."""
 
     roughness: float
-    """Of its gloss, 0 to 1 as Blender's Principled shader takes it."""
+    """Roughness of the gloss, from 0 to 1, in the scale of Blender's Principled shader."""
     specular: float
-    """Strength of its gloss, 0.5 for an index of refraction of 1.5."""
+    """Strength of the gloss. The value 0.5 stands for an index of refraction of 1.5."""
     sheen: float
     """Weight of the fuzz that shines at grazing angles."""
     translucency: float
-    """Share of the light that goes through, 0 to 1."""
+    """Share of the light that passes through, from 0 to 1."""
     hem: float
-    """Half the thickness of its hem [mm]."""
+    """Half the thickness of the hem [mm]."""
     grain: Grain
     """Pattern of the weave or knit in the colour."""
     contrast: float
-    """Of the grain, in the share of light that the fabric scatters: 0 is none."""
+    """Contrast of the grain, as a share of the light that the fabric scatters.
+
+    The value 0 means no grain.
+    """
 
 
 def _table(name: str) -> dict[str, Any]:
@@ -66,11 +69,11 @@ PLAIN = Look(
     grain="plain",
     contrast=0.1,
 )
-"""Of a fabric that is not in fabrics.toml: a user's own."""
+"""Look of a fabric that is not in fabrics.toml, for example a custom one."""
 
 
 def fabric_look(material: str) -> Look:
-    """Return the look of a material, `PLAIN` for a custom one."""
+    """Return the look of a material, or `PLAIN` for a custom one."""
     return LOOKS.get(material, PLAIN)
 
 
@@ -79,9 +82,9 @@ def print_on_fabric(
 ) -> npt.NDArray[np.uint8]:
     """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet.
 
-    The sheet has the grain of its fabric and a hem.
+    The sheet has the grain of its fabric. A rectangular sheet also has the stitches of a hem.
 
-    Row 0 is the lower edge of the sheet; the picture covers the longer side. White has at most the
+    Row 0 is the lower edge of the sheet. The picture covers the longer side. White has at most the
     albedo WHITE.
     """
     wide, high = (1e3 * side for side in surface.size)
@@ -96,7 +99,7 @@ def print_on_fabric(
 
 
 def _stitches(u: Field, v: Field, wide: float, high: float) -> Field:
-    """Return 1 on the stitches of the hem at (u, v) [mm], 0 elsewhere.
+    """Return 1 on the stitches of the hem at (u, v) [mm], and 0 elsewhere.
 
     Stitches are 4.5 mm from the edge and 3 mm long.
     """
@@ -118,9 +121,9 @@ def _noise(shape: tuple[int, ...], blur: tuple[int, int], seed: int) -> Field:
     return np.asarray((noise - noise.mean()) / noise.std())
 
 
-# Grains: from places on the cloth [mm] to a factor's departure from 1, about -1 to 1. A pixel of
-# 224 is 1.5 to 3 mm, so threads are drawn too coarse: a period of 5 mm and more is seen, a finer
-# one would be moire.
+# A grain maps places on the cloth [mm] to the departure of a factor from 1, about -1 to 1. A pixel
+# of a clip of 224 x 224 covers 1.5 to 3 mm of cloth, so the threads are coarser than real ones. A
+# period of at least 5 mm is visible. A finer one would give moire.
 _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
     "plain": lambda u, v: 0.5 * _noise(u.shape, (6, 6), 1),
     "twill": lambda u, v: (
@@ -143,14 +146,14 @@ _GRAINS: dict[Grain, Callable[[Field, Field], Field]] = {
 
 @dataclass(frozen=True)
 class Source:
-    """A sort of light: ranges that a lamp is drawn from, and what all its lamps have."""
+    """A sort of light: the ranges of its lamps, and the properties that all its lamps share."""
 
     ranges: tuple[tuple[float, float], ...]
-    """Azimuth, elevation [degree] and power over the nominal power."""
+    """Ranges of azimuth, elevation [degree] and power over the nominal power."""
     diameter: float = 3.0
-    """Of the lamp [m], which is 7.2 m from the cloth."""
+    """Diameter of the lamp [m]. The lamp is 7.2 m from the cloth."""
     surround: float = 0.012
-    """Radiance from all around, of which cameras see none: a studio has black curtains."""
+    """Radiance from all around. Cameras do not see it: a studio has black curtains."""
 
 
 SOURCES = {
@@ -165,15 +168,15 @@ SOURCES = {
 class Light:
     """The lamp of one clip.
 
-    It stands still, so far away that the cloth is lit alike everywhere [thesis, 4.2.3].
+    It stands still. It is so far away that it lights the whole cloth evenly [thesis, 4.2.3].
     """
 
     azimuth: float
-    """Seen from the middle of the cloth's way, from +x towards +y [degree]."""
+    """Azimuth from the middle of the cloth's way, from +x towards +y [degree]."""
     elevation: float
-    """Above the floor [degree]."""
+    """Angle above the floor [degree]."""
     power: float
-    """Over the nominal power."""
+    """Power over the nominal power."""
     source: Source
 
     @property
@@ -183,7 +186,7 @@ class Light:
 
 
 def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Light:
-    """Draw a lamp from a named range, or from custom ones in a studio."""
+    """Draw a lamp from a named range, or from custom ranges in a studio."""
     source = Source((custom.azimuth, custom.elevation, custom.power)) if custom else SOURCES[name]
     uniform = np.random.Generator(np.random.PCG64(seed)).uniform
     azimuth, elevation, power = (float(uniform(low, high)) for low, high in source.ranges)
@@ -207,29 +210,32 @@ HARD = (
 
 @dataclass(frozen=True)
 class Substrate:
-    """One floor. Cycles renders it grey and plain; `floor_factor` adds its marks and colour."""
+    """One floor.
+
+    Cycles renders it grey and plain. `floor_factor` adds its marks and colour.
+    """
 
     name: str
     albedo: float
-    """Share of the light that it scatters or, as a metal, reflects."""
+    """Share of the light that the floor scatters or, as a metal, reflects."""
     roughness: float
-    """Of its gloss."""
+    """Roughness of the gloss."""
     metallic: float
     """1 for a metal."""
     specular: float
-    """Strength of a dielectric's gloss, 0.5 for an index of refraction of 1.5."""
+    """Strength of a dielectric's gloss. The value 0.5 stands for an index of refraction of 1.5."""
     grain: float
-    """Contrast of its marks; motion over a floor without marks is hard to see."""
+    """Contrast of the marks. Motion over a floor without marks is hard to see."""
     seed: int
-    """Of the marks."""
+    """Seed of the marks."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factor of its colour, mean 1."""
+    """Factor of the colour, with a mean of 1."""
 
     @property
     def mirrors(self) -> bool:
-        """Whether it mirrors shapes.
+        """Whether the floor mirrors shapes.
 
-        A rough floor that is no metal shows only the mean colour of the cloth.
+        A rough floor that is not a metal shows only the mean colour of the cloth.
         """
         return self.metallic > 0.5 or self.roughness < 0.25
 
@@ -244,7 +250,10 @@ FINISHES = _table("substrates.toml")
 
 
 def drawn_substrate(name: str, seed: int, custom: FloorNumbers | None = None) -> Substrate:
-    """Draw a substrate of a finish (`any`: of a hard one or the matt plate), or of a custom one."""
+    """Draw a substrate of a named finish, or of a custom one.
+
+    The name `any` stands for a hard finish or the matt plate, chosen at random.
+    """
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     finish = str(random.choice(["matt", *HARD])) if name == "any" else name
     ranges = FINISHES[finish] if custom is None else custom.model_dump()
@@ -264,12 +273,12 @@ def floor_factor(
 ) -> npt.NDArray[np.float32]:
     """Return the factor of the floor's marks and colour on its light, (height, width, 3).
 
-    Marks and colour lie on top: a factor of all the light that the floor sends back. The floor is
-    at a height [m]; None: there is none, and the factor is 1.
+    The marks and the colour lie on top, so they scale all the light that the floor sends back. The
+    floor is at a height [m]. If the height is None, the scene has no floor and the factor is 1.
     """
     if height is None:
         return np.ones((camera.height, camera.width, 3), dtype=np.float32)
-    # Several rays through each pixel: marks far away are finer than one.
+    # Trace several rays through each pixel, because marks far away are finer than a pixel.
     step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
     rows, columns = (
         (np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width)
@@ -283,7 +292,7 @@ def floor_factor(
     right, lower = np.moveaxis(place - low, -1, 0)
     marks = _marks(substrate)
 
-    # Marks repeat over the floor: interpolate between the four around each sample.
+    # Marks repeat over the floor. Interpolate between the four marks around each sample.
     (i, j), (k, m) = (np.moveaxis(corner % GRAIN_SIZE, -1, 0) for corner in (low, low + 1))
     upper_row = marks[j, i] + right * (marks[j, k] - marks[j, i])
     lower_row = marks[m, i] + right * (marks[m, k] - marks[m, i])
@@ -309,7 +318,10 @@ def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
 
 
 def _spots(random: np.random.Generator, extent: float) -> npt.NDArray[np.float64]:
-    """Return smooth noise of unit deviation that repeats; `extent` of its spots [texels]."""
+    """Return smooth noise of unit deviation that repeats.
+
+    `extent` is the size of its spots [texels].
+    """
     down = np.fft.fftfreq(GRAIN_SIZE)[:, None]
     along = np.fft.rfftfreq(GRAIN_SIZE)
     decay = np.exp(-2.0 * (np.pi * extent) ** 2 * (down**2 + along**2))

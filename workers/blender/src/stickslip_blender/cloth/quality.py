@@ -1,22 +1,26 @@
-"""How good a clip is: its squared error against direct renderings of its own, without their noise.
+"""The quality of a clip: its squared error against direct renderings, without their noise.
 
 At seeded instants, Cycles renders the cloth directly, with several seeds and no denoiser. At a
-pixel, let P be the clip's linear light, X and Y that of two renderings, and f the sRGB encoding in
-8-bit levels. The noises of X and Y are independent, so that in
+pixel, let P be the clip's linear light, X and Y the light of two renderings, and f the sRGB
+encoding in 8-bit levels. The noises of X and Y are independent, so that in
 
     e = f'(P)^2 (P - X) (P - Y)
     E[e] = f'(P)^2 (P - T)^2, near (f(P) - f(T))^2, T: the exact light
 
-nothing of the noise of the references is left, however few samples they have; e is the mean over
-all pairs. Landed cloth in a penumbra has paths that rarely meet the lamp, and more renderings.
-Frames with cloth in the shade, where a level is little light, or lit by other cloth, are worst, and
-may be missed. So the sum of e over that of weights, 1 / sqrt(L) + BOUNCED B^2 / L, times the mean
-of these over all frames, is the mean squared error; L: light on the cloth, B: what an albedo of
-0.25 elsewhere adds to it. Blocks of pixels, and instants, tell the deviation.
+the noise of the references cancels, for any number of samples. The code takes the mean of e over
+all pairs of renderings. Landed cloth in a penumbra has paths that rarely meet the lamp, so it gets
+more renderings.
 
-One rendering serves three textures: red, green and blue of its print are the green of the three.
-The groups of three are fixed: a clip gets the same numbers alone or with others. A user's picture
-is measured by itself.
+Frames with cloth in the shade have the largest errors, because a level is little light there.
+Frames with light from other cloth have large errors too. The draw of instants may miss such frames.
+So each pixel has a weight, 1 / sqrt(L) + BOUNCED B^2 / L. Here L is the light on the cloth, and B
+is the light that an albedo of 0.25 elsewhere adds to it. The mean squared error is the sum of e
+over the sum of the weights, times the mean weight over all frames. Blocks of pixels, and instants,
+give the deviation.
+
+One rendering serves three textures: the red, green and blue of its print are the greens of the
+three textures. The groups of three are fixed, so a clip gets the same numbers alone or with others.
+A custom picture is measured alone.
 """
 
 from collections.abc import Sequence
@@ -34,13 +38,18 @@ from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
 PATHS = 2
-"""Paths per pixel of a shading in a direct rendering. As many are skipped before them, since Cycles
-sends the first path through the middle of the pixel.
+"""Paths per pixel of a shading in a direct rendering.
+
+The rendering skips as many paths before them, because Cycles sends the first path through the
+middle of the pixel.
 """
 WHOLE = 3
-"""Direct renderings of all cloth in a measured frame."""
+"""Number of direct renderings of all cloth in a measured frame."""
 OF_LANDED = 3
-"""Direct renderings of the landed cloth, which covers about half of the area of all cloth."""
+"""Number of direct renderings of the landed cloth.
+
+Landed cloth covers about half of the area of all cloth.
+"""
 _FIXED_PATHS = 22  # cost of a frame of a shading beside its paths [paths per pixel of its window]
 _SET_UP_PATHS = 1  # cost of a rendering beside its paths [paths per pixel of its window]
 _GROUP_SIZE = 3  # textures that are measured together: one in each colour channel
@@ -52,7 +61,8 @@ _SPREAD = 0.6  # deviation of the errors of instants over their mean, before a c
 _TRUST = 4  # instants that it counts for
 DARK = 0.003  # light on the cloth below which errors do not grow
 BOUNCED = 40.0  # fitted: the composition errs where much light comes from other cloth
-# side of the blocks whose sums give the spread [px]: errors of a denoised picture reach some pixels
+# Side of the blocks whose sums give the spread [px]. The errors of a denoised picture reach over
+# some pixels.
 _BLOCK = 8
 
 Floats = npt.NDArray[np.float64]
@@ -62,14 +72,17 @@ Floats = npt.NDArray[np.float64]
 class Measured:
     """PSNR of a clip by region, in the order of `REGIONS`, and their deviations [dB].
 
-    NaN where none is in sight.
+    A region has NaN if the measured frames show too little of it.
     """
 
     psnr: tuple[float, ...]
     deviations: tuple[float, ...]
 
     def shortfall(self, floors: Sequence[float]) -> str:
-        """Say which regions are below their floors [dB] by more than chance; nothing if none is."""
+        """Return the regions that are below their floors [dB] by more than chance.
+
+        The text is empty if no region is.
+        """
         numbers = zip(REGIONS, self.psnr, self.deviations, floors, strict=True)
         return "; ".join(
             f"psnr_{name} must be at least {floor:g} dB; got {psnr:.1f} dB (deviation "
@@ -80,7 +93,7 @@ class Measured:
 
     @property
     def labels(self) -> dict[str, object]:
-        """The labels of a sample, with None for a region that no measured frame shows."""
+        """The labels of a sample, with None for a region without a measurement."""
         labels: dict[str, object] = {
             f"psnr_{name}": _number_or_none(psnr)
             for name, psnr in zip(REGIONS, self.psnr, strict=True)
@@ -97,7 +110,7 @@ UNMEASURED = Measured((np.nan,) * 3, (np.nan,) * 3)
 
 
 def measured_group(texture: str) -> tuple[str, ...]:
-    """Return the textures that are measured together with one."""
+    """Return the group of textures that are measured together with a texture."""
     names = [str(name) for name in Texture]
     if texture not in names:
         return (texture,)
@@ -106,20 +119,19 @@ def measured_group(texture: str) -> tuple[str, ...]:
 
 
 def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
-    """Draw the frames that are measured, each from an equal part of the clip.
+    """Draw the frames to measure, each from an equal part of the clip.
 
-    At least one frame is measured.
-
-    To measure eight textures costs a share of their shading, which has so many paths in each part
-    of a pixel.
+    At least one frame is measured. Measuring three groups of textures costs about `share` of the
+    cost of their shading. A shading has `paths` paths in each part of a pixel.
     """
-    # What it costs to measure a frame for all groups, over the cost of its shading.
+    # Cost of measuring a frame for three groups, over the cost of its shading.
     reference_cost = _GROUP_SIZE * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP_PATHS)
     shading_cost = FINE**2 * paths + _FIXED_PATHS
     cost = reference_cost / shading_cost
     count = min(max(1, round(share * frames / cost)), frames)
 
-    # One draw in each of `count` equal parts: all of the clip is covered, at no fixed instants.
+    # Draw one frame in each of `count` equal parts. The draws cover the whole clip, and no instant
+    # is fixed.
     draws = np.random.Generator(np.random.PCG64(seed)).random(count)
     return [int((k + draw) / count * frames) for k, draw in enumerate(draws)]
 
@@ -138,7 +150,7 @@ def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[n
         Window(0, 0, camera.width, camera.height),
         grid=1,
     )
-    # The cloth's triangles come first; a prop before the cloth takes its pixels.
+    # The triangles of the cloth come first. A prop in front of the cloth takes its pixels.
     cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
     low = seen.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
     return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
@@ -152,9 +164,10 @@ def _grown(mask: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
 
 
 def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel: int) -> Floats:
-    """Return a picture's green minus a channel of linear light; NaN if not visible.
+    """Return the squared error of a picture's green against a channel of linear light.
 
-    The light is (renderings, height, width, 3).
+    The light has the shape (renderings, height, width, 3). The error is in squared 8-bit levels.
+    Pixels that no pair of renderings shows have 0.
     """
     levels = picture[..., 1]
     others = references[..., channel]
@@ -168,8 +181,8 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
     renderings = np.isfinite(others).sum(axis=0)
     difference = np.nan_to_num(light - np.minimum(others, top))
 
-    # The sum of products over all pairs of different renderings: the square of the sum less the
-    # squares. A product of a rendering with itself would hold the square of its noise.
+    # Sum the products over all pairs of different renderings: the square of the sum less the
+    # squares. The product of a rendering with itself would contain the square of its noise.
     products = difference.sum(axis=0) ** 2 - (difference**2).sum(axis=0)
     return np.asarray(slope**2 * products / np.maximum(renderings * (renderings - 1), 1))
 
@@ -180,9 +193,8 @@ def pool_errors(
     """Return the PSNR of a clip by region, from the errors and weights of its measured frames.
 
     Errors are (height, width), in squared 8-bit levels. Weights are (3, height, width), and 0
-    outside of a region.
-
-    `mean_weights`: means of weights over the regions in all frames of the clip.
+    outside of a region. `mean_weights` are the means of the weights over the regions in all frames
+    of the clip.
     """
     psnr: list[float] = []
     deviations: list[float] = []
@@ -201,7 +213,7 @@ def _pool_region(
     if sum(np.count_nonzero(weights) for _, weights in frames) < FEWEST:
         return np.nan, np.nan
 
-    # Errors in proportion to the weights: their ratio estimates the error per weight.
+    # Errors grow in proportion to the weights, so their ratio estimates the error per weight.
     block_errors = np.concatenate(
         [_block_sums(np.where(weights > 0, error, 0.0)) for error, weights in frames]
     )
@@ -211,14 +223,14 @@ def _pool_region(
     total_weight = block_weights.sum()
     ratio = block_errors.sum() / total_weight
 
-    # Errors of neighbouring pixels depend on each other, those of blocks do not: the residuals of
-    # the blocks give the deviation of the ratio within the measured frames.
+    # Errors of neighbouring pixels depend on each other, but errors of blocks do not. The residuals
+    # of the blocks give the deviation of the ratio within the measured frames.
     residuals = block_errors - ratio * block_weights
     within = float(np.sqrt((residuals**2).sum())) / total_weight
     bounded = max(ratio, within)  # chance can make the mean of products negative
 
-    # Other frames would have other errors. Few frames say little about how much, so that the
-    # usual spread counts as _TRUST frames more.
+    # Other frames would have other errors. A few frames show little of that spread, so the usual
+    # spread counts as _TRUST more frames.
     frame_residuals = np.array(
         [np.sum(np.where(weights > 0, error - bounded * weights, 0.0)) for error, weights in frames]
     )
@@ -226,7 +238,7 @@ def _pool_region(
     spread_squares = np.sum((frame_residuals * count / total_weight / bounded) ** 2)
     between = (spread_squares + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
 
-    # The relative deviation of the squared error, in decibels.
+    # Convert the relative deviation of the squared error to decibels.
     deviation = float(np.sqrt((within / bounded) ** 2 + between))
     psnr = float(10.0 * np.log10(255.0**2 / (bounded * mean_weight)))
     return psnr, 10.0 / np.log(10.0) * deviation

@@ -1,7 +1,7 @@
 """The Blender scene of every kind of cloth: a cloth over a floor, under one lamp, before black.
 
-The cloth is the solver's mesh, refined so that no facet shows. The lamp stands still. The module of
-a kind in `stickslip_blender.scenes` adds the props.
+The cloth is the solver's mesh, refined until no facet is visible. The lamp stands still. The module
+of a kind in `stickslip_blender.scenes` adds the props.
 """
 
 import numpy as np
@@ -41,7 +41,7 @@ _MIRROR_PATHS = 2  # times as many paths for the frame then
 class ClothScene:
     """A scene with one cloth, built once.
 
-    Vertices change between frames, camera, lamp and looks between clips.
+    Vertices change between frames. Camera, lamp and looks change between clips.
     """
 
     def __init__(self, geometry: Geometry) -> None:
@@ -61,7 +61,7 @@ class ClothScene:
                 add_mesh(self._scene, "floor", *_floor(geometry.surroundings.floor)), "floor"
             )
 
-        # The vertices of the cloth and the props move from frame to frame; here only faces and
+        # The vertices of the cloth and the props move from frame to frame. Here only faces and
         # texture coordinates count.
         faces = geometry.surface.triangles
         uv = geometry.surface.uv
@@ -89,15 +89,15 @@ class ClothScene:
     ) -> None:
         """Set the camera, the lamp, the floor and the fabric of the next clips.
 
-        The lamp is turned to the middle of all that the solver's vertices pass in the track
-        (frames, V', 3) [m].
+        The lamp points at the middle of the box that contains all vertices of the track (frames,
+        V', 3) [m].
         """
         set_view(self._scene, camera)
         self._camera = camera
         self.substrate = substrate
         self._fabric.set_look(**_shader(look))
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
-        # The same distance for all clips: the lamp's power gives the same light.
+        # All clips have the same distance, so the same power of the lamp gives the same light.
         a = np.radians(light.azimuth)
         e = np.radians(light.elevation)
         outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -117,24 +117,22 @@ class ClothScene:
     ) -> npt.NDArray[np.float16]:
         """Render an instant for all textures: linear light at three albedos.
 
-        The shape is (FINE height, FINE width, 3).
-
-        Seed: of the noise; the same in all frames of a clip, so that the remaining noise does not
-        flicker.
+        The shape is (FINE height, FINE width, 3). `seed` sets the noise. All frames of a clip have
+        the same seed, so the remaining noise does not flicker.
         """
         self._fabric.set_color(SHOWN, ELSEWHERE)
         self._place(points)
 
-        # The whole frame, with few paths: light on the floor varies slowly.
+        # Render the whole frame with few paths, because light on the floor varies slowly.
         paths = sampling.frame * (_MIRROR_PATHS if self.substrate.roughness < _MIRRORING else 1)
         set_sampling(self._scene, Sampling(paths, "quick", seed))
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
 
-        # The window of the cloth, with more paths and FINE x FINE values a pixel.
+        # Render the window of the cloth with more paths and FINE x FINE values a pixel.
         part = self.window(points, _DISCARDED + _RAMP)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
 
-        # Blend the window into the frame, so that its border does not show.
+        # Blend the window into the frame, so that its border is invisible.
         down = _blend_weights(part.top, part.bottom, self._camera.height)
         across = _blend_weights(part.left, part.right, self._camera.width)
         here = part.times(FINE).slices
@@ -181,7 +179,7 @@ def _blend_weights(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
 
 
 def _shader(look: Look) -> dict[str, float]:
-    """Return what of a look the shader of a fabric takes."""
+    """Return the numbers of a look that the shader of a fabric takes."""
     return {
         name: getattr(look, name) for name in ("roughness", "specular", "sheen", "translucency")
     }
@@ -189,7 +187,7 @@ def _shader(look: Look) -> dict[str, float]:
 
 def _floor(height: float) -> tuple[npt.NDArray[np.float64], list[tuple[int, ...]]]:
     """Return the vertices and faces of a round plate at a height [m], with a low rim."""
-    # The floor is one polygon; its rim is a ring of upright faces.
+    # The floor is one polygon. Its rim is a ring of upright faces.
     around = 64
     angle = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(around)], axis=1) * _FLOOR_RADIUS

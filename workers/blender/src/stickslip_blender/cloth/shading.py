@@ -1,25 +1,27 @@
 """One shading for many textures.
 
 The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and floor are grey, so
-red, green and blue are three samples of the light that a pixel sends to the camera, as a function
-of the cloth's albedo there, a, and elsewhere, m:
+red, green and blue are three samples of the light that a pixel sends to the camera. This light is a
+function of the cloth's albedo at the pixel, a, and elsewhere, m:
 
     L(a, m) = S + (D + I m) a
 
-with the gloss S, also of light from other cloth, D the light scattered once, and I twice.
+S is the gloss, including the gloss of light from other cloth. D is the light scattered once, and I
+is the light scattered twice.
 
-A texture has the albedo A(p) at pixel p, from the rasteriser, and its picture is L(A(p), m) with
-the mean albedo m of the cloth in sight, in linear light, for each of the texture's colours. The
-cloth is rendered with FINE x FINE pixels in each of a picture: where light and print change within
-one, the mean of their products is not that of their means.
+A texture has the albedo A(p) at pixel p, from the rasteriser. Its picture is L(A(p), m) with the
+mean albedo m of the visible cloth, in linear light, for each of the texture's colours. The cloth is
+rendered with FINE x FINE pixels in each pixel of a picture. If light and print change within a
+pixel, the mean of their products differs from the product of their means.
 
-Off the cloth L is linear in the albedo of light that the cloth threw there: m, or what a floor that
-mirrors shows of the cloth, blurred as much as its roughness does. Marks of the floor and colours of
-props lie on top, as factors of their light: whatever is not the cloth is grey in Cycles.
+In pixels without cloth, L is linear in the albedo of the light that the cloth threw there. This
+albedo is m, or the mirror image of the cloth in a floor that mirrors, blurred as much as the
+roughness of the floor does. Marks of the floor and colours of props lie on top, as factors of their
+light: everything except the cloth is grey in Cycles.
 
-Each level of a picture is within TOLERANCE of the exact value, and chosen so that pixels stay as
-they are in the frame before (clips are 6 % smaller for it), and that the colours of grey are equal
-(a tenth smaller).
+Each level of a picture is within TOLERANCE of the exact value. Within this limit, the composer
+keeps the pixels of the frame before, which makes clips 6 % smaller. It also makes the colours of
+grey equal, which makes clips a tenth smaller.
 """
 
 from dataclasses import replace
@@ -46,18 +48,19 @@ from stickslip_blender.raster import (
 
 SHOWN = (0.0, 0.6, 0.6)
 ELSEWHERE = (0.3, 0.3, 0.05)
-"""The cloth's base colours in a shading, where the camera sees it and where other rays meet it."""
+"""Base colours of the cloth in a shading, for rays of the camera and for other rays."""
 
 FINE = 2  # pixels of a shading across one of a picture, and down
 TOLERANCE: int = _raster.TOLERANCE
-"""Largest difference of a pixel of a clip from its exact value [8-bit levels]; raster/raster.hpp
-sets it.
+"""Largest difference of a pixel of a clip from its exact value [8-bit levels].
+
+raster/raster.hpp sets it.
 """
 
 _MIRROR_GRID = 8
 _PROP_GRID = 3
-# radius of a box, twice applied, over the width of the lobe that it stands for; compared with
-# Cycles
+# Ratio of the radius of a box, applied twice, to the width of the lobe that it stands for. The
+# value comes from a comparison with Cycles.
 _LOBE = 1.9
 _SURE_COVERAGE = 0.02  # of mirrored cloth, from which on its own colour counts in full
 _PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
@@ -83,22 +86,23 @@ class Composer:
     ) -> tuple[float, float]:
         """Compose a frame's shading with all textures, into `pictures`.
 
-        The shading is (FINE height, FINE width, 3).
+        The shading is (FINE height, FINE width, 3). `points` are all vertices of the scene at that
+        instant (V, 3) [m], and `floor` has the form that `floor_factor` returns. `pictures` has the
+        pictures of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3).
 
-        Points: all vertices of the scene at that instant (V, 3) [m]; floor: as `floor_factor`
-        returns it; pictures: those of the frame before, or zeros, 8-bit sRGB, shape (textures,
-        height, width, 3). Returns the share of the frame that is cloth, and of the cloth that
-        nothing hides, its area taken as it is turned to the camera.
+        Returns the share of the frame that is cloth, and the share of the cloth that is visible.
+        The area of the cloth is its area as the camera sees it, with nothing in front.
         """
-        # What each finer pixel sees, and the mean albedo of the cloth there in each texture.
+        # Find the triangle that each finer pixel sees, and the mean albedo of the cloth there in
+        # each texture.
         window = self._window(points, camera).times(FINE)
         parts = scaled(camera, FINE)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
         sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
         colors = 3 * textures.count
 
-        # On a floor that mirrors, the light from the cloth has the colour of its mirror image; on
-        # others, the mean colour of the cloth in sight.
+        # On a floor that mirrors, the light from the cloth has the colour of its mirror image. On
+        # other floors, it has the mean colour of the visible cloth.
         reflected = np.empty((0, 0, colors), dtype=np.float32)
         around = Window(0, 0, 0, 0)
         if substrate.mirrors and self._geometry.surroundings.floor is not None:
@@ -115,7 +119,7 @@ class Composer:
             self._tinted(floor, points, camera),
             pictures,
         )
-        # Samples of cloth that are seen, over those of its projected area.
+        # Divide the samples of visible cloth by the samples of its projected area.
         frame = parts.width * parts.height
         visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
         return float(sight.coverage.sum()) / frame, float(min(visible, 1.0))
@@ -125,12 +129,12 @@ class Composer:
     ) -> Floats:
         """Return the factor (fine height, fine width, 3) of marks and colours of a frame.
 
-        It is for frames that are rendered directly.
+        It applies to frames that are rendered directly.
         """
         window = self._window(points, camera).times(fine)
         parts = scaled(camera, fine)
         seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
-        # The direct rendering has the cloth's own colours: the factor is 1 as far as cloth covers a
+        # The direct rendering has the cloth's own colours. The factor is 1 as far as cloth covers a
         # pixel.
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
         cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
@@ -140,9 +144,9 @@ class Composer:
         return np.asarray(1.0 + (1.0 - cover[..., None]) * marks, dtype=np.float32)
 
     def _tinted(self, floor: Floats, points: npt.NDArray[np.float64], camera: Camera) -> Floats:
-        """Return the factor (height, width, 3) of all but the cloth.
+        """Return the factor (height, width, 3) of everything except the cloth.
 
-        It is that of the floor, or of the prop before it.
+        A pixel has the factor of the floor, or of the prop in front of it.
         """
         geometry = self._geometry
         if not geometry.surroundings.props:
@@ -152,7 +156,7 @@ class Composer:
         if not window.area:
             return floor
 
-        # Colours of bodies and holders: the mean over the samples of a pixel.
+        # The colour of bodies and holders is the mean over the samples of a pixel.
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
         seen = see(projections, props, window, _PROP_GRID)
         samples = [
@@ -163,8 +167,8 @@ class Composer:
             (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
         ) / len(samples)
 
-        # Further sheets have pictures. `see_albedo` reads the first triangles of a mesh: roll each
-        # sheet to the front.
+        # Further sheets have pictures. `see_albedo` reads the first triangles of a mesh, so roll
+        # each sheet to the front.
         for sheet in geometry.printed:
             count = sheet.triangles.stop - sheet.triangles.start
             first = sheet.triangles.start
@@ -175,7 +179,7 @@ class Composer:
             sight = see_albedo(rolled, geometry.uv, sheet.textures, count)
             shown = shown + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
 
-        # A prop stands before the floor, as far as it covers a pixel.
+        # A prop hides the floor, as far as it covers a pixel.
         factor = floor.copy()
         factor[window.slices] = (
             shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
@@ -203,14 +207,14 @@ class Composer:
         if not window.area:
             return nothing
 
-        # The mirror image of the cloth, as if the floor were a window.
+        # Make the mirror image of the cloth, as if the floor were a window.
         seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)
         sight = see_albedo(seen, self._geometry.uv, textures, cloth)
         if not sight.coverage.any():
             return nothing
 
-        # How far behind the floor it appears decides how far a rough floor blurs it. At the edge of
-        # the cloth there is no depth: take the mean around.
+        # The distance of the image behind the floor decides how far a rough floor blurs it. The
+        # edge of the cloth has no depth, so take the mean around it.
         beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
         shown = sight.coverage[..., None]
         wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
@@ -219,16 +223,16 @@ class Composer:
         )
         path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
 
-        # Seen from where the mirrored ray meets the floor, a lobe of microfacets of width
-        # roughness^2 is narrower across the plane of incidence than in it, by the sine of the angle
-        # at which the camera looks down.
+        # Look from the point at which the mirrored ray meets the floor. A lobe of microfacets of
+        # width roughness^2 is narrower across the plane of incidence than in it. The ratio is the
+        # sine of the angle at which the camera looks down.
         down = np.asarray(
             path * np.float32(_LOBE * camera.fy * substrate.roughness**2), dtype=np.float32
         )
         across = np.asarray(down * np.float32(-np.asarray(camera.rotation)[2, 2]), dtype=np.float32)
 
-        # Blur coverage and colour alike; their ratio is the colour. Where hardly any cloth is
-        # mirrored, the mean colour takes its part.
+        # Blur coverage and colour alike. Their ratio is the colour. In places with hardly any
+        # mirrored cloth, the mean colour takes its part.
         flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
         blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
         coverage = blurred[..., :1]
@@ -239,9 +243,9 @@ class Composer:
 
 
 def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
-    """Return how far behind the floor a mirrored thing appears, over its depth.
+    """Return the distance of a mirrored thing behind the floor, over its depth.
 
-    The shape is (height, width); 0 if nothing is mirrored.
+    The shape is (height, width). A pixel without a mirror image has 0.
     """
     depth = seen.at_centers(seen.points[:, 2:])[..., 0]
     window = seen.window
@@ -250,7 +254,7 @@ def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
         [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)],
         axis=-1,
     )
-    # A ray that does not go down meets the floor nowhere near.
+    # A ray that does not go down meets the floor only very far away.
     down = (ray @ np.asarray(camera.rotation))[..., 2]
     floor = (height - camera.position[2]) / np.where(down < -1e-6, down, -1e-6)
     fraction = np.where(depth > 0.0, 1.0 - floor / np.maximum(depth, 1e-6), 0.0)

@@ -1,9 +1,7 @@
-"""The scene besides a sheet: further sheets, bodies and holders.
+"""The scene around a sheet: further sheets, bodies and holders.
 
-They come from its document and a record.
-
-Names of arrays are those of a record of `cloth_scene`; everything in a document is in the order of
-its names.
+They come from the document of the scene and a record. The arrays have the names of a record of
+`cloth_scene`. Everything in a document is in the order of its names.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +30,8 @@ from stickslip_blender.cloth.looks import fabric_look, print_on_fabric
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
-# of a visible body inside that of the simulation [m]: half the thickness of a cloth that lies on it
+# Distance of a visible body inside the simulated one [m]: half the thickness of a cloth that lies
+# on it.
 SUNK = -FLOOR
 ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane that is no floor [m]
 TILE = 0.1  # side of the tiles of bodies [m]
@@ -45,7 +44,7 @@ _DEFAULT_COLOR = (0.2, 0.2, 0.2)  # linear, of a body without a look: the docume
 _DEFAULT_ROUGHNESS = 0.5  # likewise
 # Turns of the camera about the scene [degree], the smallest first.
 _TURNS = (0.0, *(sign * 30.0 * step for step in range(1, 6) for sign in (1, -1)), 180.0)
-# Fraction of the most cloth that any turn shows: the smallest turn that shows as much is used.
+# Fraction of the most cloth that any turn shows. The smallest turn that reaches it is used.
 _ENOUGH = 0.6
 _WATCHED = 60  # instants at which it is found out what moves
 _TURN_INSTANTS = 5  # instants at which the cloth in sight of a turn is measured
@@ -55,7 +54,7 @@ Array = npt.NDArray[Any]
 
 
 class Stage:
-    """The surroundings of one sheet of a scene: the one that takes the axis `texture`."""
+    """The surroundings of one sheet of a scene: the sheet that takes the axis `texture`."""
 
     def __init__(
         self,
@@ -69,7 +68,7 @@ class Stage:
 
         Args:
             scene: `Staged` of stickslip_schemas.scene, as JSON.
-            sheet: The sheet that is no prop.
+            sheet: The sheet that is not a prop.
             segments: Names of the codes of the segmentation.
             record: Arrays of a sample.
             picture: Returns a texture by name.
@@ -83,7 +82,7 @@ class Stage:
         self._placers: list[Callable[[int], Array]] = []
         props: list[Prop] = []
 
-        # Sheets come first: the composer reads their pictures from the first triangles.
+        # Sheets come first, because the composer reads their pictures from the first triangles.
         for name, other in scene["sheets"].items():
             if name != sheet:
                 props.append(
@@ -92,7 +91,7 @@ class Stage:
                     )
                 )
 
-        # The first level plane is the floor, which has marks, a mirror image and no mesh.
+        # The first level plane is the floor. It has marks and a mirror image, but no mesh.
         for number, (name, body) in enumerate(scene["bodies"].items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor = body["origin"][2] + FLOOR
@@ -104,7 +103,7 @@ class Stage:
             }
             props.append(self._body(name, number, body, look, codes[name]))
 
-        # A holder is a box about what it holds; one that holds nothing has no box.
+        # A holder is a box around the part that it holds. A holder without such a part has no box.
         for number, sides in enumerate(
             record["holder_box"].tolist() if "holder_box" in record else ()
         ):
@@ -121,11 +120,11 @@ class Stage:
         return [place(instant) for place in self._placers]
 
     def moving(self) -> Array:
-        """Return the places (n, 3) [m], over time, of all that moves, and of all of the sheet."""
+        """Return the places (n, 3) [m], over time, of all moving vertices and of the sheet."""
         track = self._record[f"{self._sheet}.positions"]
         instants = np.unique(np.linspace(0, len(track) - 1, _WATCHED).astype(int))
         parts = [track.reshape(-1, 3)]
-        # Props that stand still do not count, however large.
+        # Props that stand still do not count, whatever their size.
         for place in self._placers:
             places = np.stack([place(instant) for instant in instants])
             moves = (np.ptp(places, axis=0) > MOVING).any(axis=1)
@@ -133,7 +132,7 @@ class Stage:
         return np.concatenate(parts)
 
     def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
-        """Return the camera that frames all that moves.
+        """Return the camera that frames everything that moves.
 
         It is turned until enough of the sheet is visible.
         """
@@ -141,7 +140,8 @@ class Stage:
         track = self._record[f"{self._sheet}.positions"]
         instants = np.linspace(0, len(track) - 1, _TURN_INSTANTS).astype(int)
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
-        # The first turn that shows about as much as any: a camera far around would surprise.
+        # Take the first turn that shows nearly as much as the best one. A camera from far around
+        # would surprise.
         shown = [
             _shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes)
             for turn in _TURNS
@@ -218,7 +218,7 @@ def _sunk(points: Array, triangles: Array) -> Array:
 
 
 def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:
-    """Return the vertices of a body that is no mesh, in its own axes [m], and its faces."""
+    """Return the vertices of a body that is not a mesh, in its axes [m], and its faces."""
     kind = body["type"]
     if kind == "plane":
         vertices, faces = square(body["normal"], 2.0 * ENDLESS)
@@ -231,7 +231,7 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:
 
 
 def _shown(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:
-    """Return how many pixels show the sheet, over several instants."""
+    """Return the number of pixels that show the sheet, over several instants."""
     window = Window(0, 0, camera.width, camera.height)
     count = 0
     for points in scenes:

@@ -1,7 +1,7 @@
 """The visible cloth: the solver's mesh, refined, with weak creases and a thick hem.
 
-The middle of the sheet is the solver's surface. Creases are a seeded height of half a millimetre at
-most; a label says how strong they are, for wrinkles are what friction is seen by. The hem is a
+The middle of the sheet is the solver's surface. Creases are a seeded height of at most half a
+millimetre. A label gives their strength, because wrinkles make friction visible. The hem is a
 second skin about the outer 6 mm.
 """
 
@@ -19,19 +19,22 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
 
 SHARPEST = np.radians(135.0)
-"""Two edges of the boundary that meet at a smaller angle make a corner, which stays where it is."""
+"""Least angle of two edges of the boundary that do not make a corner [rad].
+
+Corners stay in place.
+"""
 
 
 @dataclass(frozen=True)
 class Subdivision:
-    """How one mesh is refined: from values at its vertices to values at those of the finer one."""
+    """The refinement of one mesh, from values at its vertices to values at the finer vertices."""
 
     triangles: Indices
-    """Of the finer mesh, shape (4 T, 3)."""
+    """Triangles of the finer mesh, shape (4 T, 3)."""
     _sources: Indices
     """Old vertices of each new one, padded, shape (V', n)."""
     _weights: Array
-    """Their weights, zero in the padding, shape (V', n); each row sums to one."""
+    """Weights of the old vertices, zero in the padding, shape (V', n). Each row sums to one."""
 
     def __call__(self, values: npt.ArrayLike) -> Array:
         """Refine values (V, k) to (V', k)."""
@@ -45,12 +48,12 @@ class Subdivision:
 def subdivide(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> Subdivision:
     """Make the Loop subdivision of triangles (T, 3).
 
-    The rest shape (V, 2) says where corners of the boundary are.
+    The rest shape (V, 2) gives the corners of the boundary.
 
-    New vertices are the old ones, moved, and then one on each edge. Each is a mean of old ones with
-    weights that are not negative, so a cloth that lies on the floor does not get below it, and
-    everything that is given by vertex, texture coordinates too, is refined by the same rule [Loop
-    1987; Hoppe et al. 1994, boundary and corner rules].
+    The new vertices are the moved old ones, followed by one vertex on each edge. Each new vertex is
+    a mean of old ones with weights of at least zero. A cloth that lies on the floor therefore does
+    not sink below it. The same rule refines every value at a vertex, for example texture
+    coordinates [Loop 1987; Hoppe et al. 1994, boundary and corner rules].
     """
     old = np.asarray(triangles, dtype=np.int64)
     flat = np.asarray(rest, dtype=np.float64)
@@ -121,9 +124,9 @@ FINE_VERTICES = 6000  # a mesh is subdivided until it has so many: a facet is th
 CREASE = 0.0005  # height of the strongest crease at strength 1 [m]
 _CREASES = 14
 
-# Of the hem, from its inner edge over the upper side to the outer edge and back below: how far
-# inside the edge of the sheet [m], and how high over its middle surface, in units of half the hem's
-# thickness.
+# Profile of the hem, from its inner edge over the upper side to the outer edge and back below. Each
+# point has its distance inside the edge of the sheet [m], and its height over the middle surface in
+# units of half the hem's thickness.
 _PROFILE = np.array(
     [
         (6.5e-3, 0.0),
@@ -140,7 +143,7 @@ _PROFILE = np.array(
 def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
     """Return the surface of a mesh, see `Surface`.
 
-    The last surfaces are cached, since making a surface takes a second.
+    A cache keeps the last surfaces, because making a surface takes a second.
     """
     faces = np.asarray(triangles, dtype=np.int32)
     flat = np.asarray(rest, dtype=np.float64)
@@ -148,14 +151,14 @@ def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
 
 
 class Surface:
-    """A refined mesh: from positions of the solver's vertices to those of the visible ones."""
+    """A refined mesh: it turns positions of the solver's vertices into visible vertices."""
 
     triangles: Indices
-    """Shape (T, 3)."""
+    """Triangles of the sheet and the hem, shape (T, 3)."""
     uv: Array
     """Texture coordinates, shape (V, 2): from 0 to 1 along the longer side."""
     size: tuple[float, float]
-    """Of the flat sheet, along warp and weft [m]."""
+    """Size of the flat sheet, along warp and weft [m]."""
     is_rectangle: bool
     """Whether the flat sheet is a rectangle."""
 
@@ -169,10 +172,10 @@ class Surface:
         self.size = width, height
         ab, ac = (flat[faces[:, k]] - flat[faces[:, 0]] for k in (1, 2))
         area = 0.5 * np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()
-        # A sheet whose triangles fill the box around it has four straight sides.
+        # A sheet has four straight sides if its triangles fill the box around it.
         self.is_rectangle = bool(area > 0.999 * width * height)
 
-        # Subdivide until facets are smaller than a pixel; positions pass the same levels.
+        # Subdivide until facets are smaller than a pixel. Positions pass through the same levels.
         self._levels: list[Subdivision] = []
         while len(flat) < FINE_VERTICES:
             self._levels.append(subdivide(faces, flat))
@@ -181,7 +184,7 @@ class Surface:
         self._sheet = faces
         self._count = len(flat)
 
-        # The hem is a ring of further vertices around the rim, at offsets of its profile.
+        # The hem is a ring of further vertices around the rim, at the offsets of its profile.
         rim = _rim(faces)
         self._profile = np.repeat(_PROFILE[:, 1], len(rim))[:, None]
         inside = np.concatenate(
@@ -192,7 +195,8 @@ class Surface:
             np.concatenate([faces, _ring_faces(len(rim), self._count)])
         )
 
-        # The print goes on over the hem: its vertices have the coordinates of the sheet below.
+        # The print continues over the hem. The vertices of the hem have the coordinates of the
+        # sheet below.
         uv = (np.concatenate([flat, inside]) - low) / max(self.size)
         self.uv = np.ascontiguousarray(np.clip(uv, 0.0, 1.0))
         self.apply_relief(hem=0.0)
@@ -205,7 +209,7 @@ class Surface:
         )
 
     def __call__(self, positions: npt.ArrayLike) -> Array:
-        """Return the vertices (V, 3) that are seen of the solver's positions (V', 3) [m]."""
+        """Return the visible vertices (V, 3) for the solver's positions (V', 3) [m]."""
         sheet = np.asarray(positions, dtype=np.float64)
         for level in self._levels:
             sheet = level(sheet)
@@ -218,7 +222,7 @@ class Surface:
             lifted[:, 2] = np.maximum(lifted[:, 2], np.minimum(sheet[:, 2], 0.0))
             sheet = lifted
 
-        # The hem follows the sheet that is already creased.
+        # The hem follows the creased sheet.
         middle = np.einsum("hk,hkx->hx", self._weights, sheet[self._corners])
         upward = np.einsum("hk,hkx->hx", self._weights, normals[self._corners])
         return np.concatenate([sheet, middle + self._hem * upward])
@@ -234,7 +238,7 @@ def _made(triangles: bytes, rest: bytes) -> Surface:
 def _creases(uv: Array, seed: int) -> Array:
     """Return the height of creases in [-1, 1] at (n, 2).
 
-    They are straight ridges and furrows that fade along their length.
+    Creases are straight ridges and furrows that fade along their length.
     """
     random = np.random.Generator(np.random.PCG64([seed, 2]))
     height = np.zeros(len(uv))
@@ -251,7 +255,7 @@ def _creases(uv: Array, seed: int) -> Array:
 
 
 def _rim(faces: Indices) -> npt.NDArray[np.int64]:
-    """Return the vertices of the boundary in order, the sheet on their left."""
+    """Return the vertices of the boundary in order, with the sheet on their left."""
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, index, uses = np.unique(
         np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
@@ -269,7 +273,7 @@ def _rim(faces: Indices) -> npt.NDArray[np.int64]:
 def _inward(rim: Array) -> Array:
     """Return the direction into the sheet at each vertex of its edge (n, 2).
 
-    It is as long as moves both sides there by 1.
+    A step along this vector moves both sides at the vertex inwards by 1.
     """
 
     def unit(v: Array) -> Array:
@@ -287,7 +291,7 @@ def _inward(rim: Array) -> Array:
 def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array]:
     """Return the corners (n, 3) and barycentric weights (n, 3) of flat points.
 
-    They are those of the triangle that the point is most inside of.
+    The corners belong to the triangle that contains the point best.
     """
     a, b, c = (flat[faces[:, k]] for k in range(3))
     inverse = np.linalg.inv(np.stack([b - a, c - a], axis=-1))  # (T, 2, 2)
@@ -306,7 +310,10 @@ def _located(points: Array, flat: Array, faces: Indices) -> tuple[Indices, Array
 
 
 def _ring_faces(around: int, first: int) -> npt.NDArray[Any]:
-    """Return the triangles of a strip about the edge: len(_PROFILE) rings of so many vertices."""
+    """Return the triangles of a strip about the edge.
+
+    The strip has len(_PROFILE) rings of `around` vertices.
+    """
     here = np.arange(around)
     following = np.roll(here, -1)
     faces = []

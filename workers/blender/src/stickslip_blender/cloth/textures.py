@@ -1,7 +1,7 @@
-"""The cloth textures, drawn by formula: a square of cloth seen flat.
+"""The cloth textures, drawn by formula: a square of cloth in a flat view.
 
-Periods are a centimetre and more on a cloth of 20 cm: at 224 x 224 a thread would be noise, a
-pattern is not.
+Periods are at least a centimetre on a cloth of 20 cm. At 224 x 224, a thread would be noise, but a
+pattern is visible.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,10 @@ from stickslip_schemas.format.pictures import read_picture
 from stickslip_schemas.spec.names import Texture
 
 SIZE = 512
-"""Side of a texture [texels]: 0.4 mm on the cloth, a seventh of a pixel."""
+"""Side of a texture [texels].
+
+A texel is 0.4 mm on the cloth, a seventh of a pixel.
+"""
 _OVERSAMPLING = 2
 
 Field = npt.NDArray[np.float64]
@@ -40,10 +43,10 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
 def custom_texture(data: bytes) -> npt.NDArray[np.uint8]:
     """Return the picture in a file of a user, as `texture_image` does.
 
-    Its upper edge is the held one.
+    The upper edge of the picture is the held edge of the cloth.
 
     Raises:
-        UnfitPictureError: It is no picture that a cloth can be printed with.
+        UnfitPictureError: The file is not a picture that can be printed on a cloth.
     """
     picture = Image.fromarray(np.flipud(read_picture(data))).resize(
         (SIZE, SIZE), Image.Resampling.BILINEAR
@@ -59,7 +62,7 @@ def _mix(where: npt.NDArray[np.bool_] | Field, there: Rgb | Field, elsewhere: Rg
 
 
 def _phase(x: Field, count: float) -> Field:
-    """Return where in its period a point is, [0, 1), with `count` periods on the cloth."""
+    """Return the position of a point in its period, [0, 1), with `count` periods on the cloth."""
     return np.asarray(np.mod(x * count, 1.0))
 
 
@@ -71,7 +74,10 @@ def _dots(u: Field, v: Field) -> Field:
 
 
 def _plaid(u: Field, v: Field) -> Field:
-    """Draw a tartan: the same sett as warp and as weft, each seen half."""
+    """Draw a tartan.
+
+    The warp and the weft have the same sett, and each gives half of the colour.
+    """
 
     def threads(x: Field) -> Field:
         place = _phase(x, 3)
@@ -142,7 +148,7 @@ def _argyle(u: Field, v: Field) -> Field:
 
 
 def _camouflage(u: Field, v: Field) -> Field:
-    """Draw blots of three colours where sums of waves are high, seeded.
+    """Draw seeded blots of three colours in places with high sums of waves.
 
     The pattern repeats at the edges.
     """
@@ -158,7 +164,10 @@ def _camouflage(u: Field, v: Field) -> Field:
 
 
 def _terrazzo(u: Field, v: Field) -> Field:
-    """Strew chips of five colours over off-white, seeded; the pattern repeats at the edges."""
+    """Strew chips of five colours over off-white, seeded.
+
+    The pattern repeats at the edges.
+    """
     picture = np.broadcast_to(np.asarray((226, 222, 214), dtype=np.float64), (*u.shape, 3))
     random = np.random.Generator(np.random.PCG64(13))
     chips: tuple[Rgb, ...] = (

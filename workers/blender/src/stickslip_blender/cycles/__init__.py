@@ -1,1 +1,1 @@
-"""All use of Blender: its engine and device, what stands in a scene, and the pixels of a frame."""
+"""All use of Blender: its engine and device, the objects of a scene, and the pixels of a frame."""

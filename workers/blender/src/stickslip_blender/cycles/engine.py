@@ -1,6 +1,6 @@
 """Blender: its import, the device of Cycles, and settings that all scenes share.
 
-The environment variable STICKSLIP_RENDER_DEVICE names the device; the default is the CPU. Noise
+The environment variable STICKSLIP_RENDER_DEVICE names the device. The default is the CPU. Noise
 differs between the CPU and a GPU, and it may differ between GPUs and drivers. The device is
 therefore part of the renderer's build, and workers with different devices share no results. All
 scenes have one thread and a fixed seed.
@@ -19,7 +19,7 @@ from typing import Any, Literal
 from stickslip_schemas.installation import install_hint
 from stickslip_schemas.spec.jobs import Quality
 
-# Debian's names
+# Names of Debian packages
 SYSTEM_LIBRARIES = (
     "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libxext6 libxcb1 libgl1"
 )
@@ -35,7 +35,7 @@ class NoDeviceError(RuntimeError):
 
 
 def import_bpy() -> Any:
-    """Return the bpy module; an ImportError names what is missing."""
+    """Return the bpy module; an ImportError names the missing package."""
     if "bpy" in sys.modules:
         return sys.modules["bpy"]
     try:
@@ -57,10 +57,8 @@ def import_bpy() -> Any:
 def _one_processor() -> Iterator[None]:
     """Show one processor to Blender's task scheduler while it starts.
 
-    So it makes no worker threads.
-
-    Each process renders with one thread. Idle TBB workers spin: each used half a core while nothing
-    was rendered.
+    The scheduler then makes no worker threads. Each process renders with one thread. Idle TBB
+    workers spin: each of them used half a core without any rendering.
     """
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
@@ -85,9 +83,9 @@ def device() -> str:
 
 
 def use_device(scene: Any) -> None:
-    """Render a scene on the requested device; raise NoDeviceError where Cycles finds none.
+    """Render a scene on the requested device; raise NoDeviceError if Cycles finds none.
 
-    Call it after reading factory settings, which reset the devices.
+    Call it after reading factory settings, because they reset the devices.
     """
     if device() != CPU:
         _find_devices()
@@ -95,7 +93,7 @@ def use_device(scene: Any) -> None:
 
 
 def described() -> dict[str, Any]:
-    """Return what the pixels depend on: the device and, for GPUs, names and driver.
+    """Return the device and, for GPUs, the names and the driver, because pixels depend on them.
 
     Only the driver's major version counts.
     """
@@ -141,42 +139,48 @@ def _driver() -> str:
 
 @dataclass(frozen=True)
 class Sampling:
-    """What a quality means to Cycles."""
+    """The settings of Cycles for a quality."""
 
     samples: int
     """Paths per pixel."""
     denoiser: Literal["none", "quick", "plain", "guided"] = "none"
-    """OpenImageDenoise; `guided` by albedo and normal, for textures have edges; `quick`: its
-    smallest network.
+    """The denoiser, OpenImageDenoise.
 
-    Guides are those of what a smooth floor mirrors, as noisy as the gloss itself: light of an even
-    cloth is `plain`.
+    `guided` also uses albedo and normal, because textures have edges. `quick` is its smallest
+    network. On a smooth floor, these guides show the mirrored things, and they are as noisy as the
+    gloss. The light of an even cloth therefore uses `plain`.
     """
     seed: int = 0
-    """Of the sampling noise, the same for every frame: the remaining noise does not flicker, and
-    clips compress.
+    """Seed of the sampling noise.
+
+    Every frame has the same seed, so the remaining noise does not flicker, and clips compress.
     """
     skipped: int = 0
-    """Paths per pixel that are left out first. Cycles sends the very first one through the middle
-    of the pixel.
+    """Paths per pixel to skip first.
+
+    Cycles sends the very first path through the middle of the pixel.
     """
 
 
 @dataclass(frozen=True)
 class ClothSampling:
-    """What a quality means to a clip of cloth, whose light is denoised."""
+    """The settings of Cycles for a clip of cloth, whose light is denoised."""
 
     frame: int
     """Paths per pixel in the whole frame."""
     window: int
-    """Paths in the window that the cloth is in, per pixel of its shading: FINE x FINE for one of a
-    picture.
+    """Paths in the window around the cloth, per pixel of its shading.
+
+    A shading has FINE x FINE pixels for one pixel of a picture.
     """
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
 
     def over(self, area: float) -> ClothSampling:
-        """Trace more paths for the same cost if the window has a smaller area [px^2]."""
+        """Return a sampling with more paths if the window has a small area [px^2].
+
+        The cost stays the same.
+        """
         return replace(
             self,
             window=round(self.window * min(max(_FULL_AREA / max(area, 1.0), 1.0), _MAX_PATH_RATIO)),
@@ -184,22 +188,22 @@ class ClothSampling:
 
     @property
     def finer(self) -> ClothSampling:
-        """Half the noise: for a clip that is below its floors."""
+        """Sampling with half the noise, for a clip below its floors."""
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
 _FULL_AREA = 13_000.0  # of a window from which on the paths of the quality suffice [px^2]
 _MAX_PATH_RATIO = 1.6  # most times as many paths in a smaller window
 
-# Frozen: a change makes other pictures and another build digest. benchmarks/render_rods.py measures
-# them.
+# These numbers are frozen. A change makes other pictures and another build digest.
+# benchmarks/render_rods.py measures the pictures.
 SAMPLING = {
     Quality.preview: Sampling(samples=4),
     Quality.draft: Sampling(samples=8),
     Quality.standard: Sampling(samples=28),
     Quality.high: Sampling(samples=128),
 }
-# The same for cloth, whose clips are thirty frames: benchmarks/render_cloth.py measures them.
+# The same for cloth, whose clips have thirty frames. benchmarks/render_cloth.py measures the clips.
 CLOTH_SAMPLING = {
     Quality.preview: ClothSampling(1, 1, (24.0, 20.0, 21.0)),
     Quality.draft: ClothSampling(1, 3, (30.0, 27.0, 25.0)),
@@ -211,11 +215,12 @@ CLOTH_SAMPLING = {
 def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: bool = True) -> Any:
     """Empty Blender and return its one scene, with the engine set up and a world.
 
-    Blender holds one scene per process: a second one in the same process would empty the first.
+    Blender holds one scene per process. A second call in the same process would empty the first
+    scene.
     """
     bpy = import_bpy()
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    # Blender makes a directory for itself, which is never used, and a killed process leaves it
+    # Blender makes a directory that the renderer never uses. A killed process would leave it
     # behind.
     with suppress(OSError):
         Path(bpy.app.tempdir).rmdir()
@@ -223,8 +228,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     render = scene.render
     cycles = scene.cycles
     render.engine = "CYCLES"
-    # One thread: workers run several renderers beside each other, and bytes never depend on
-    # their number.
+    # Render with one thread. Workers run several renderers at the same time, and bytes never depend
+    # on the number of threads.
     render.threads_mode = "FIXED"
     render.threads = 1
     render.use_persistent_data = True
@@ -232,8 +237,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     render.use_sequencer = False
     render.resolution_percentage = 100
     use_device(scene)
-    # The same number of paths for every pixel, and no limit of time: no pixel depends on the
-    # machine's load.
+    # Trace the same number of paths for every pixel, without a time limit. No pixel then depends on
+    # the machine's load.
     cycles.use_animated_seed = False
     cycles.use_adaptive_sampling = False
     cycles.time_limit = 0.0
@@ -245,8 +250,8 @@ def new_scene(*, max_bounces: int = 2, diffuse_bounces: int = 1, light_tree: boo
     cycles.glossy_bounces = 1
     cycles.use_light_tree = light_tree
 
-    # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither: colors
-    # keep meaning.
+    # 8-bit values are the sRGB encoding of the light itself, without filmic curve or dither.
+    # Colours keep their meaning.
     scene.display_settings.display_device = "sRGB"
     view = scene.view_settings
     view.view_transform = "Standard"

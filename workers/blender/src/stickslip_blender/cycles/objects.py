@@ -13,10 +13,10 @@ from stickslip_blender.cycles.engine import import_bpy
 SENSOR_WIDTH = 36.0  # [mm]; only the ratio of focal length to sensor width matters
 _CLIP = (1e-3, 1e3)  # [scene units]
 SHARP = np.radians(40.0)
-"""Angle between faces above which an edge is no part of a smooth skin [rad]."""
+"""Angle between faces above which an edge splits a smooth skin [rad]."""
 
-# least roughness that other rays than a camera's meet: at 0.4, light of a steel floor was twice as
-# noisy
+# Least roughness for every ray that does not come from the camera. At 0.4, the light of a steel
+# floor was twice as noisy.
 SOFT = 0.6
 
 _MIX_INPUTS = (
@@ -31,7 +31,7 @@ Array = npt.NDArray[np.float64]
 def add_mesh(scene: Any, name: str, vertices: npt.ArrayLike, faces: Sequence[Sequence[int]]) -> Any:
     """Add a mesh of vertices (n, 3) and polygons, and return its data.
 
-    It is smooth but for edges above `SHARP`.
+    It is smooth except at edges above `SHARP`.
     """
     bpy = import_bpy()
     mesh = bpy.data.meshes.new(name)
@@ -53,7 +53,7 @@ def move_mesh(mesh: Any, points: npt.ArrayLike) -> None:
 def add_material(mesh: Any, name: str, **inputs: Any) -> Any:
     """Give a mesh a material of the Principled shader, and return the shader.
 
-    Its inputs are as for `set_inputs`.
+    `inputs` has the form of `set_inputs`.
     """
     material = import_bpy().data.materials.new(name)
     shader = material.node_tree.nodes["Principled BSDF"]
@@ -63,19 +63,18 @@ def add_material(mesh: Any, name: str, **inputs: Any) -> Any:
 
 
 def set_inputs(shader: Any, **inputs: Any) -> None:
-    """Set inputs of a shader by name, `_` for a blank."""
+    """Set inputs of a shader by name, with `_` for a blank."""
     for words, value in inputs.items():
         shader.inputs[words.replace("_", " ")].default_value = value
 
 
 def set_roughness(shader: Any, roughness: float) -> None:
-    """Set the roughness of a shader as cameras see it.
+    """Set the roughness of a shader for rays of the camera.
 
-    Every other ray meets one of at least `SOFT`.
-
-    Else a lamp that a mirror shows in the gloss of cloth is noise that no number of paths cures.
-    Cycles' own remedies (no caustics, filtered gloss, clamped light) act on paths by the albedos
-    that they meet: dark prints shine more.
+    Every other ray meets a roughness of at least `SOFT`. Otherwise a mirror shows the lamp in the
+    gloss of cloth, and no number of paths cures that noise. Cycles has its own remedies: no
+    caustics, filtered gloss, clamped light. They act on paths by the albedos that the paths meet,
+    so dark prints would shine more.
     """
     tree = shader.id_data
     softened = tree.nodes.get("softened")
@@ -106,7 +105,7 @@ class Lamp:
     def aim(self, at: Array, outward: Array, distance: float) -> None:
         """Place the lamp at a distance from a point, and turn it to the point.
 
-        `outward` is its direction from the point.
+        `outward` is the direction of the lamp from the point.
         """
         from mathutils import Vector
 
@@ -123,7 +122,7 @@ class Fabric:
     def __init__(self, mesh: Any, uv: Array, corners: npt.NDArray[np.int32]) -> None:
         """Give a mesh texture coordinates (V, 2) and the material.
 
-        Coordinates are by its corners, in the order of its faces.
+        `corners` has the vertex of each corner, in the order of the faces.
         """
         mesh.uv_layers.new(name="rest").uv.foreach_set(
             "vector", uv[corners].astype(np.float32).ravel()
@@ -158,7 +157,7 @@ class Fabric:
     def set_color(self, color: Sequence[float], other: Sequence[float] | None = None) -> None:
         """Give the cloth a linear colour.
 
-        Rays that do not come from the camera may have another one.
+        Rays that do not come from the camera may see another colour.
         """
         self._shown.default_value = (*color, 1.0)
         self._other.default_value = (*(other or color), 1.0)
@@ -188,7 +187,7 @@ def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
     """Return the socket of a colour: `seen` for rays of the camera, `other` for the rest."""
     mix = tree.nodes.new("ShaderNodeMix")
     mix.data_type = "RGBA"
-    # A mix node has inputs of all data types; identifiers tell those of colours.
+    # A mix node has inputs of all data types. Identifiers distinguish the inputs of colours.
     sockets = {socket.identifier: socket for socket in mix.inputs}
     factor, a, b = (sockets[identifier] for identifier in _MIX_INPUTS)
     tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], factor)
@@ -205,7 +204,7 @@ def set_pixels(image: Any, color: npt.NDArray[np.floating[Any]]) -> None:
 
 
 def add_view(scene: Any) -> Any:
-    """Add a perspective camera to the scene, make it the scene's, and return it."""
+    """Add a perspective camera to the scene, make it the scene's camera, and return it."""
     bpy = import_bpy()
     data = bpy.data.cameras.new("view")
     data.type = "PERSP"
@@ -221,7 +220,7 @@ def add_view(scene: Any) -> Any:
 def set_view(scene: Any, camera: Camera) -> None:
     """Make the scene's camera project as `camera` does.
 
-    Blender's camera looks along -z with y up, and its shifts are in units of the image's width, in
+    Blender's camera looks along -z with y up. Its shifts are in units of the image's width, in
     square pixels.
     """
     from mathutils import Matrix
@@ -230,8 +229,8 @@ def set_view(scene: Any, camera: Camera) -> None:
     view = scene.camera
     render.resolution_x = camera.width
     render.resolution_y = camera.height
-    # Pixels that are not square: Blender takes aspects >= 1 and measures in the narrower of the
-    # two.
+    # For pixels that are not square, Blender takes aspects of at least 1 and measures in the
+    # narrower of the two.
     ratio = camera.fx / camera.fy  # a pixel's height over its width
     render.pixel_aspect_x = max(1.0, 1.0 / ratio)
     render.pixel_aspect_y = max(1.0, ratio)
@@ -253,27 +252,28 @@ class SoftBox:
 
     Its radiance falls off from its middle as cos^sharpness of the angle.
 
-    Area lights would cost more: Cycles picks one of them at random at each sample, and on a thin
+    Area lights would cost more. Cycles picks one of them at random at each sample, and on a thin
     rod that was 6 dB noisier at equal samples.
     """
 
     azimuth: float
-    """Direction seen from the scene, from +x towards +y [degree]."""
+    """Azimuth from the scene, from +x towards +y [degree]."""
     elevation: float
-    """Above the horizon [degree]."""
+    """Angle above the horizon [degree]."""
     radiance: float
-    """In its middle; a white matt thing under a sky of radiance 1 is white in the picture."""
+    """Radiance in the middle.
+
+    A white matt thing under a sky of radiance 1 is white in the picture.
+    """
     sharpness: float
-    """Exponent; 2 is wide, 8 is a window."""
+    """Exponent of the fall-off. For example, 2 is wide, and 8 is a window."""
 
 
 def panorama(boxes: Sequence[SoftBox], ambient: float) -> npt.NDArray[np.float32]:
     """Return the radiance of soft boxes and an even ambient light.
 
-    The shape is (HEIGHT, 2 HEIGHT), with row 0 lowest.
-
-    Column c of n looks to azimuth 180 - 360 (c + 1/2) / n degrees, as Blender's equirectangular
-    mapping does.
+    The shape is (HEIGHT, 2 HEIGHT), with row 0 lowest. Column c of n looks to azimuth 180 - 360 (c
+    + 1/2) / n degrees, as Blender's equirectangular mapping does.
     """
     elevation = np.pi * ((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5)[:, None]
     azimuth = np.pi * (1.0 - (np.arange(2 * HEIGHT) + 0.5) / HEIGHT)[None, :]

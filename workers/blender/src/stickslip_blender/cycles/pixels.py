@@ -1,7 +1,7 @@
 """Read rendered frames from Blender as linear light, and encode light as sRGB.
 
 Headless Blender gives no access to its pixels in memory, so a frame goes through an uncompressed
-file: an anonymous one in memory, of which a killed process leaves nothing behind.
+file. The file is an anonymous one in memory, so a killed process leaves nothing behind.
 """
 
 import faulthandler
@@ -31,10 +31,13 @@ def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
 
     Row 0 is on top.
 
-    It reads the one kind of OpenEXR file that we have Blender write: scan lines of half floats, not
-    compressed. [OpenEXR, File Layout]: a magic number and version; attributes (name, type, size,
-    value) up to an empty name; offsets of the lines; and the lines, each with its row, its size in
-    bytes and its channels in alphabetical order.
+    The function reads only one kind of OpenEXR file: scan lines of half floats, not compressed.
+    Blender writes this kind here. The file has these parts [OpenEXR, File Layout]:
+
+    - a magic number and version
+    - attributes (name, type, size, value) up to an empty name
+    - offsets of the lines
+    - the lines, each with its row, its size in bytes and its channels in alphabetical order
     """
     magic, version = struct.unpack_from("<ii", data)
     if magic != _MAGIC or version & _MULTI_PART_OR_DEEP_OR_TILED:
@@ -58,7 +61,7 @@ def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
 
 
 def _attributes(data: bytes) -> tuple[dict[str, bytes], int]:
-    """Return the values of the header's attributes by name, and where the header ends."""
+    """Return the values of the header's attributes by name, and the end of the header."""
     found: dict[str, bytes] = {}
     at = 8
     while data[at] != 0:
@@ -127,13 +130,13 @@ class FrameReader:
     def read_light(self, window: Window | None = None, fine: int = 1) -> npt.NDArray[np.float16]:
         """Render the scene, or a window of it: linear light (height, width, 3), not clipped.
 
-        A window has the very values that it would have in the whole frame. Each pixel is rendered
-        as fine x fine ones.
+        A window has exactly the values that it would have in the whole frame. The scene is rendered
+        with fine x fine pixels for each pixel.
         """
         return read_exr(self._rendered("RGB", window, fine), "RGB")
 
     def read_matte(self, window: Window | None = None) -> npt.NDArray[np.float16]:
-        """Render as `read_light` does, before nothing: (height, width, 4).
+        """Render as `read_light` does, with a transparent background: (height, width, 4).
 
         The channels are light times coverage, and coverage.
         """
@@ -178,8 +181,8 @@ def _set_window(render: Any, window: Window | None, fine: int) -> None:
     if window is not None:
         width = render.resolution_x
         height = render.resolution_y
-        # Blender truncates to whole pixels: half of one keeps rounding out of it. It counts rows
-        # from below.
+        # Blender truncates to whole pixels, so half a pixel keeps rounding out of it. Blender
+        # counts rows from below.
         half = 0.5 / fine
         render.border_min_x = (window.left + half) / width
         render.border_max_x = (window.right + half) / width

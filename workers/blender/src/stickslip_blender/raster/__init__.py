@@ -1,9 +1,10 @@
-"""A rasteriser: what a camera sees of a mesh, without light.
+"""A rasteriser: a camera's view of a mesh, without light.
 
 Cycles gives the light. Albedo at texture edges, silhouettes, depth and other ground truth are
-geometry, and cost far less here: which triangle each sample of an image sees, what is interpolated
-there, and the albedo of many textures. The compiled part is `_raster`; raster/raster.hpp says where
-samples lie and how textures are looked up.
+geometry, and the rasteriser computes them at a far lower cost. It finds the triangle that each
+sample of an image sees, interpolates values there, and gives the albedo of many textures. The
+compiled part is `_raster`. raster/raster.hpp defines the places of the samples and the lookup of
+textures.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,10 @@ from stickslip_schemas.spec.cameras import Camera
 from stickslip_blender.raster import _raster
 
 GRID = 12
-"""Samples across a pixel, and down: silhouettes are then within 0.0005 of their coverage."""
+"""Samples across a pixel, and down.
+
+Silhouettes are then within 0.0005 of their coverage.
+"""
 
 _LANES = 8  # channels are filled up to a multiple
 
@@ -47,7 +51,7 @@ class Window:
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def times(self, fine: int) -> "Window":
-        """Return the same part where each pixel is fine x fine ones."""
+        """Return the same part of a frame with fine x fine pixels for each pixel."""
         return Window(fine * self.left, fine * self.top, fine * self.right, fine * self.bottom)
 
     @property
@@ -58,20 +62,21 @@ class Window:
 
 @dataclass(frozen=True)
 class Seen:
-    """Which triangle each sample of a window sees."""
+    """The triangle that each sample of a window sees."""
 
     points: Points
     """Projected vertices: column, row [px] and depth [scene units], shape (V, 3)."""
     triangles: Indices
-    """Shape (T, 3)."""
+    """Corners of the triangles, shape (T, 3)."""
     window: Window
     grid: int
     """Samples across a pixel."""
     triangle: Indices
-    """By sample, -1 if there is none; shape (grid height, grid width)."""
+    """Triangle of each sample, or -1 for no triangle, shape (grid height, grid width)."""
     places: Points | None = None
-    """Columns and rows of the samples [px], (height, width, 2); none: the middles of the pixels of
-    the window.
+    """Columns and rows of the samples [px], (height, width, 2).
+
+    None stands for the middles of the pixels of the window.
     """
 
     def share_below(self, end: int) -> npt.NDArray[np.float32]:
@@ -85,9 +90,9 @@ class Seen:
         return share
 
     def looked_up(self, places: Points) -> "Seen":
-        """Return what positions (height, width, 2) [px] of the frame see, with a grid of 1.
+        """Return the view at positions (height, width, 2) [px] of the frame, with a grid of 1.
 
-        The nearest sample answers.
+        Each position gets the triangle of the nearest sample.
         """
         near = np.rint(places).astype(int) - (self.window.left, self.window.top)
         return replace(self, triangle=self.triangle[near[..., 1], near[..., 0]], places=places)
@@ -95,9 +100,8 @@ class Seen:
     def at_centers(self, values: npt.ArrayLike, fill: float = 0.0) -> npt.NDArray[np.float64]:
         """Interpolate values of vertices (V, k) in perspective at the samples.
 
-        Samples that see nothing get `fill`.
-
-        For a grid of one sample a pixel. Returns shape (height, width, k).
+        Samples that see nothing get `fill`. The grid must have one sample a pixel. Returns shape
+        (height, width, k).
         """
         if self.grid != 1:
             raise ValueError(
@@ -118,7 +122,7 @@ class Seen:
 def barycentric(corners: Points, places: npt.NDArray[Any]) -> Points:
     """Return the weights (n, 3) of flat triangles' corners (n, 3, 2) at positions (n, 2).
 
-    All are in the image.
+    Corners and positions are in the image.
     """
     a, b, c = (corners[:, k] for k in range(3))
 
@@ -149,7 +153,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 
 def window_about(points: Points, camera: Camera, margin: int = 1) -> Window:
-    """Return the part of the frame that projected points are in, with so many pixels around it."""
+    """Return the part of the frame that contains projected points, with a margin around it [px]."""
     places = points[np.isfinite(points[:, 0]), :2]  # the others are behind the camera
     if not len(places):
         return Window(0, 0, 0, 0)
@@ -174,9 +178,9 @@ def fans(faces: Sequence[Sequence[int]]) -> Indices:
 
 
 def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
-    """Find which of the triangles (T, 3) of projected points is nearest at each sample of a window.
+    """Find the nearest of the triangles (T, 3) of projected points at each sample of a window.
 
-    A triangle that reaches behind the camera is not seen.
+    A triangle that reaches behind the camera is invisible.
     """
     behind = ~(points[:, 2] > 0.0)
     if behind.any():
@@ -208,24 +212,24 @@ class Textures:
 
 @dataclass(frozen=True)
 class Albedo:
-    """What the pixels of a window see of a cloth."""
+    """The cloth in the pixels of a window."""
 
     coverage: npt.NDArray[np.float32]
-    """Share of each pixel, shape (height, width)."""
+    """Share of each pixel that shows cloth, shape (height, width)."""
     mean: npt.NDArray[np.float32]
-    """Linear albedo of the visible cloth, 0 elsewhere; shape (height, width, textures, 3)."""
+    """Linear albedo of the visible cloth, 0 elsewhere, shape (height, width, textures, 3)."""
     hits: npt.NDArray[np.int32]
-    """Samples that see each of the cloth's triangles."""
+    """Number of samples that see each of the cloth's triangles."""
     overall: npt.NDArray[np.float32]
-    """Mean albedo of all that is seen of the cloth, shape (textures, 3)."""
+    """Mean albedo of all visible cloth, shape (textures, 3)."""
     area: float
-    """Of the cloth's triangles, each seen alone [pixels]."""
+    """Sum of the areas of the cloth's triangles, each without the others in front [pixels]."""
 
 
 def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
-    """Mean textures over the visible part of the first `cloth` triangles.
+    """Average the textures over the visible part of the first `cloth` triangles.
 
-    Uv: texture coordinates (V, 2) in [0, 1].
+    `uv` are texture coordinates (V, 2) in [0, 1].
     """
     packed = textures.texels, textures.count, seen.window.place, seen.grid
     return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))

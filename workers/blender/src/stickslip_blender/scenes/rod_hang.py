@@ -1,7 +1,7 @@
-"""A hanging silicone rod, seen by all cameras of its rig before a dark ground, under soft lights.
+"""A hanging silicone rod under soft lights, in front of a dark ground, in all cameras of its rig.
 
 No clamp is in the picture: the rod begins at its first point. To recover the centreline from an
-image (thesis 5.3.1), threshold against the ground; every bright pixel is rod.
+image (thesis 5.3.1), threshold against the ground. Every bright pixel is rod.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def transport_frames(tangents: FloatArray) -> FloatArray:
 
     Return (n, 2, 3), two unit normals at each point.
 
-    From point to point the frame turns by the least rotation that takes the tangent t to t', which
-    for a normal n is n' = n - (n . t') (t + t') / (1 + t . t').
+    From point to point, the frame turns by the least rotation that takes the tangent t to t'. For a
+    normal n, this is n' = n - (n . t') (t + t') / (1 + t . t').
     """
     normals = np.empty_like(tangents)
     axis = np.eye(3)[np.argmin(np.abs(tangents[0]))]
@@ -68,10 +68,8 @@ def transport_frames(tangents: FloatArray) -> FloatArray:
 def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
     """Return the vertices of the tube about a centreline (n, 3).
 
-    The shape is (n SIDES + CAP_RINGS SIDES + 2, 3).
-
-    In order: n rings, the rings of the round end, its pole, the middle of the flat end in the
-    clamp.
+    The shape is (n SIDES + CAP_RINGS SIDES + 2, 3). The order is: n rings, the rings of the round
+    end, its pole, and the middle of the flat end in the clamp.
     """
     tangents = np.gradient(centerline, axis=0, edge_order=2)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -79,7 +77,7 @@ def tube_vertices(centerline: FloatArray, radius: float) -> FloatArray:
     angle = 2.0 * np.pi / SIDES * np.arange(SIDES)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (SIDES, 2)
     rings = centerline[:, None] + radius * circle @ normals  # (n, SIDES, 3)
-    # Rings of the half sphere on the free end, smaller and farther along the tangent.
+    # Make the rings of the half sphere on the free end, each smaller and farther along the tangent.
     rise = np.pi / 2.0 / (CAP_RINGS + 1) * np.arange(1, CAP_RINGS + 1)[:, None, None]
     cap = centerline[-1] + radius * (
         np.cos(rise) * (circle @ normals[-1]) + np.sin(rise) * tangents[-1]
@@ -97,7 +95,7 @@ def tube_faces(points: int) -> list[tuple[int, ...]]:
     pole = rings * SIDES
     middle = rings * SIDES + 1
     faces: list[tuple[int, ...]] = []
-    # Quadrilaterals between neighbouring rings; then fans to the pole and to the flat end.
+    # Make quadrilaterals between neighbouring rings, then fans to the pole and to the flat end.
     for ring in range(rings - 1):
         for side in range(SIDES):
             a = ring * SIDES + side
@@ -116,7 +114,8 @@ RADIUS = 0.008  # [L], the default
 GROUND = 0.0025  # linear light of the dark ground
 GROUND_LEVEL = 8  # the same in a picture, of 255
 
-# Strong and weak by turns, high up: each of the four views of rod-4 has a lit and a shaded side.
+# Strong and weak lights alternate, high up. Each of the four views of rod-4 has a lit and a shaded
+# side.
 AMBIENT = 0.2
 SOFT_BOXES = (
     SoftBox(azimuth=40.0, elevation=40.0, radiance=2.4, sharpness=4.0),
@@ -130,7 +129,7 @@ Color = tuple[float, float, float]
 def silicone_color(seed: int) -> Color:
     """Draw a bright, saturated color, sRGB in [0, 1], rounded to 1/255.
 
-    Hue uniform, HSV saturation in [0.55, 0.95], value in [0.7, 1].
+    The hue is uniform, the HSV saturation is in [0.55, 0.95], and the value is in [0.7, 1].
     """
     hue, saturation, value = np.random.Generator(np.random.PCG64(seed)).random(3)
     color = colorsys.hsv_to_rgb(hue, 0.55 + 0.4 * saturation, 0.7 + 0.3 * value)
@@ -173,9 +172,8 @@ class RodRenderer:
     ) -> npt.NDArray[np.uint8]:
         """Render a centreline (points, 3) [L] with each camera: 8-bit sRGB.
 
-        The shape is (cameras, height, width, 3).
-
-        Seed: added to that of the sampling, so that pictures of a dataset differ in their noise.
+        The shape is (cameras, height, width, 3). `seed` is added to the seed of the sampling, so
+        pictures of a dataset differ in their noise.
         """
         line = np.asarray(centerline, dtype=np.float64)
         if line.shape != (POINTS, 3) or not np.isfinite(line).all():
@@ -209,13 +207,13 @@ class RodRenderer:
     ) -> npt.NDArray[np.float32]:
         """Put the light of the rod (h, w, 4) before the ground.
 
-        Its last channel is the share of samples that hit the rod.
+        The last channel of the light is the share of samples that hit the rod.
 
-        Most noise on a thin rod is in how many samples hit it. So the mean light of the hits,
-        together with one sample's worth of the pixels around, gets the coverage (h, w) that the
-        rasteriser computes.
+        Most noise on a thin rod comes from the number of samples that hit it. So the code takes the
+        mean light of the hits, together with one sample's worth of the pixels around. This mean
+        gets the coverage (h, w) that the rasteriser computes.
         """
-        # Light and hits of the 3 x 3 pixels around each.
+        # Sum the light and the hits of the 3 x 3 pixels around each pixel.
         padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))
         rows, columns = coverage.shape
         shifted = [
@@ -224,12 +222,13 @@ class RodRenderer:
         ]
         around = np.sum(shifted, axis=0)
 
-        # Their mean counts as one more sample that hit: a pixel at the edge may have none itself.
+        # Their mean counts as one more sample that hit, because a pixel at the edge may have no hit
+        # itself.
         hit = around[..., 3:] > 0.0
         prior = around / np.where(hit, around[..., 3:], 1.0) / self._sampling.samples
         mean = (light + prior)[..., :3] / np.where(hit, (light + prior)[..., 3:], 1.0)
 
-        # The exact coverage in place of the share of hits, which is noisy.
+        # Use the exact coverage instead of the share of hits, which is noisy.
         alpha = np.where(hit, coverage[..., None], 0.0)
         return np.asarray(alpha * mean + (1.0 - alpha) * np.float32(GROUND), dtype=np.float32)
 
@@ -244,7 +243,7 @@ def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> Tas
     renderer = context.renderer(
         ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality)
     )
-    # The seed of the colour is that of the noise, too: rods of a dataset differ in both.
+    # The seed of the colour is also the seed of the noise, so rods of a dataset differ in both.
     views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
     preview = (
         context.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
