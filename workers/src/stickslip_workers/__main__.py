@@ -28,7 +28,7 @@ STEADY_SECONDS = 60.0
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit status."""
+    """Run a command, and return its exit status."""
     options = _parser().parse_args(arguments)
     if options.command == "dispatch" and not options.once:
         words = sys.argv[1:] if arguments is None else arguments
@@ -131,7 +131,10 @@ def _describe(_options: argparse.Namespace) -> int:
 
 
 def _store(place: str) -> str:
-    """Return the place of a store; raise ArgumentTypeError if it cannot be opened."""
+    """Return the place of a store.
+
+    Raises ArgumentTypeError if the store cannot be opened.
+    """
     try:
         open_store(place)
     except ValueError as error:
@@ -187,7 +190,7 @@ def _dispatch(options: argparse.Namespace) -> int:
 
     def stop(number: int, _frame: object) -> None:
         if dispatcher is None or dispatcher.stopping:
-            raise SystemExit(128 + number)  # nothing is running yet, or this is the second time
+            raise SystemExit(128 + number)  # nothing runs yet, or this is the second signal
         if not dispatcher.stop():
             raise SystemExit(0)
 
@@ -203,7 +206,7 @@ def _dispatch(options: argparse.Namespace) -> int:
 
 
 def run_for_ever(command: list[str], backoff: Backoff) -> int:
-    """Run a dispatcher, and start it again if it fails; return its status after a stop.
+    """Run a dispatcher, start it again if it fails, and return its status after a stop.
 
     A driver of Ray may die with its cluster in any state, and it cannot connect to another cluster.
     """
@@ -223,7 +226,7 @@ def run_for_ever(command: list[str], backoff: Backoff) -> int:
         # and not also from the terminal.
         child = subprocess.Popen(command, process_group=0, preexec_fn=_die_with_parent)
         status = child.wait()
-        if stopped or status in (0, 2):  # 2: its arguments make no sense
+        if stopped or status in (0, 2):  # 2: its arguments are wrong
             return status
         if time.monotonic() - began > STEADY_SECONDS:
             backoff.succeeded()

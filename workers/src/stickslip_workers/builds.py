@@ -17,13 +17,19 @@ if TYPE_CHECKING:
 
 
 def scene_module(name: str) -> str:
-    """Return the module that simulates a kind; raise UnknownKindError."""
+    """Return the module that simulates a kind.
+
+    Raises UnknownKindError for an unknown kind.
+    """
     kind_named(name)
     return f"stickslip_sim_core.scenes.{name}"
 
 
 def kind(name: str) -> "Kind":
-    """Return the simulation of a kind; raise UnknownKindError."""
+    """Return the simulation of a kind.
+
+    Raises UnknownKindError for an unknown kind.
+    """
     simulated: Kind = import_module(scene_module(name)).KIND
     return simulated
 
@@ -33,7 +39,10 @@ _LIBRARIES = ("zarr", "numcodecs", "google-crc32c")
 
 
 def roots(stage: str, name: str) -> tuple[str, ...]:
-    """Return the modules that a stage of a kind starts from; raise ValueError for another stage."""
+    """Return the modules that a stage of a kind starts from.
+
+    Raises ValueError for a stage other than `simulate` and `pack`.
+    """
     if stage == "simulate":
         return (f"{_STAGES}.run", scene_module(name))
     if stage == "pack":

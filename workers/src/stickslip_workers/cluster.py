@@ -62,14 +62,14 @@ class RayCluster:
                     else (self.location / "address").read_text()
                 )
                 host, _, port = address.rpartition(":")
-                if host:  # Ray itself would wait for long where nobody listens
+                if host:  # Ray itself would wait long for an unused port
                     socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
                 handler = signal.getsignal(signal.SIGTERM)
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(
                         signal.SIGTERM, handler
-                    )  # Ray has put its own in place, which exits at once
+                    )  # Ray has set its own handler, which exits at once
                 return
             except (OSError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
                 log.info("no Ray at %s yet: %s", self.location, error)
@@ -98,7 +98,7 @@ SETTINGS = {
     "RAY_worker_register_timeout_seconds": "600",  # Python may import slowly
     "RAY_enable_metrics_collection": "0",
     "RAY_event_stats": "0",
-    "RAY_task_events_report_interval_ms": "0",  # nobody reads the history of tasks
+    "RAY_task_events_report_interval_ms": "0",  # no program reads the history of tasks
     "RAY_prestart_worker_first_driver": "0",
     # Ray also starts as many processes for waiting calls, and they come too late
     "RAY_num_workers_soft_limit": "0",
@@ -147,7 +147,7 @@ def run_head(directory: Path, cpus: int | None) -> None:
 
     Before the start, write `token` and `address` to the directory.
     """
-    shutil.rmtree(directory, ignore_errors=True)  # of an earlier head
+    shutil.rmtree(directory, ignore_errors=True)  # an earlier head may have left files
     directory.mkdir(exist_ok=True)
     token = directory / "token"
     token.touch(mode=0o600)

@@ -54,7 +54,10 @@ with open(answer, "w") as file:
 def replay(
     task: AnyTask, *, store: str, blender_python: Path, render_actor: str = RENDER_ACTOR
 ) -> TaskResult:
-    """Run a task and return its result; a render runs in Blender's interpreter."""
+    """Run a task, and return its result.
+
+    A render runs in Blender's interpreter.
+    """
     if not isinstance(task, RenderTask):
         return run_tasks([task], open_store(store))[0]
     with TemporaryDirectory() as scratch:

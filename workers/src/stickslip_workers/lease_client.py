@@ -90,19 +90,31 @@ class CoordinatorClient:
         """URLs of coordinators with one database. The client asks the first one."""
 
     def register(self, registration: api.WorkerRegistration) -> api.WorkerSession:
-        """Open a session; raise CoordinatorError."""
+        """Open a session.
+
+        Raises CoordinatorError.
+        """
         return self._post("/v1/workers", registration, api.WorkerSession)
 
     def lease(self, request: api.LeaseRequest) -> api.LeaseBatch:
-        """Lease tasks; raise CoordinatorError."""
+        """Lease tasks.
+
+        Raises CoordinatorError.
+        """
         return self._post("/v1/worker/lease", request, api.LeaseBatch, timeout=LONG_TIMEOUT)
 
     def heartbeat(self, heartbeat: api.Heartbeat) -> api.HeartbeatAnswer:
-        """Renew leases; raise CoordinatorError."""
+        """Renew leases.
+
+        Raises CoordinatorError.
+        """
         return self._post("/v1/worker/heartbeat", heartbeat, api.HeartbeatAnswer)
 
     def report(self, reports: api.ReportBatch) -> api.ReportAnswer:
-        """Report results; raise CoordinatorError."""
+        """Report results.
+
+        Raises CoordinatorError.
+        """
         return self._post("/v1/worker/report", reports, api.ReportAnswer, timeout=LONG_TIMEOUT)
 
     def close(self) -> None:
@@ -149,7 +161,7 @@ class Backoff:
         """Earliest time of the next attempt, on the monotonic clock [s]."""
 
     def failed(self) -> float:
-        """Record a failure and double the wait; return the time until the next attempt [s]."""
+        """Record a failure, double the wait, and return the time until the next attempt [s]."""
         delay = self._delay * random.uniform(0.5, 1.0)
         self._delay = min(2 * self._delay, self._most)
         self.next_try = time.monotonic() + delay
@@ -170,7 +182,10 @@ class Outbox:
     def __init__(self) -> None:
         self._reports: dict[str, api.Report] = {}
         self.report_at = math.inf
-        """Latest time of the next report, on the monotonic clock [s]; inf without a result."""
+        """Latest time of the next report, on the monotonic clock [s].
+
+        It is infinite without a result.
+        """
 
     def put(self, report: api.Report) -> None:
         """Add a report, in place of an older one of the same task."""
@@ -203,11 +218,14 @@ class LeaseTable:
 
     @property
     def report_at(self) -> float:
-        """Latest time of the next report, on the monotonic clock [s]; inf without a result."""
+        """Latest time of the next report, on the monotonic clock [s].
+
+        It is infinite without a result.
+        """
         return self._outbox.report_at
 
     def add(self, leases: Iterable[api.Lease]) -> None:
-        """Add leases; they replace older ones of the same tasks."""
+        """Add leases, in place of older ones of the same tasks."""
         with self._lock:
             for lease in leases:
                 self._states[lease.task_id] = api.LeaseState(
@@ -244,7 +262,7 @@ class LeaseTable:
                 self.put_result(state, None)
 
     def remove(self, leases: Iterable[api.Lease | api.LeaseState | api.Report]) -> None:
-        """Remove leases; newer ones of the same tasks stay."""
+        """Remove leases, but keep newer ones of the same tasks."""
         with self._lock:
             for lease in leases:
                 if self.holds(lease):
@@ -291,7 +309,7 @@ class Session(threading.Thread):
         self._requested_sessions = 1
         """Number of sessions requested so far."""
         self._open_session = 0
-        """Number of the open session; 0 before the first."""
+        """Number of the open session, 0 before the first."""
         self._ended = False
         self._wake = threading.Event()
         self.error: CoordinatorError | None = None
@@ -299,7 +317,7 @@ class Session(threading.Thread):
 
     @property
     def worker_id(self) -> str | None:
-        """ID of this dispatcher at the coordinator; None without an open session."""
+        """ID of this dispatcher at the coordinator, or None without an open session."""
         if self.error is not None:
             raise self.error
         is_open = self._open_session == self._requested_sessions
@@ -314,7 +332,7 @@ class Session(threading.Thread):
         self._wake.set()
 
     def send_heartbeat(self) -> float:
-        """Send one heartbeat; return the time until the next one [s]."""
+        """Send one heartbeat, and return the time until the next one [s]."""
         states = self.leases.states()
         condition = self._registration().condition
         message = api.Heartbeat(worker_id=self._worker_id, leases=states, condition=condition)
@@ -328,7 +346,7 @@ class Session(threading.Thread):
         return min(START_BEAT_SECONDS, self._interval)
 
     def report(self, worker_id: str) -> bool:
-        """Send all waiting results; return whether any waited."""
+        """Send all waiting results, and return whether any waited."""
         reports = self.leases.reports()
         for first in range(0, len(reports), REPORTS_A_REQUEST):
             batch = reports[first : first + REPORTS_A_REQUEST]

@@ -69,7 +69,7 @@ def machine_name() -> str:
     model = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:  # another system than Linux
+    except OSError:  # the system is not Linux
         lines = []
     for line in lines:
         name, _, value = line.partition(":")
@@ -104,7 +104,7 @@ def _control_groups() -> Iterator[Path]:
     try:
         mounts = Path("/proc/self/mountinfo").read_text(encoding="utf-8").splitlines()
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-    except OSError:  # another system than Linux
+    except OSError:  # the system is not Linux
         return
     groups = {}
     for line in lines:
@@ -131,7 +131,7 @@ def speed_file() -> Path:
 
 
 def machine_speed(file: Path, slots: int) -> MachineSpeed:
-    """Return the speed of this machine; measure it if `file` does not have it.
+    """Return the speed of this machine, from `file` or from a measurement.
 
     A machine that cannot be measured counts as the reference machine, and the log gives the reason.
     """

@@ -38,7 +38,7 @@ class RenderActor:
         }
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
-        """Render the sample of a `RenderTask`; return a `TaskResult`."""
+        """Render the sample of a `RenderTask`, and return a `TaskResult`."""
         wall = time.perf_counter()
         cpu = time.process_time()
         job = RenderTask.model_validate(task)

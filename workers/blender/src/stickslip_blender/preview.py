@@ -32,24 +32,24 @@ _DIFFUSE = 0.6
 _SHADOW = 0.72
 _SHEET = np.array(
     [[0.93, 0.90, 0.84], [0.20, 0.42, 0.72]]
-)  # sRGB, of the squares of the sheet that has no picture yet
+)  # sRGB colours of the squares of a sheet without a picture
 _SQUARES = 8
 _GROUND = 0.62
 _LINE = 0.5
 _SKY = 0.9
-_LINE_DISTANCE = 0.1  # [m], between lines on the floor
+_LINE_DISTANCE = 0.1  # distance between lines on the floor [m]
 _LINE_WIDTH = 0.003  # [m]
 
 Array = npt.NDArray[Any]
 
 
 def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> list[str]:
-    """Draw a scene; return the names of the pictures.
+    """Draw a scene, and return the names of the pictures.
 
     Args:
-        scene: Four entries. `scene`: `Staged`, as JSON, with paths of files. `sheet`: the sheet that
-            takes the texture. `segments`: names of the codes. `cameras`: cameras of the scene, as JSON,
-            or none if cameras frame everything that moves.
+        scene: Four entries. `scene`: `Staged`, as JSON, with paths of files. `sheet`: the sheet
+            that takes the texture. `segments`: names of the codes. `cameras`: cameras of the
+            scene, as JSON, or none if cameras frame everything that moves.
         record: Arrays of the scene at the instants of the animation.
         out: Directory for the pictures.
     """

@@ -141,7 +141,7 @@ class RenderContext:
     def renderer(self, scene: object, build: Callable[[], Any]) -> Any:
         """Return the renderer of a scene: the last one if it fits, or a new one in its place."""
         if self._renderer is None or self._renderer[0] != scene:
-            self._renderer = None  # building ends the last one, even if it fails
+            self._renderer = None  # a build ends the last renderer, even if it fails
             self._renderer = scene, build()
         return self._renderer[1]
 

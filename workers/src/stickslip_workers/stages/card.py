@@ -177,7 +177,7 @@ def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def pictured(spec: JobSpec) -> ArrayLayout | None:
-    """Return the array that shows a dataset of `spec` best; None if it has no pictures."""
+    """Return the array that shows a dataset of `spec` best, or None if it has no pictures."""
     seen = (
         array
         for array in layout(spec)

@@ -72,7 +72,10 @@ class _Shard:
         self._trajectories: dict[tuple[str, RecordRef], bytes] = {}
 
     def fill(self, row: int, slot: PackSlot) -> None:
-        """Put a sample into its row; raise ValueError if parts of it are missing."""
+        """Put a sample into its row.
+
+        Raises ValueError if parts of the sample are missing.
+        """
         self._check_labels(slot)
         for array in self._arrays:
             if not array.per_sample and not array.is_recorded:
@@ -115,7 +118,10 @@ class _Shard:
         return chunk
 
     def _trajectory(self, array: ArrayLayout, record: RecordRef) -> bytes:
-        """Return the encoded chunk of a trajectory; the renders of one simulation share it."""
+        """Return the encoded chunk of a trajectory.
+
+        The renders of one simulation share the chunk.
+        """
         key = array.name, record
         if key not in self._trajectories:
             self._trajectories[key] = encode_sample(array, self._recorded(array, record))

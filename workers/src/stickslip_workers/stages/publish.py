@@ -96,7 +96,7 @@ def create_array(
         chunks=(1, *array.shape) if array.per_sample else group_shape,
         shards=group_shape
         if array.per_sample
-        else None,  # the index: crc32c, at the end, as zarr has it
+        else None,  # the index has crc32c and is at the end, the default of zarr
         filters=() if order is None else (TransposeCodec(order=order),),
         serializer=BytesCodec(endian="little"),
         compressors=(compressor, Crc32cCodec()),
@@ -202,7 +202,7 @@ def _show(
     manifest: Manifest,
     group: bytes,
 ) -> _Seal:
-    """Put all files into the directory of the version; the manifest is last."""
+    """Put all files into the directory of the version, with the manifest last."""
     version = (task.dataset, task.version)
     in_parallel(lambda file: store.show(file.sha256, *version, file.path), files)
     data = canonical_json(manifest.model_dump(mode="json")).encode()
@@ -299,7 +299,7 @@ class _Labels:
 def _sections(
     task: PublishTask, parts: Sequence[PublishSection], store: Store
 ) -> tuple[FileEntry, ...]:
-    """Write the sections of the manifest; none if the whole manifest fits into one file."""
+    """Write the sections of the manifest, or none if the whole manifest fits into one file."""
     if not has_sections(task.spec):
         return ()
     size = section_samples(task.spec)
@@ -370,7 +370,7 @@ def _psnr_by_region(labels: _Labels) -> dict[str, Psnr]:
 def _preview(
     task: PublishTask, parts: Sequence[PublishSection], labels: _Labels, store: Store
 ) -> bytes | None:
-    """Return the picture of the version; None without pictures or valid samples."""
+    """Return the picture of the version, or None without pictures or valid samples."""
     array = pictured(task.spec)
     if array is None:
         return None

@@ -36,7 +36,7 @@ Faces = list[tuple[int, ...]]
 ARC = 12  # faces of a quarter of a circle
 GORE = 6
 """Faces across one gore. Bright and dark gores alternate, so a viewer can see the body turn."""
-_JOINT = 1e-7  # [m]: vertices that are closer are one
+_JOINT = 1e-7  # [m]: closer vertices become one
 DARK = 0.15
 """Ratio of the colour of a dark gore to the colour of a bright one."""
 
@@ -88,7 +88,7 @@ def gores(color: Array, count: int) -> Array:
     """
     around = 4 * (ARC + 1)
     place = np.arange(count) % around
-    within = place % (ARC + 1) // GORE  # the face between two octants goes with the gore before it
+    within = place % (ARC + 1) // GORE  # a face between octants belongs to the gore before
     dark = (np.minimum(within, ARC // GORE - 1) + place // (ARC + 1) * (ARC // GORE)) % 2 == 1
     return np.where(dark[:, None], DARK * color, color)
 
@@ -340,7 +340,10 @@ class Geometry:
         return [points[begin:end] for begin, end in pairwise(ends)]
 
     def checked(self, positions: npt.ArrayLike) -> Array:
-        """Return positions (frames, V', 3) [m]; raise ValueError if they do not fit this cloth."""
+        """Return positions (frames, V', 3) [m].
+
+        Raises ValueError if they do not fit this cloth.
+        """
         track = np.asarray(positions, dtype=np.float64)
         if track.ndim != 3 or track.shape[1:] != (self.vertices, 3) or not np.isfinite(track).all():
             raise ValueError(

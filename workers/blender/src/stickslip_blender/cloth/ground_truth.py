@@ -45,7 +45,7 @@ def apply_lens_distortion(video: npt.NDArray[np.uint8], camera: Camera) -> npt.N
     return result
 
 
-@lru_cache(maxsize=4)  # every frame and every texture asks
+@lru_cache(maxsize=4)  # every frame and every texture calls it
 def traced(camera: Camera) -> tuple[Camera, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return a camera's pinhole, its rays (height, width, 3), and their pixels.
 

@@ -158,7 +158,7 @@ class Source:
 
 SOURCES = {
     "drawn": Source(((-75.0, 15.0), (42.0, 62.0), (0.8, 1.25))),
-    "held-out": Source(((25.0, 80.0), (25.0, 40.0), (0.6, 0.8))),  # what no training light has
+    "held-out": Source(((25.0, 80.0), (25.0, 40.0), (0.6, 0.8))),  # outside of all training lights
     "room": Source(((-75.0, 15.0), (55.0, 80.0), (0.5, 0.8)), diameter=9.6, surround=0.45),
     "window": Source(((-125.0, -95.0), (20.0, 34.0), (0.9, 1.3)), diameter=7.2, surround=0.12),
 }
@@ -194,7 +194,7 @@ def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Ligh
 
 
 GRAIN_SIZE = 512  # side of the picture of a floor's grain [texels]
-GRAIN_EXTENT = 0.5  # what the picture covers; it repeats [m]
+GRAIN_EXTENT = 0.5  # side of the square that the picture covers [m]; the picture repeats
 _SUBSAMPLES = 3
 HARD = (
     "aluminium",
@@ -306,14 +306,14 @@ def floor_factor(
 def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:
     """Return the factor of a square of the floor that repeats, shape (GRAIN_SIZE, GRAIN_SIZE)."""
     random = np.random.Generator(np.random.PCG64(substrate.seed))
-    if substrate.name == "cloth":  # a plain weave, drawn four times too coarse to be seen at all
+    if substrate.name == "cloth":  # a plain weave, four times too coarse, so that it is visible
         thread = np.arange(GRAIN_SIZE) // 4
         over = (thread[:, None] + thread[None, :]) % 2
         marks = np.where(over == 1, 0.5, -0.5) + 0.5 * _spots(random, 4.0)
     else:
         marks = 0.5 * _spots(random, 10.0) + 0.5 * _spots(
             random, 30.0
-        )  # finer ones would be noise far away
+        )  # finer spots would be noise far away
     return np.asarray(np.clip(1.0 + substrate.grain * marks, 0.2, 1.8))
 
 

@@ -55,12 +55,12 @@ _SET_UP_PATHS = 1  # cost of a rendering beside its paths [paths per pixel of it
 _GROUP_SIZE = 3  # textures that are measured together: one in each colour channel
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
-FEWEST = 30  # pixels of a region, over all measured instants, below which nothing is said of it
-DEVIATIONS = 2.0  # standard deviations below a floor that are taken for chance
-_SPREAD = 0.6  # deviation of the errors of instants over their mean, before a clip's own are known
-_TRUST = 4  # instants that it counts for
+FEWEST = 30  # least pixels of a region, over all measured instants, for a PSNR
+DEVIATIONS = 2.0  # standard deviations below a floor that count as chance
+_SPREAD = 0.6  # usual deviation of the errors of instants over their mean
+_TRUST = 4  # number of instants that the usual deviation counts as
 DARK = 0.003  # light on the cloth below which errors do not grow
-BOUNCED = 40.0  # fitted: the composition errs where much light comes from other cloth
+BOUNCED = 40.0  # fitted: the composition errs in much light from other cloth
 # Side of the blocks whose sums give the spread [px]. The errors of a denoised picture reach over
 # some pixels.
 _BLOCK = 8
@@ -209,7 +209,10 @@ def pool_errors(
 def _pool_region(
     frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weight: float
 ) -> tuple[float, float]:
-    """Return the PSNR of one region and its standard deviation [dB]; NaN if it is too small."""
+    """Return the PSNR of one region and its standard deviation [dB].
+
+    Both are NaN if the region is too small.
+    """
     if sum(np.count_nonzero(weights) for _, weights in frames) < FEWEST:
         return np.nan, np.nan
 

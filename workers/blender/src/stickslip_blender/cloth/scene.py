@@ -32,10 +32,10 @@ _LAMP_POWER = 940.0  # [W]
 _FLOOR_RADIUS = 8.0  # [m]
 _FLOOR_RIM = 0.6  # [m]: it hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
-_DISCARDED = 2  # [px] at a window's border, where the denoiser errs
-_RAMP = 4  # [px] over which the window then passes into the frame
+_DISCARDED = 2  # [px] at a window's border, because the denoiser errs there
+_RAMP = 4  # [px] of the blend between the window and the frame, after the discarded ones
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
-_MIRROR_PATHS = 2  # times as many paths for the frame then
+_MIRROR_PATHS = 2  # factor of the frame's paths below this roughness
 
 
 class ClothScene:
@@ -49,8 +49,8 @@ class ClothScene:
         self.composer = Composer(geometry)
         self._scene = new_scene(
             max_bounces=3, diffuse_bounces=2, light_tree=False
-        )  # one lamp: nothing to choose
-        cycles = self._scene.cycles  # what else meets gloss is soft: set_roughness
+        )  # one lamp leaves no choice
+        cycles = self._scene.cycles  # other rays meet only soft gloss: set_roughness
         cycles.caustics_reflective = True
         cycles.blur_glossy = 0.0
         cycles.sample_clamp_indirect = 0.0

@@ -50,7 +50,7 @@ SHOWN = (0.0, 0.6, 0.6)
 ELSEWHERE = (0.3, 0.3, 0.05)
 """Base colours of the cloth in a shading, for rays of the camera and for other rays."""
 
-FINE = 2  # pixels of a shading across one of a picture, and down
+FINE = 2  # pixels of a shading across a pixel of a picture, and down
 TOLERANCE: int = _raster.TOLERANCE
 """Largest difference of a pixel of a clip from its exact value [8-bit levels].
 
@@ -62,8 +62,8 @@ _PROP_GRID = 3
 # Ratio of the radius of a box, applied twice, to the width of the lobe that it stands for. The
 # value comes from a comparison with Cycles.
 _LOBE = 1.9
-_SURE_COVERAGE = 0.02  # of mirrored cloth, from which on its own colour counts in full
-_PATH_BLUR = 6.0  # over which the length of mirrored paths is averaged [px]
+_SURE_COVERAGE = 0.02  # coverage by mirrored cloth from which its colour counts in full
+_PATH_BLUR = 6.0  # width of the mean of the lengths of mirrored paths [px]
 
 Floats = npt.NDArray[np.float32]
 

@@ -33,22 +33,22 @@ from stickslip_blender.raster import Window, _raster, projected, see
 # Distance of a visible body inside the simulated one [m]: half the thickness of a cloth that lies
 # on it.
 SUNK = -FLOOR
-ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane that is no floor [m]
+ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane besides the floor [m]
 TILE = 0.1  # side of the tiles of bodies [m]
-JAWS = 0.004  # by how much a holder is larger than what it holds, along each axis [m]
-ROUNDING = 0.005  # radius of the edges of a box that gives none [m], as in the simulation
-MOVING = 0.005  # a vertex that goes farther than this moves [m]: cameras frame all that do
-PLAIN = (168, 164, 156)  # sRGB, of a sheet that neither a scene nor an axis gives a texture
+JAWS = 0.004  # excess of a holder over the held part, along each axis [m]
+ROUNDING = 0.005  # default radius of the edges of a box [m], as in the simulation
+MOVING = 0.005  # least way of a moving vertex [m]: cameras frame all moving vertices
+PLAIN = (168, 164, 156)  # sRGB colour of a sheet without a texture from the scene or an axis
 
-_DEFAULT_COLOR = (0.2, 0.2, 0.2)  # linear, of a body without a look: the document's default
-_DEFAULT_ROUGHNESS = 0.5  # likewise
+_DEFAULT_COLOR = (0.2, 0.2, 0.2)  # linear colour of a body without a look, the document's default
+_DEFAULT_ROUGHNESS = 0.5  # roughness of a body without a look
 # Turns of the camera about the scene [degree], the smallest first.
 _TURNS = (0.0, *(sign * 30.0 * step for step in range(1, 6) for sign in (1, -1)), 180.0)
 # Fraction of the most cloth that any turn shows. The smallest turn that reaches it is used.
 _ENOUGH = 0.6
-_WATCHED = 60  # instants at which it is found out what moves
-_TURN_INSTANTS = 5  # instants at which the cloth in sight of a turn is measured
-_THUMB = 56  # side of their pictures [px]
+_WATCHED = 60  # instants for finding the moving vertices
+_TURN_INSTANTS = 5  # instants for measuring the visible cloth of a turn
+_THUMB = 56  # side of the pictures for turns [px]
 
 Array = npt.NDArray[Any]
 

@@ -120,7 +120,7 @@ def _angle(first: Array, second: Array) -> float:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-FINE_VERTICES = 6000  # a mesh is subdivided until it has so many: a facet is then below a pixel
+FINE_VERTICES = 6000  # target of the subdivision: a facet is then below a pixel
 CREASE = 0.0005  # height of the strongest crease at strength 1 [m]
 _CREASES = 14
 

@@ -36,7 +36,7 @@ def texture_image(texture: Texture) -> npt.NDArray[np.uint8]:
     picture = _DRAWN_BY[texture](u, v)
     boxes = picture.reshape(SIZE, _OVERSAMPLING, SIZE, _OVERSAMPLING, 3)
     mean: npt.NDArray[np.uint8] = np.rint(boxes.mean(axis=(1, 3))).astype(np.uint8)
-    mean.flags.writeable = False  # it is kept for the next who asks
+    mean.flags.writeable = False  # the cache returns the same array again
     return mean
 
 

@@ -35,7 +35,10 @@ class NoDeviceError(RuntimeError):
 
 
 def import_bpy() -> Any:
-    """Return the bpy module; an ImportError names the missing package."""
+    """Return the bpy module.
+
+    If a package or library is missing, an ImportError says how to install it.
+    """
     if "bpy" in sys.modules:
         return sys.modules["bpy"]
     try:
@@ -75,7 +78,10 @@ def blender_version() -> dict[str, str]:
 
 
 def device() -> str:
-    """Return the requested device, one of `DEVICES`; raise NoDeviceError for another name."""
+    """Return the requested device, one of `DEVICES`.
+
+    Raises NoDeviceError for another name.
+    """
     name = os.environ.get(VARIABLE) or CPU
     if name not in DEVICES:
         raise NoDeviceError(f"{VARIABLE} must be one of {', '.join(DEVICES)}; got {name!r}")
@@ -83,9 +89,10 @@ def device() -> str:
 
 
 def use_device(scene: Any) -> None:
-    """Render a scene on the requested device; raise NoDeviceError if Cycles finds none.
+    """Render a scene on the requested device.
 
-    Call it after reading factory settings, because they reset the devices.
+    Call it after reading factory settings, because they reset the devices. Raises NoDeviceError if
+    Cycles finds no such device.
     """
     if device() != CPU:
         _find_devices()
@@ -107,12 +114,12 @@ def described() -> dict[str, Any]:
 
 
 def _find_devices() -> list[Any]:
-    """Return Cycles' devices of the requested type; enable them and disable all others."""
+    """Enable and return Cycles' devices of the requested type, and disable all others."""
     preferences = import_bpy().context.preferences.addons["cycles"].preferences
     sort = device().upper()
     try:
         preferences.compute_device_type = sort
-    except TypeError as error:  # the enumeration lacks it
+    except TypeError as error:  # the enumeration does not have this type
         raise NoDeviceError(
             f"{VARIABLE} is {device()!r}, and this Blender cannot use such devices: {error}"
         ) from error
@@ -192,8 +199,8 @@ class ClothSampling:
         return replace(self, frame=4 * self.frame, window=4 * self.window)
 
 
-_FULL_AREA = 13_000.0  # of a window from which on the paths of the quality suffice [px^2]
-_MAX_PATH_RATIO = 1.6  # most times as many paths in a smaller window
+_FULL_AREA = 13_000.0  # least area of a window that needs no additional paths [px^2]
+_MAX_PATH_RATIO = 1.6  # largest factor of the paths in a smaller window
 
 # These numbers are frozen. A change makes other pictures and another build digest.
 # benchmarks/render_rods.py measures the pictures.

@@ -169,7 +169,7 @@ class Fabric:
         old = self._picture.image
         image = images.new(
             "print", *picture.shape[:2]
-        )  # a new one: Cycles does not read a changed image again
+        )  # a new image, because Cycles does not read a changed one again
         set_pixels(image, picture / np.float32(255))
         image.update()
         self._picture.image = image
@@ -243,7 +243,7 @@ def set_view(scene: Any, camera: Camera) -> None:
     view.matrix_world = Matrix(pose.tolist())
 
 
-HEIGHT = 64  # rows of the panorama: its light is smooth
+HEIGHT = 64  # rows of the panorama, few because its light is smooth
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,10 @@ def panorama(boxes: Sequence[SoftBox], ambient: float) -> npt.NDArray[np.float32
 
 
 def set_environment(scene: Any, light: npt.NDArray[np.float32], ground: float) -> None:
-    """Light the scene with a panorama; cameras see a ground of even radiance instead."""
+    """Light the scene with a panorama.
+
+    Cameras see a ground of even radiance instead of the panorama.
+    """
     image = import_bpy().data.images.new(
         "panorama", width=light.shape[1], height=light.shape[0], float_buffer=True, is_data=True
     )
@@ -306,7 +309,10 @@ def set_environment(scene: Any, light: npt.NDArray[np.float32], ground: float) -
 
 
 def set_curtains(scene: Any, ambient: float) -> None:
-    """Light the scene evenly from all around with a low radiance; cameras see black instead."""
+    """Light the scene evenly from all around with a low radiance.
+
+    Cameras see black instead of this light.
+    """
     scene.world.color = (0.0, 0.0, 0.0)
     tree, surface = _emptied(scene)
     dark = tree.nodes.new("ShaderNodeBackground")
@@ -321,12 +327,12 @@ def set_curtains(scene: Any, ambient: float) -> None:
     tree.links.new(dark.outputs["Background"], mix.inputs[2])
     tree.links.new(mix.outputs["Shader"], surface)
     scene.world.cycles.sampling_method = (
-        "NONE"  # paths that leave find it: the lamp gets all shadow rays
+        "NONE"  # leaving paths find this light, so the lamp gets all shadow rays
     )
 
 
 def _emptied(scene: Any) -> tuple[Any, Any]:
-    """Empty the node tree of the world; return it and the socket of its surface."""
+    """Empty the node tree of the world, and return it and the socket of its surface."""
     tree = scene.world.node_tree
     tree.nodes.clear()
     return tree, tree.nodes.new("ShaderNodeOutputWorld").inputs["Surface"]

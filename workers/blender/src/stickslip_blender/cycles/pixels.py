@@ -89,14 +89,12 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
     return data[at:end].decode(), end + 1
 
 
-FIRST_SECONDS = 300.0  # besides its paths, for a first frame: a GPU may load its kernels
-LEAST_SECONDS = (
-    60.0  # besides their paths, for later frames, on a machine that has a lot else to do
-)
-_PATH_SECONDS = 5e-6  # of a path before one is measured: a slow core
-_SLOWER = 20.0  # times as long as its paths took before, and a frame hangs
+FIRST_SECONDS = 300.0  # extra time of a first frame [s]: a GPU may load its kernels
+LEAST_SECONDS = 60.0  # extra time of later frames [s], for a machine with much other work
+_PATH_SECONDS = 5e-6  # time of a path before the first measurement [s], for a slow core
+_SLOWER = 20.0  # a frame hangs if its paths take this many times as long as before
 
-_LEVELS = 65536  # of the table that encodes linear light
+_LEVELS = 65536  # size of the table that encodes linear light
 _LIGHT = np.arange(_LEVELS) / (_LEVELS - 1)
 _SRGB = np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * _LIGHT ** (1.0 / 2.4) - 0.055)
 _ENCODED = np.rint(255.0 * _SRGB).astype(np.uint8)
@@ -149,7 +147,7 @@ class FrameReader:
         self._scene.render.film_transparent = channels == "RGBA"
         self._scene.render.image_settings.color_mode = channels
         _set_window(self._scene.render, window, fine)
-        self._path.write_bytes(b"")  # so that a frame is never an old one
+        self._path.write_bytes(b"")  # an old frame never counts as a new one
         with _quiet(), self._watched(window, fine):
             import_bpy().ops.render.render(write_still=True)
         return self._path.read_bytes()

@@ -24,7 +24,7 @@ GRID = 12
 Silhouettes are then within 0.0005 of their coverage.
 """
 
-_LANES = 8  # channels are filled up to a multiple
+_LANES = 8  # channels are padded to a multiple of this
 
 _LINEAR = np.array([_raster.decoded(level / 255.0) for level in range(256)], dtype=np.float32)
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from stickslip_schemas.kinds.rod_hang import RodHangRender
 
 SIDES = 24  # a 24-gon is at most 0.9 % of the radius inside its circle
-CAP_RINGS = 4  # of the half sphere on the free end, its pole not counted
+CAP_RINGS = 4  # rings of the half sphere on the free end, without its pole
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def tube_faces(points: int) -> list[tuple[int, ...]]:
 POINTS = 150
 RADIUS = 0.008  # [L], the default
 GROUND = 0.0025  # linear light of the dark ground
-GROUND_LEVEL = 8  # the same in a picture, of 255
+GROUND_LEVEL = 8  # the same in a picture, from 0 to 255
 
 # Strong and weak lights alternate, high up. Each of the four views of rod-4 has a lit and a shaded
 # side.
@@ -144,7 +144,10 @@ def to_linear(color: Color) -> Color:
 
 
 class RodRenderer:
-    """A scene with one rod, built once; only vertices, color and camera change between frames."""
+    """A scene with one rod, built once.
+
+    Only vertices, color and camera change between frames.
+    """
 
     def __init__(self, *, quality: Quality | Sampling = Quality.standard) -> None:
         self._scene = new_scene()
@@ -189,7 +192,7 @@ class RodRenderer:
         return np.stack([self._view(vertices, camera) for camera in cameras])
 
     def _view(self, vertices: npt.NDArray[np.float32], camera: Camera) -> npt.NDArray[np.uint8]:
-        """Render the window around the rod; the rest is ground."""
+        """Render the window around the rod, and fill the rest with ground."""
         set_view(self._scene, camera)
         frame = np.full((camera.height, camera.width, 3), GROUND_LEVEL, dtype=np.uint8)
         points = projected(camera, vertices)
