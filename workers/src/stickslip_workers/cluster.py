@@ -84,7 +84,7 @@ class RayCluster:
         # If a head does not even start its processes, only its own output gives the reason.
         paths = [logs / name for name in ("raylet.err", "raylet.out", "gcs_server.out")]
         for path in [*paths, *filter(None, [self.log])]:
-            with contextlib.suppress(OSError):  # a head that starts again removes them
+            with contextlib.suppress(OSError):  # a new start of the head removes them
                 if lines := path.read_text(errors="replace").split("\n")[:-1]:
                     return f"last line of {path}: {lines[-1][:300]}"
         return f"it has not written to {self.location} yet"
