@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from stickslip_services.cli import app
 from stickslip_services.client import Client
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import RunningServer, start_server, wait_until
+from stickslip_testing.servers import RunningServer, served, start_server, wait_until
 from stickslip_testing.worker import PretendWorker, rejection
 
 
@@ -83,9 +83,14 @@ def test_a_grid_becomes_a_verified_directory(
     assert "has ended" in cli("cancel", job).stderr
 
 
-def test_a_valid_spec_that_would_be_refused_now(cli: Any, tmp_path: Path) -> None:
+def test_a_valid_spec_that_would_be_refused_now(tmp_path: Path) -> None:
     axes = {"material": ["gray-interlock"], "mu": [0.5], "texture": ["dots"], "viewpoint": ["left"]}
-    refused = cli("validate", write(tmp_path / "cloth.yaml", {"kind": "cloth_drag", "axes": axes}))
+    file = write(tmp_path / "cloth.yaml", {"kind": "cloth_drag", "axes": axes})
+    # Workers of other tests may be registered at the shared server.
+    with served(tmp_path / "data") as server:
+        server.worker()
+        env = {"STICKSLIP_URL": server.url, "COLUMNS": "200"}
+        refused = CliRunner().invoke(app, ["validate", str(file)], env=env)
     assert refused.exit_code == 1
     assert "would be refused now: no worker" in refused.stderr
 
