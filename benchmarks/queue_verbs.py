@@ -118,7 +118,8 @@ class Queue:
             self.meter.composing += time.process_time() - begin
             return value
 
-        setattr(lease_module, "_compose_leases", timed)  # each checkout has its own signature
+        # Each checkout has its own signature.
+        vars(lease_module)["_compose_leases"] = timed
 
     def plan(self, spec: dict[str, Any], project: str) -> str:
         """Submit and plan a job of a project."""

@@ -56,7 +56,8 @@ CASES: dict[str, str] = {
             control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over
             smooth.reach smooth.same_normal""",
-        "edges": "medial_axis.radius_max medial_axis.thickness_max medial_axis.beyond stepping.sweep",
+        "edges": """medial_axis.radius_max medial_axis.thickness_max medial_axis.beyond
+            stepping.sweep""",
         "valley": "contact.fillet",
         "push": "stepping.near_patience stepping.stalled_soon",
         "let down": "control.halvings",
