@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -199,10 +200,7 @@ def test_an_array_goes_on_where_slurm_takes_its_nodes(
     # Ray's, too.
     slurm("scontrol", "requeue", f"{slurm.job}_2")
     for task in "12":
-        say(
-            f"task {task} runs again",
-            lab.wait("its turn", lambda task=task: state(task, "RUNNING", 1)),
-        )  # type: ignore[misc]
+        say(f"task {task} runs again", lab.wait("its turn", partial(state, task, "RUNNING", 1)))
     before = {task: done(task) for task in "12"}
     say(
         "both have done more",

@@ -219,13 +219,14 @@ def test_smoothing_tends_to_the_law() -> None:
 def exact(contact: tuple[float, Floats, Floats, Floats], mu: float) -> Floats:
     """Return the force that the exact law asks for, written from its definition."""
     gap, n, slip, force = contact
-    normal_force = force @ n
+    normal_force = float(force @ n)
     asked = force - K * (gap * n + slip)
     if asked @ n <= 0.0:
         return np.zeros(3)
     friction = asked - (asked @ n) * n
     bound = mu * max(normal_force, 0.0)
-    return (asked @ n) * n + friction * min(1.0, bound / np.linalg.norm(friction))
+    factor = min(1.0, bound / float(np.linalg.norm(friction)))
+    return np.asarray((asked @ n) * n + friction * factor)
 
 
 def contact_of(mode: int, seed: int) -> tuple[float, Floats, Floats, Floats]:
