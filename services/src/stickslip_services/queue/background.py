@@ -1,4 +1,4 @@
-"""The work that a coordinator does by the clock, all of it.
+"""The periodic work of a coordinator.
 
 | service | period | work |
 |---|---|---|
@@ -7,8 +7,8 @@
 | scrub | `sweep_seconds` | reads datasets that nobody has read for a month, while no job runs |
 | planner | `PLAN_SECONDS` | plans jobs of many samples, piece by piece |
 
-Webhooks are delivered by `access.webhooks`. Each service asks first, in a read transaction and by
-an index, whether there is work: a coordinator with thousands of waiting jobs is nearly idle.
+`access.webhooks` delivers the webhooks. Each service first asks whether there is work, in a read
+transaction and by an index. So a coordinator with thousands of waiting jobs is nearly idle.
 """
 
 import logging
@@ -41,12 +41,14 @@ PLAN_SECONDS = 0.2
 """Polling interval for jobs to plan [s]."""
 
 CHECK_JOBS_SECONDS = 60.0
-"""Interval in which the rows of all active jobs are checked for damage [s]: a job that no worker
-serves is read by nothing else, and it takes 20 microseconds a job."""
+"""Interval in which a service checks the rows of all active jobs for damage [s].
+
+Nothing else reads a job that no worker serves. The check takes 20 microseconds a job.
+"""
 
 
 class Service(NamedTuple):
-    """A function that is called again and again, with pauses."""
+    """A function that the coordinator calls again and again, with pauses."""
 
     run_once: Callable[[], object]
     seconds: float
@@ -74,18 +76,22 @@ def start(context: Context) -> None:
 
 
 def _take_over(context: Context, connection: Connection) -> None:
-    """Renew what no other coordinator could have renewed while none was running."""
+    """Renew leases and release claims that ran out or stayed while no coordinator was running."""
     now = context.clock()
+    # Nobody answered heartbeats meanwhile, so the workers could not renew their leases.
     expires_at = now + context.settings.lease_seconds
     connection.execute(update(tasks).where(IS_LEASED).values(expires_at=expires_at))
     is_ahead = workers.c.last_seen_at > now  # by the clock of an earlier process
+    # A time ahead of the clock would make a worker look alive for too long.
     connection.execute(update(workers).where(is_ahead).values(last_seen_at=now))
+    # No other planner is left to hold a claim.
     release_claims(connection)
 
 
 def sweep(context: Context) -> None:
-    """Do what is due, once."""
+    """Do all work of the sweep that is due, once."""
     fail_damaged_jobs(context)
+    # The store comes before planning and leases: without it no job may start tasks.
     _watch_store(context)
     plan_waiting_jobs(context)
     expire_leases(context)
@@ -113,13 +119,18 @@ _ACTIVE_JOBS = RowQuery(
 
 
 def fail_damaged_jobs(context: Context) -> None:
-    """End the active jobs whose rows are damaged: nobody can say which dataset they should make."""
+    """End the active jobs whose rows are damaged.
+
+    Nobody can say which dataset such a job should make.
+    """
+    # Requests for tasks have found these jobs since the last sweep.
     damaged: dict[int, DamagedRowError] = context.job_builds.take_damaged()
     now = context.clock()
     if now >= context.next_job_check:
         context.next_job_check = now + CHECK_JOBS_SECONDS
         with context.database.read() as connection:
             rows = _ACTIVE_JOBS.rows(connection)
+        # One damaged row must not hide the others, so each check reports by itself.
         for row in rows:
             try:
                 check_job(row)
@@ -174,6 +185,7 @@ def _pause_all(context: Context, trouble: str) -> None:
         f"{trouble}. Nothing more is started; the job goes on by itself as soon as the store takes "
         "results again"
     )
+    # The transaction reads the jobs again: one may have ended since the read above.
     with context.transaction() as tx:
         for job in _SCHEDULABLE_JOBS.rows(tx.connection):
             pause(tx, job.seq, reason=Reason.store_unavailable, message=message)

@@ -1,7 +1,8 @@
-"""The context of one coordinator: what the verbs of the queue share, and its state in memory.
+"""The context of one coordinator: the shared objects of the queue, and its state in memory.
 
-The store is watched: while it takes no results, jobs are paused; afterwards they resume. Trouble is
-found by a check of the coordinator, or reported by a worker that could not write.
+The coordinator watches the store. While the store takes no results, it pauses jobs, and later it
+resumes them. A check of the coordinator finds a fault, or a worker that could not write reports
+one.
 """
 
 import asyncio
@@ -21,21 +22,27 @@ from stickslip_services.queue.transaction import QueueTransaction
 from stickslip_services.settings import Settings
 
 HOLD_SECONDS = 10.0
-"""Duration of a worker's report, if the coordinator itself finds no fault [s]."""
+"""Time for which a worker's report counts if the coordinator itself finds no fault [s]."""
 
 PROBE_SECONDS = 10.0
-"""Time between two probes of a working bucket [s]: each probe costs requests."""
+"""Time between two probes of a working bucket [s].
+
+Each probe costs requests.
+"""
 
 
 class Turns:
-    """When each project got its last task, as a number that grows; lost with a restart."""
+    """The order in which projects got their last tasks, as numbers that grow.
+
+    A restart loses it.
+    """
 
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
         self._turn = 0
 
     def last(self, project: str) -> int:
-        """Return the last turn of a project; 0 before its first."""
+        """Return the last turn of a project, or 0 before its first."""
         return self._last.get(project, 0)
 
     def take(self, project: str) -> int:
@@ -61,7 +68,7 @@ class StoreWatch:
         """Description of the fault; empty without one."""
 
     def check(self) -> str:
-        """Check again; return the fault."""
+        """Check the store again, and return the fault."""
         reported = self._reported if self._clock() < self._reported_until else ""
         self.trouble = self._fault() or reported
         return self.trouble
@@ -83,14 +90,18 @@ class StoreWatch:
         return ""
 
     def _fault_of(self, store: Store) -> str:
-        """Return the fault of one store; raise OSError where it cannot be written."""
+        """Return the fault of one store.
+
+        Raises OSError if the store cannot be written.
+        """
         room = store.disk_usage()
         if room is not None and room.free < self._min_free_bytes:
             free = room.free / 2**20
             least = self._min_free_bytes / 2**20
             return f"{store.place} has {free:.3g} MiB left, and {least:.3g} MiB must stay free"
         if room is None and not self.trouble:
-            # A bucket: each probe costs requests.
+            # A bucket has no disk usage, and each probe of it costs requests. So a working bucket
+            # gets few probes.
             if self._clock() < self._next_probe:
                 return ""
             self._next_probe = self._clock() + PROBE_SECONDS
@@ -99,7 +110,10 @@ class StoreWatch:
 
 
 class Notifier:
-    """Wakes event streams when the queue has changed; `notify` may be called from any thread."""
+    """Wakes event streams when the queue has changed.
+
+    Any thread may call `notify`.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -120,6 +134,7 @@ class Notifier:
         """Return when there have been more than `seen` notifications, or after `timeout` [s]."""
         entry = (asyncio.get_running_loop(), asyncio.Event())
         with self._lock:
+            # A notification may have come between the caller's look for news and this call.
             if self.count != seen:
                 return
             self._waiting.add(entry)
@@ -135,7 +150,7 @@ class Notifier:
 class Context:
     """Database, store, clock and settings of a coordinator.
 
-    What is in memory only is lost with a restart.
+    A restart loses the values that exist only in memory.
     """
 
     settings: Settings
@@ -145,17 +160,19 @@ class Context:
     store_watch: StoreWatch
     notifier: Notifier = field(default_factory=Notifier)
     frames_by_worker: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
-    """Progress of simulations from the last heartbeat of each worker: (frames done, frames total)
-    by task.
+    """Progress of simulations by worker and task: (frames done, frames total).
+
+    Each heartbeat of a worker replaces the progress of its tasks.
     """
     sections: dict[str, tuple[Sha256, ...]] = field(default_factory=dict)
-    """Temporary artifacts with the sections of publish tasks, by task. `gc` finds those of an
-    earlier process.
+    """Temporary artifacts with the sections of publish tasks, by task.
+
+    `gc` finds the artifacts of an earlier process.
     """
     job_builds: JobBuilds = field(default_factory=JobBuilds)
     turns: Turns = field(default_factory=Turns)
     next_job_check: float = float("-inf")
-    """When the rows of the active jobs are checked for damage again [s since 1970]."""
+    """Time of the next check of the active jobs for damaged rows [s since 1970]."""
     no_check_since: int = -1
     """Number of writes when no job waited for a check of its dataset (`existing_datasets`)."""
     last_situation: tuple[int, tuple[tuple[str, str], ...]] | None = None
@@ -184,7 +201,7 @@ class Context:
 
     @contextmanager
     def transaction(self) -> Iterator[QueueTransaction]:
-        """Open a write transaction; notify watchers after the commit."""
+        """Open a write transaction, and notify watchers after the commit."""
         with self.database.write() as connection:
             yield QueueTransaction(connection, self.clock())
         self.notifier.notify()

@@ -1,7 +1,7 @@
 """Control of jobs by users: cancel, pause, resume and prioritise.
 
-Each is one transaction that writes one row of `jobs`, an event and an audit entry, whatever the
-number of tasks. Workers hear at their next heartbeat which tasks to drop.
+Each of these is one transaction. It writes one row of `jobs`, an event and an audit entry, whatever
+the number of tasks. Workers hear at their next heartbeat which tasks to drop.
 """
 
 from collections.abc import Iterator
@@ -25,9 +25,10 @@ from stickslip_services.queue.workers import NO_WORKER, update_unschedulable_job
 
 
 def cancel_job(context: Context, job_id: str) -> JobDetail:
-    """Cancel a job; one that is cancelled, or being cancelled, stays so.
+    """Cancel a job.
 
-    Raises ConflictError if it has ended.
+    A job that is cancelled, or being cancelled, stays so. Raises ConflictError if the job has ended
+    otherwise.
     """
     with _change(context, job_id, "job.cancel") as (tx, job):
         if job.state not in (JobState.cancelling, JobState.cancelled):
@@ -39,14 +40,16 @@ def cancel_job(context: Context, job_id: str) -> JobDetail:
             set_job_state(
                 tx, job.seq, JobState.cancelling, reason=Reason.cancelled, message=message
             )
+            # Without running tasks the job is cancelled at once, and the user sees that in the
+            # answer.
             settle_job(tx, job.seq)
     return _show(context, job.seq)
 
 
 def pause_job(context: Context, job_id: str) -> JobDetail:
-    """Pause a job: no further tasks are leased, running ones finish.
+    """Pause a job, so that no further tasks of it are leased.
 
-    Raises ConflictError if it has ended.
+    Running tasks finish. Raises ConflictError if the job has ended.
     """
     with _change(context, job_id, "job.pause") as (tx, job):
         pausing = (JobState.pausing, JobState.paused)
@@ -64,21 +67,26 @@ def pause_job(context: Context, job_id: str) -> JobDetail:
 def resume_job(context: Context, job_id: str) -> JobDetail:
     """Resume a paused job with the builds that it was planned for.
 
-    A job that is not paused is left as it is. Raises ConflictError if it has ended, or while the
-    store takes no results.
+    A schedulable job stays as it is. Raises ConflictError if the job has ended, or while the store
+    takes no results.
     """
+    # The sweep would pause the job again at once.
     trouble = context.store_watch.trouble
     if trouble:
         raise ConflictError(f"{trouble}; once that is mended the job goes on by itself")
     with _change(context, job_id, "job.resume") as (tx, job):
         resume(tx, job)
+    # The job may have been paused before its planning, or its workers may have gone meanwhile.
     plan_waiting_jobs(context)
     update_unschedulable_jobs(context)
     return _show(context, job.seq)
 
 
 def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
-    """Set the priority of a job. Raise ConflictError if it has ended."""
+    """Set the priority of a job.
+
+    Raises ConflictError if the job has ended.
+    """
     with _change(context, job_id, "job.prioritise", priority=priority) as (tx, job):
         if not JobState(job.state).is_open:
             raise ConflictError(
@@ -96,11 +104,15 @@ def pause(tx: QueueTransaction, job: int, *, reason: Reason | None = None, messa
 
 
 def resume(tx: QueueTransaction, job: JobRow) -> None:
-    """Let a paused job continue; raise ConflictError if it has ended."""
+    """Let a paused job continue.
+
+    Raises ConflictError if the job has ended.
+    """
     if job.state in SCHEDULABLE:
         return
     if job.state not in (JobState.pausing, JobState.paused):
         raise ConflictError(f"job {job.id} is {job.state}, and only a paused job can be resumed")
+    # A pause keeps the job's progress in its columns. They tell which state the job returns to.
     if job.builds is None:
         reason = Reason.waiting_for_worker
         set_job_state(tx, job.seq, JobState.queued, reason=reason, message=NO_WORKER)
@@ -119,7 +131,7 @@ class _JobChange(NamedTuple):
 
 @contextmanager
 def _change(context: Context, job_id: str, action: str, **details: object) -> Iterator[_JobChange]:
-    """Open a transaction that changes a job, and that ends with an audit entry."""
+    """Open a transaction that changes a job and ends with an audit entry."""
     with context.transaction() as tx:
         job = cast("JobRow", find_job(tx.connection, job_id))  # it has all columns of a JobRow
         yield _JobChange(tx, job)

@@ -1,6 +1,6 @@
-"""Dependents of tasks: they wait for results, and become ready when they have them all.
+"""Dependents of tasks: they wait for results, and become ready when all results are there.
 
-A rejected simulation rejects its renders, which are results in turn.
+If a simulation is rejected, its renders are rejected too. Their rejections are results in turn.
 """
 
 from collections.abc import Collection
@@ -59,21 +59,22 @@ _REJECT = Statement(
 
 
 def release_dependents(tx: QueueTransaction, tasks: Collection[int]) -> None:
-    """Let the dependents of tasks that have just got their results wait for less."""
+    """Count down the waiting dependents of tasks that have just got their results."""
     ready: list[int] = []
+    # The database counts down and tells in one statement which tasks have nothing left to wait for.
     for batch in batches(tasks):
         for row in _WAIT_FOR_LESS.rows(tx.connection, {"b_tasks": batch}):
             if row.waiting_on == 0:
                 ready.append(row.seq)
-    # Renders of rejected simulations have waiting_on 0 as well: reject them before the others
-    # become ready.
+    # Renders of rejected simulations wait for nothing either. Reject them before the other tasks
+    # become ready, so that no worker gets one of them.
     if ready:
         reject_renders(tx, tasks)
         add_ready(tx.connection, ready)
 
 
 def reject_renders(tx: QueueTransaction, simulations: Collection[int]) -> None:
-    """Reject the renders of those of the simulations that were rejected."""
+    """Reject the renders of the rejected ones among some simulations."""
     renders: list[_RenderToReject] = []
     for batch in batches(simulations):
         renders += _RENDERS_TO_REJECT.rows(tx.connection, {"b_tasks": batch})
@@ -86,6 +87,8 @@ def reject_renders(tx: QueueTransaction, simulations: Collection[int]) -> None:
         rows.append({**row, "b_digest": digest, "b_now": tx.now})
     _REJECT.run_all(tx.connection, rows)
     rejected = [render.seq for render in renders]
+    # A rejection is a result: it leaves the queue, counts in the totals and releases the pack
+    # tasks.
     remove_ready(tx.connection, rejected)
     add_results(tx.connection, rejected)
     release_dependents(tx, rejected)

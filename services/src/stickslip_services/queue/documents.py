@@ -1,4 +1,4 @@
-"""Documents of tasks, composed when they are leased: what to do, with the results to do it with."""
+"""Documents of tasks: the work and the results that it needs, composed when a task is leased."""
 
 import json
 from collections import Counter
@@ -70,9 +70,10 @@ _SAMPLES = RowQuery(
 
 
 class MissingResultsError(Exception):
-    """Tasks whose results a document needs, and that it does not depend on, run again.
+    """A document needs results of tasks that run again, and its task does not depend on them.
 
-    A pack task depends on renders only, and reads the results of their simulations, too.
+    For example, a pack task depends on renders only, but also reads the results of their
+    simulations.
     """
 
     def __init__(self, tasks: Sequence[int]) -> None:
@@ -81,7 +82,7 @@ class MissingResultsError(Exception):
 
 
 class NoValidSamplesError(Exception):
-    """All samples of a dataset were rejected: there is nothing to publish."""
+    """All samples of a dataset were rejected, so there is nothing to publish."""
 
 
 class Leasable(Protocol):
@@ -108,8 +109,8 @@ class Leasable(Protocol):
 def compose_task(connection: Connection, task: Leasable, publish: Publish) -> AnyTask:
     """Return the document of a task whose dependencies all have results.
 
-    Sections of a publish task are stored with `publish`, which takes a while: do not call this in a
-    write transaction. Raises DamagedRowError where a row is damaged, MissingResultsError, or
+    `publish` stores the sections of a publish task, which takes a while. So do not call this in a
+    write transaction. Raises DamagedRowError if a row is damaged, MissingResultsError, or
     NoValidSamplesError.
     """
     with reported_damage():
@@ -127,9 +128,9 @@ def compose_task(connection: Connection, task: Leasable, publish: Publish) -> An
 
 
 def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
-    """Return a task by its name, see `compose_task`.
+    """Return the document of a task by its name (see `compose_task`).
 
-    Raises NotFoundError, or ConflictError where its dependencies have no results.
+    Raises NotFoundError, or ConflictError if its dependencies have no results.
     """
     key = task_key(name)
     columns = (*task_columns(StoredTask), tasks.c.waiting_on)
@@ -137,6 +138,7 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
     row = None
     if key is not None:
         row = connection.execute(select(*columns).where(*is_visible)).one_or_none()
+    # The same key with another stage names no task.
     if row is None or task_id(row.stage, row.key) != name:
         raise NotFoundError(f"there is no task {name[:100]!r}")
     if row.waiting_on:
@@ -151,7 +153,10 @@ def find_task(connection: Connection, name: str, publish: Publish) -> AnyTask:
 
 
 def read_plan(connection: Connection, job: int) -> tuple[JobSpec, PlanInputs]:
-    """Return spec, builds and certificate of a planned job; raise DamagedRowError."""
+    """Return spec, builds and certificate of a planned job.
+
+    Raises DamagedRowError if the row of the job is damaged.
+    """
     row = _JOB.first(connection, {"b_job": job})
     if row is None:
         raise DamagedRowError(f"row {job} of jobs")
@@ -161,7 +166,7 @@ def read_plan(connection: Connection, job: int) -> tuple[JobSpec, PlanInputs]:
 
 
 def reserve_version(connection: Connection, task: Leasable) -> None:
-    """Reserve the version number of a publish task, for good, so that no other task takes it."""
+    """Reserve the version number of a publish task for good, so that no other task takes it."""
     if find_reserved(connection, task.seq) is not None:
         return
     try:
@@ -174,7 +179,10 @@ def reserve_version(connection: Connection, task: Leasable) -> None:
 
 
 def _results(connection: Connection, seqs: Collection[int]) -> dict[int, TaskResultRow]:
-    """Return the results of tasks by `seq`; raise MissingResultsError or DamagedRowError."""
+    """Return the results of tasks by `seq`.
+
+    Raises MissingResultsError or DamagedRowError.
+    """
     rows = _RESULTS.batched_rows(connection, "b_tasks", seqs)
     missing = [row.seq for row in rows if row.state in _WITHOUT_RESULT]
     if missing:
@@ -196,7 +204,10 @@ def _output(row: TaskResultRow) -> dict[str, object]:
 
 
 def _read_samples(connection: Connection, job: int, first: int, end: int) -> list[SampleRow]:
-    """Return the samples of the slots from `first` to `end`; raise DamagedRowError."""
+    """Return the samples of the slots from `first` to `end`.
+
+    Raises DamagedRowError if a row is damaged or missing.
+    """
     rows = _SAMPLES.rows(connection, {"b_job": job, "b_first": first, "b_end": end})
     check_samples(rows, job, range(first, end))
     return rows
@@ -229,6 +240,7 @@ def _pack_task(connection: Connection, task: Leasable) -> PackTask:
     end = min(first + spec.samples_per_shard, spec.sample_count)
     rows = _read_samples(connection, payload["job"], first, end)
 
+    # A slot needs the result of its simulation even if a render follows: it has the record.
     seqs: set[int] = set()
     for row in rows:
         seqs.add(row.simulate_task)
@@ -239,7 +251,7 @@ def _pack_task(connection: Connection, task: Leasable) -> PackTask:
 
 
 def _slot(sample: SampleRow, results: Mapping[int, TaskResultRow]) -> dict[str, object]:
-    """Return a sample as a pack task has it: its results, or its rejection."""
+    """Return a sample in the form of a pack task, with its results or its rejection."""
     last = results[sample.last_task]
     labels = json.loads(sample.labels)
     slot: dict[str, object] = {
@@ -248,6 +260,7 @@ def _slot(sample: SampleRow, results: Mapping[int, TaskResultRow]) -> dict[str, 
         "split": sample.split,
         "labels": labels,
     }
+    # A rejected sample stays in the dataset as a slot without data, with the reason.
     if last.state == TaskState.rejected:
         slot["rejection"] = _rejection(sample, last)
         return slot
@@ -280,7 +293,7 @@ class _Rejection(NamedTuple):
     number: int
 
 
-# Ordered by slot, the first valid sample ends the search: of most jobs it is one of the first.
+# The search ends at the first valid sample. In most jobs it is one of the first slots.
 _VALID_SAMPLE: ValueQuery[int] = ValueQuery(
     "SELECT samples.slot FROM samples JOIN tasks "
     "ON tasks.seq = coalesce(samples.render_task, samples.simulate_task) "
@@ -297,7 +310,7 @@ _REJECTIONS = RowQuery(
 
 
 def _check_valid_samples(connection: Connection, job: int, spec: JobSpec) -> None:
-    """Raise NoValidSamplesError where all samples of a job were rejected."""
+    """Raise NoValidSamplesError if all samples of a job were rejected."""
     if _VALID_SAMPLE.first(connection, {"b_job": job}) is not None:
         return
     counts = Counter[str]()
@@ -315,9 +328,11 @@ def _publish_task(connection: Connection, task: Leasable, publish: Publish) -> P
     payload = json.loads(task.payload)
     job = payload["job"]
     spec, inputs = read_plan(connection, job)
+    # Dependencies come in no order, and the dataset needs its shards in theirs.
     packs: dict[int, TaskResultRow] = {}
     for row in _results_of_dependencies(connection, task):
         packs[json.loads(row.payload)["shard"]] = row
+    # Check this before any section is stored.
     _check_valid_samples(connection, job, spec)
 
     outputs = [_output(packs[shard]) for shard in sorted(packs)]
@@ -332,10 +347,10 @@ def _publish_task(connection: Connection, task: Leasable, publish: Publish) -> P
 
 
 def _without_name(connection: Connection, job: int, spec: JobSpec) -> JobSpec:
-    """Return a spec for the manifest of a dataset: that of a project has no name.
+    """Return a spec for the manifest of a dataset, without the name if the job has a project.
 
     Another project that specifies the same samples reads the same files, and a name may be a
-    secret. Jobs without a project are of people who see all projects.
+    secret. Jobs without a project belong to people who see all projects.
     """
     project = connection.scalar(select(jobs.c.project).where(jobs.c.seq == job))
     return spec.model_copy(update={"name": None}) if project else spec
@@ -344,13 +359,14 @@ def _without_name(connection: Connection, job: int, spec: JobSpec) -> JobSpec:
 def _sections(
     connection: Connection, job: int, spec: JobSpec, packs: Sequence[Mapping[str, object]]
 ) -> Iterator[bytes]:
-    """Yield the slots of a dataset, whole shards at a time, as `PublishSection`s.
+    """Yield the slots of a dataset as `PublishSection`s of whole shards.
 
     `packs` are the outputs of the pack tasks by shard.
     """
     size = section_samples(spec)
     for first in range(0, spec.sample_count, size):
         end = min(first + size, spec.sample_count)
+        # Round up: the last shard of a dataset may be short.
         last_shard = -(-end // spec.samples_per_shard)
         shards = packs[first // spec.samples_per_shard : last_shard]
         yield _section(connection, job, range(first, end), shards)
