@@ -65,7 +65,7 @@ class StoreWatch:
         self._reported_until = float("-inf")
         self._next_probe = float("-inf")
         self.trouble = ""
-        """Description of the fault; empty without one."""
+        """Description of the fault, or an empty text."""
 
     def check(self) -> str:
         """Check the store again, and return the fault."""
@@ -119,7 +119,9 @@ class Notifier:
         self._lock = threading.Lock()
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self.count = 0
-        """Number of notifications so far: read it before looking for news, and pass it to `wait`.
+        """Number of notifications so far.
+
+        Read it before looking for news, and pass it to `wait`.
         """
 
     def notify(self) -> None:
@@ -176,7 +178,8 @@ class Context:
     no_check_since: int = -1
     """Number of writes when no job waited for a check of its dataset (`existing_datasets`)."""
     last_situation: tuple[int, tuple[tuple[str, str], ...]] | None = None
-    """Writes and workers when it was asked last which jobs no worker can run (`workers`)."""
+    """Number of writes and states of the workers when `workers` last looked for unschedulable jobs.
+    """
     next_situation_check: float = float("-inf")
     is_closing: bool = False
 

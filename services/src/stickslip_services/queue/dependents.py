@@ -59,7 +59,7 @@ _REJECT = Statement(
 
 
 def release_dependents(tx: QueueTransaction, tasks: Collection[int]) -> None:
-    """Count down the waiting dependents of tasks that have just got their results."""
+    """Count down the missing results of the dependents of tasks that have just got results."""
     ready: list[int] = []
     # The database counts down and tells in one statement which tasks have nothing left to wait for.
     for batch in batches(tasks):

@@ -1,4 +1,4 @@
-"""A job of a spec before it is submitted: counts, sizes, time, and whether it would be refused."""
+"""A job of a spec before its submission: counts, sizes, time, and the reason for a refusal."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -28,9 +28,9 @@ MAX_LOOKUPS = 10_000
 
 
 def validate_spec(context: Context, spec: JobSpec) -> Validation:
-    """Return counts and sizes of a job of `spec`, and why it would be refused, if so.
+    """Return counts and sizes of a job of `spec`, and the reason if it would be refused.
 
-    Counts come from arithmetic, so that a grid of a million samples costs nothing. Raises
+    Counts come from arithmetic, so a grid of a million samples costs nothing. Raises
     UnknownFileError.
     """
     check_files(context.database, context.store, spec)
@@ -39,6 +39,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
     inputs: PlanInputs | None = None
     refusal: str | None = None
     with context.database.read() as connection:
+        # A refusal is part of the answer: the user sees counts and sizes all the same.
         try:
             inputs = plan_inputs_for(connection, spec)
         except (KindNotAvailableError, PresetNotCertifiedError) as error:
@@ -67,6 +68,7 @@ def validate_spec(context: Context, spec: JobSpec) -> Validation:
 def _measured_costs(connection: Connection, spec: JobSpec, counts: Counts) -> dict[Stage, Interval]:
     """Return the CPU time of the stages whose tasks were measured [s]."""
     costs = read_costs(connection)
+    # The first points of a large grid stand for the rest of it.
     points = list(islice(spec.grid(), MAX_LOOKUPS))
     pack_timings = known_timings(costs, Stage.pack, spec.kind, "")
     work = {Stage.pack: [StageWork(counts.shards, pack_timings)]}
@@ -82,8 +84,10 @@ def _measured_costs(connection: Connection, spec: JobSpec, counts: Counts) -> di
     cpu_ratio = _cpu_ratio(connection, spec.kind)
     intervals: dict[Stage, Interval] = {}
     for stage, items in work.items():
+        # One unknown cost group makes the sum of the stage unknown.
         if any(item.timings is None for item in items):
             continue
+        # One slot gives the sum of the durations.
         eta = estimate({stage: items}, slots=1)
         if eta:
             ratio = cpu_ratio.get(stage, 1.0)
@@ -116,10 +120,12 @@ _CACHED_COUNT: ValueQuery[int] = ValueQuery(
 
 
 def _count_cached(database: Database, spec: JobSpec, inputs: PlanInputs) -> int | None:
-    """Return the number of tasks that have a result; None if the grid is too large to look."""
+    """Return the number of tasks that have a result, or None if the grid is too large to look."""
     with database.read() as connection:
         builds = inputs.builds.model_dump_json()
         same_builds = (jobs.c.kind == spec.kind, jobs.c.builds == builds)
+        # The builds are part of every task's key. Without a job of the same builds no task is
+        # known, and the plan need not be made.
         if connection.scalar(select(jobs.c.seq).where(*same_builds).limit(1)) is None:
             return 0
     if spec.sample_count > MAX_LOOKUPS:
@@ -133,7 +139,7 @@ def _count_cached(database: Database, spec: JobSpec, inputs: PlanInputs) -> int 
 
 
 def _compression(connection: Connection, kind: str) -> float | None:
-    """Return stored bytes over raw bytes of the newest dataset of a kind; None if there is none."""
+    """Return stored bytes over raw bytes of the newest dataset of a kind, or None without one."""
     row = connection.execute(
         select(jobs.c.spec, dataset_versions.c.bytes)
         .join(dataset_versions, dataset_versions.c.publish_task == jobs.c.publish_task)

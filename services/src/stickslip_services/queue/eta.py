@@ -1,19 +1,19 @@
 """The time that a job still takes, from measured durations of tasks, with its uncertainty.
 
-With n_g tasks left of cost group g, whose durations have mean m_g and standard deviation d_g over
-k_g measured tasks, and p slots to run them on,
+Let n_g be the number of tasks left of cost group g. Their durations have mean m_g and standard
+deviation d_g over k_g measured tasks. With p slots to run them on,
 
     T     = sum_g n_g m_g / p,  but no less than  sum_s M_s  over the stages left, in sequence
     var T = sum_g (n_g d_g^2 + n_g^2 d_g^2 / k_g + n_g^2 m_g^2 f^2) / p^2
 
-where M_s is the mean duration of the tasks left of stage s. A running task that reports its
-progress counts as the fraction that is left of it.
+M_s is the mean duration of the tasks left of stage s. A running task that reports its progress
+counts as the fraction of it that is left.
 
-The three terms: the spread of the durations, the standard error of the mean, and a relative error f
-for what the model leaves out (idle slots, other jobs). The interval is T -+ 1.28 sqrt(var T): 80 %
-of a normal distribution.
+The three terms of the variance are the spread of the durations, the standard error of the mean, and
+a relative error f. The model leaves out idle slots and other jobs, and f stands for them. The
+interval is T -+ 1.28 sqrt(var T), which holds 80 % of a normal distribution.
 
-The cost of a task is its share of the wall time of the call that made it; the call is what can
+The cost of a task is its share of the wall time of the call that made it. Only the whole call can
 hang.
 """
 
@@ -33,16 +33,16 @@ from stickslip_services.queue.rows import LeasedTask
 QUANTILE_80 = 1.2816
 MODEL_ERROR = 0.15  # f
 PACK_GUESS = 5.0
-"""Assumed duration of a pack or publish task before one has been measured [s]."""
+"""Assumed duration of a pack or publish task until one has been measured [s]."""
 
 MEASURED = 3
-"""Measured calls of a group that make its cost known."""
+"""Number of measured calls of a group that make its cost known."""
 
 LONG_CALL = 60.0
 """One call that takes longer than this [s] makes a cost known."""
 
 KEPT_RUNS = 200
-"""The sums of a group are halved beyond this number of tasks, so that old measurements fade."""
+"""Number of tasks beyond which the sums of a group are halved, so that old measurements fade."""
 
 TIMES = 3.0
 """Timeout of a call, as a multiple of its expected duration."""
@@ -53,7 +53,7 @@ Group = tuple[Stage, str, str]
 
 @dataclass(frozen=True, slots=True)
 class StageTimings:
-    """Durations of finished tasks: how many, their sum [s] and the sum of their squares [s^2]."""
+    """Durations of finished tasks: the number, their sum [s] and the sum of their squares [s^2]."""
 
     count: int
     total: float
@@ -70,7 +70,10 @@ class StageTimings:
 
     @property
     def variance(self) -> float:
-        """Variance of a duration [s^2]; of a single one, the mean squared."""
+        """Variance of a duration [s^2].
+
+        A single duration has its square as the variance.
+        """
         if self.count < 2:
             return self.mean**2
         return max(0.0, (self.squares - self.total * self.mean) / (self.count - 1))
@@ -85,26 +88,36 @@ class Cost:
 
     @property
     def calls(self) -> float:
-        """Measured calls: each task has its fraction of the wall time of its call."""
+        """Number of measured calls.
+
+        Each task has its fraction of the wall time of its call, and counts as that fraction of a
+        call.
+        """
         return self.share.count * self.share.total / max(self.call.total, 1e-9)
 
     @property
     def is_known(self) -> bool:
-        """True if enough calls have been measured: a call of many tasks is one measurement."""
+        """Whether enough calls have been measured.
+
+        A call of many tasks is one measurement.
+        """
         if self.share.count == 0:
             return False
         return self.calls > MEASURED - 0.5 or self.call.mean > LONG_CALL
 
     @property
     def expected_call(self) -> float:
-        """Expected duration of a slow call [s]: mean plus two standard deviations."""
+        """Expected duration of a slow call [s]: the mean plus two standard deviations."""
         spread = self.call.variance if self.call.count > 1 else 0.0
         return float(self.call.mean + 2 * spread**0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class StageWork:
-    """Tasks left of a cost group, and the durations of such tasks so far (None: unknown)."""
+    """Number of tasks left of a cost group, and the durations of such tasks so far.
+
+    The durations are None if they are unknown.
+    """
 
     left: float
     timings: StageTimings | None
@@ -113,9 +126,9 @@ class StageWork:
 def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | None:
     """Return the time left, or None if it is unknown or nothing is left.
 
-    Packing and publishing are a few short tasks at the end. Until one has been measured they are
-    assumed to take `PACK_GUESS`, or the mean of the slowest measured group where that is less, with
-    an error of 100 %. Simulations and renders are not guessed.
+    Packing and publishing are a few short tasks at the end. Until such a task has been measured, it
+    is assumed to take `PACK_GUESS`, with an error of 100 %. If the slowest measured group has a
+    smaller mean, the guess is that mean. Simulations and renders are not guessed.
     """
     left = {
         stage: rest
@@ -130,12 +143,14 @@ def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | 
         for item in left.get(stage, ())
     ):
         return None
+    # Work that is done still tells how long tasks take, so take the timings of all items.
     measured = [
         item.timings for items in work.values() for item in items if item.timings is not None
     ]
     if not measured:
         return None
     longest = min(PACK_GUESS, max(timings.mean for timings in measured))
+    # A variance of the mean squared is the error of 100 %.
     guess = StageTimings(1, longest, longest**2)
     seconds = chain = variance = 0.0
     for items in left.values():
@@ -148,6 +163,7 @@ def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | 
                 n * spread + n**2 * spread / timings.count + (n * mean * MODEL_ERROR) ** 2
             ) / slots**2
         seconds += total / slots
+        # Stages follow each other, so even with many slots each one takes as long as a task of it.
         chain += total / max(1.0, sum(item.left for item in items))
     seconds = max(seconds, chain)
     margin = QUANTILE_80 * sqrt(variance)
@@ -157,7 +173,7 @@ def estimate(work: Mapping[Stage, Sequence[StageWork]], *, slots: int) -> Eta | 
 def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings | None:
     """Return the shares of all groups of a stage and kind together, as one measurement.
 
-    None where none is known.
+    Returns None if no group is known.
     """
     found = [
         cost.share
@@ -173,9 +189,9 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
 def known_timings(
     costs: Mapping[Group, Cost], stage: Stage, kind: str, group: str
 ) -> StageTimings | None:
-    """Return the shares of a group, None if too little is known of it.
+    """Return the shares of a group, or None if too little is known of it.
 
-    Other groups say nothing of a job that has not begun: a frame of another quality, for example,
+    Other groups say nothing about a job that has not begun. For example, a frame of another quality
     costs several times as much.
     """
     cost = costs.get((stage, kind, group))
@@ -223,9 +239,9 @@ def read_costs(connection: Connection) -> dict[Group, Cost]:
 
 
 def limit_seconds(cost: Cost | None, tries: int, *, floor: float) -> float | None:
-    """Return the timeout of a call [s], at least `floor`; each failed try doubles it.
+    """Return the timeout of a call [s], at least `floor`, or None if the cost is unknown.
 
-    None: the cost is unknown.
+    Each failed try doubles it.
     """
     if cost is None or not cost.is_known:
         return None
@@ -253,7 +269,10 @@ class Run(NamedTuple):
 
 
 def add_costs(connection: Connection, runs: Sequence[Run]) -> None:
-    """Add the costs of tasks that have a representative call; rejections often come early."""
+    """Add the costs of the tasks that succeeded and whose calls were measured.
+
+    Rejections often come early, so they say little about the cost of a task.
+    """
     runs_by_group: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for task, result in runs:
         if result.call_seconds is not None and result.outcome == "succeeded":

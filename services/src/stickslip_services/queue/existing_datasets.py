@@ -1,6 +1,6 @@
-"""Jobs whose dataset existed before their submission: its files are checked before they end.
+"""Jobs whose dataset existed before their submission: its files are checked before the job ends.
 
-All files of the dataset are read, in the background. Damaged ones are computed again.
+A service reads all files of the dataset in the background. Damaged files are computed again.
 """
 
 import logging
@@ -21,9 +21,11 @@ from stickslip_services.queue.transaction import QueueTransaction
 logger = logging.getLogger(__name__)
 
 SMALL_DATASET = 64 * 2**20
-"""Largest dataset that the sweep checks itself [bytes]: it takes less than a second.
+"""Largest dataset that the sweep checks itself [bytes].
 
-Larger ones are checked by a service of their own, so that the sweep does not wait for them."""
+The check takes less than a second. Another service checks larger datasets, so that the sweep does
+not wait for them.
+"""
 
 
 class _ExistingDataset(NamedTuple):
@@ -53,12 +55,13 @@ def check_small_datasets(context: Context) -> None:
 
 
 def check_existing_datasets(context: Context) -> None:
-    """Do the same with datasets of all sizes."""
+    """Check datasets of all sizes, and end the jobs that wait for that."""
     _check_datasets(context, max_bytes=None)
 
 
 def _check_datasets(context: Context, *, max_bytes: int | None) -> None:
-    # Nothing was written since no job waited for a check: an idle coordinator does not ask again.
+    # The last check found no waiting job, and nothing has been written since. So an idle
+    # coordinator does not ask the database again.
     writes = context.notifier.count
     if context.no_check_since == writes:
         return
@@ -71,7 +74,7 @@ def _check_datasets(context: Context, *, max_bytes: int | None) -> None:
             continue
         try:
             damaged = damaged_files(context.store, dataset.manifest, dataset.group_digest)
-        except OSError as error:  # out of reach: the next sweep tries again
+        except OSError as error:  # the store is out of reach: the next sweep tries again
             logger.warning("an existing dataset cannot be checked now: %s", error)
             continue
         with context.transaction() as tx:
@@ -81,14 +84,15 @@ def _check_datasets(context: Context, *, max_bytes: int | None) -> None:
 def _end_or_rerun(
     tx: QueueTransaction, dataset: _ExistingDataset, damaged: Mapping[str, Sha256] | None
 ) -> None:
-    """End a job whose dataset is intact; otherwise rerun the tasks that produced damaged files.
+    """End a job whose dataset is intact, or else rerun the tasks that produced the damaged files.
 
-    `damaged` has the paths and digests of damaged files; it is None where the manifest itself
+    `damaged` has the paths and digests of the damaged files. It is None if the manifest itself
     cannot be trusted.
     """
     if dataset not in _EXISTING_DATASETS.rows(tx.connection):
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
+        # The check has read every file, so the scrub need not read them soon.
         own = dataset_versions.c.publish_task == dataset.publish_task
         intact = update(dataset_versions).where(own).values(scrubbed_at=tx.now, damaged=0)
         tx.connection.execute(intact)
@@ -101,5 +105,6 @@ def _end_or_rerun(
         "are recomputed"
     )
     set_job_state(tx, dataset.seq, JobState.queued, message=message)
+    # The publish task runs again too, after the producers of the damaged files.
     reset_tasks(tx, [dataset.publish_task])
     rerun_producers(tx, dataset.publish_task, damaged.values() if damaged else ())

@@ -1,10 +1,12 @@
-"""How leases end without a result: they are returned, lost, expired, or the attempt has failed.
+"""Leases that end without a result: they are returned, lost or expired, or the attempt failed.
 
-Losing a worker does not count as a failed try, and neither does a task that had not been started.
-After the n-th failed try the task waits `retry_seconds` 2^(n-1); after `max_tries` of them it
-fails. A task that ended its process each time is quarantined, and the jobs that need it continue
-with everything else. Any other failure ends all jobs that need the task: they start no further
-tasks, and running ones finish and are kept.
+The loss of a worker does not count as a failed try. A task that had not been started does not count
+either. After the n-th failed try the task waits `retry_seconds` 2^(n-1), and after `max_tries`
+failed tries it fails for good.
+
+A task that ended its process each time is quarantined, and the jobs that need it continue with
+everything else. Any other failure ends all jobs that need the task. These jobs start no further
+tasks, but their running tasks finish, and the results are kept.
 """
 
 import shlex
@@ -77,7 +79,10 @@ def leased_tasks_of(connection: Connection, workers: Sequence[str]) -> list[Leas
 
 
 def mark_started(tx: QueueTransaction, leased: Collection[TaskRow]) -> None:
-    """Record that leased tasks have been started: from here on they may fail."""
+    """Record that workers have started leased tasks.
+
+    From then on the tasks may fail, and the loss of the worker counts.
+    """
     for batch in batches(leased):
         values = {"b_tasks": [task.seq for task in batch], "b_now": tx.now}
         _MARK_STARTED.run(tx.connection, values)
@@ -97,11 +102,15 @@ def requeue(tx: QueueTransaction, leased: Collection[TaskRow], *, is_lost: bool 
 def requeue_lost(
     tx: QueueTransaction, leased: Sequence[LeasedTask], settings: Settings, *, message: str
 ) -> None:
-    """End the leases of a lost worker. A task fails after `max_losses` lost workers."""
+    """End the leases of a lost worker.
+
+    A task fails after `max_losses` lost workers.
+    """
     not_started: list[LeasedTask] = []
     lost: list[LeasedTask] = []
     exhausted: list[LeasedTask] = []
     for task in leased:
+        # A task that was not started cannot have brought its worker down.
         if task.state != TaskState.running:
             not_started.append(task)
         elif task.losses + 1 < settings.max_losses:
@@ -115,7 +124,8 @@ def requeue_lost(
         fail_permanently(tx, failure, task.losses + 1, settings)
 
 
-# A lease ends when it has had its duration, and nothing has been heard of its worker for as long.
+# A lease expires after its duration, but only if its worker has been silent for as long. Messages
+# of the worker renew all its leases without a write for each of them.
 _IS_EXPIRED = (
     f"{IS_LEASED.text} AND tasks.expires_at <= :b_now AND tasks.owner NOT IN "
     "(SELECT workers.id FROM workers WHERE workers.last_seen_at > :b_alive_since)"
@@ -137,6 +147,7 @@ def is_expiry_due(connection: Connection, now: float, alive_since: float) -> boo
 
 def expire_leases(context: Context) -> None:
     """End expired leases, and return tasks whose retry is due to `pending`."""
+    # Most calls find nothing. A read does not wait for writers.
     with context.database.read() as connection:
         if not is_expiry_due(connection, context.clock(), context.alive_since):
             return
@@ -161,7 +172,7 @@ class Failure:
 
 
 def record_failures(tx: QueueTransaction, failures: Sequence[Failure], settings: Settings) -> None:
-    """Count failed tries; each task is retried later, or fails for good."""
+    """Count failed tries, so that each task is retried later or fails for good."""
     for failure in failures:
         task = failure.task
         tries = task.tries + 1
@@ -185,6 +196,7 @@ def fail_permanently(
     times = "once" if count == 1 else f"{count} times, at last"
     explanation = f"task {name} failed {times} with {reason}: {failure.message}"
     message = failure.message
+    # Such a task hurts only itself: its jobs can go on without it.
     if reason.ends_a_process:
         message = (
             f"quarantined after {count} tries, at last {reason}: {failure.message}. To reproduce: "
@@ -199,6 +211,7 @@ def fail_permanently(
         "No further tasks are started; what is done is kept, and submitting the job again tries "
         f"again. To reproduce: {command}"
     )
+    # The task is shared, so its failure concerns every open job that needs it.
     for job in open_jobs_of(tx.connection, task.seq):
         if reason is not Reason.quarantined:
             end_job(tx, job, JobState.failed, Reason.failed_tasks, f"{explanation}. {advice}")
@@ -224,11 +237,12 @@ def _report_quarantine(
 def fail_damaged(tx: QueueTransaction, task: LeasedTask, error: DamagedRowError) -> None:
     """End the jobs that need a damaged row, which a lease of `task` has found.
 
-    The task and the damaged results fail for good. The next submission of a spec that needs them
+    The task and the damaged results fail for good. If a later submission of a spec needs them, it
     writes them anew and computes them again (`insertion`).
     """
     message = str(error)
     discarded = [seq for seq in error.results if seq != task.seq]
+    # A damaged result may belong to jobs that do not need the task itself.
     affected_jobs: set[int] = set()
     for seq in (task.seq, *discarded):
         affected_jobs.update(open_jobs_of(tx.connection, seq))
@@ -237,8 +251,9 @@ def fail_damaged(tx: QueueTransaction, task: LeasedTask, error: DamagedRowError)
         tx, [task.seq, *discarded], TaskState.failed, reason=Reason.damaged_row, message=message
     )
     remove_ready(tx.connection, [task.seq, *discarded])
+    # Dependents in other jobs must not run with a discarded result.
     hold_dependents(tx, discarded)
-    # The totals of these jobs are not corrected: they end here.
+    # The totals of these jobs are not corrected, because the jobs end here.
     for job in sorted(affected_jobs):
         end_job(tx, job, JobState.failed, Reason.damaged_row, message)
 
@@ -254,7 +269,7 @@ def fail_invalid_dataset(tx: QueueTransaction, task: LeasedTask, message: str) -
 def _set_state(
     tx: QueueTransaction, seqs: Collection[int], state: TaskState, **values: object
 ) -> None:
-    """End the leases of tasks, and put them into a state."""
+    """End the leases of tasks, and put the tasks into a state."""
     values = {"retry_at": None, **NO_LEASE, **values}
     values["finished_at"] = tx.now if state.is_over else None
     change = update(tasks).where(tasks.c.seq.in_(seqs)).values(state=state, **values)
@@ -272,7 +287,7 @@ def reproducer(name: str, settings: Settings) -> str:
 
 
 class FailedTask(NamedTuple):
-    """A task that failed for good, or waits for a retry."""
+    """A task that failed for good or waits for a retry."""
 
     task_id: str
     stage: str
@@ -285,7 +300,7 @@ class FailedTask(NamedTuple):
 def failed_tasks(
     connection: Connection, job: int, settings: Settings, count: int
 ) -> list[FailedTask]:
-    """Return the tasks of a job that have failed or wait for a retry, newest first."""
+    """Return the newest tasks of a job that have failed or wait for a retry."""
     rows = connection.execute(
         select(tasks.c.key, tasks.c.stage, tasks.c.tries, tasks.c.reason, tasks.c.message)
         .join(job_tasks, job_tasks.c.task == tasks.c.seq)

@@ -1,4 +1,4 @@
-"""Names: random ones, and those of tasks, `<stage>-<content key>`."""
+"""Names: random names, and the names of tasks, `<stage>-<content key>`."""
 
 import secrets
 
@@ -16,7 +16,7 @@ def task_id(stage: str, key: bytes) -> str:
 
 
 def task_key(name: str) -> bytes | None:
-    """Return the content key in the name of a task; None for any other text."""
+    """Return the content key in the name of a task, or None for any other text."""
     stage, _, key = name.partition("-")
     if stage not in list(Stage) or not is_sha256(key):
         return None

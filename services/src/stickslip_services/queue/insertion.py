@@ -1,7 +1,7 @@
 """Insertion of jobs and of their plans, piece by piece.
 
-A task that exists in the database already is shared. If it has a result, the job gets that for
-free; if it waits or runs, both jobs wait for it; if it failed, or if no other job needs it any
+If a task exists in the database already, jobs share it. If it has a result, the job gets that for
+free. If it waits or runs, both jobs wait for it. If it failed, or if no other job needs it any
 more, the new job starts it again with all its tries.
 """
 
@@ -47,7 +47,7 @@ from stickslip_services.queue.transaction import QueueTransaction
 
 
 def insert_job(tx: QueueTransaction, spec: JobSpec, *, priority: int = 0, project: str = "") -> int:
-    """Insert a job without its tasks; return its `seq`."""
+    """Insert a job without its tasks, and return its `seq`."""
     document = spec.model_dump_json()
     result = tx.connection.execute(
         insert(jobs).values(
@@ -71,7 +71,10 @@ def insert_job(tx: QueueTransaction, spec: JobSpec, *, priority: int = 0, projec
 def begin_planning(
     tx: QueueTransaction, job: int, inputs: PlanInputs, plan: Plan | None = None
 ) -> None:
-    """Store the inputs of a job's plan, and insert it, or have it planned piece by piece."""
+    """Store the inputs of a job's plan, and insert the plan or leave it to the planner.
+
+    The planner inserts a plan piece by piece if `plan` is None.
+    """
     spec = tx.connection.scalar(select(jobs.c.spec).where(jobs.c.seq == job))
     builds = inputs.builds.model_dump_json()
     values = {"builds": builds, "certificate": inputs.certificate}
@@ -83,9 +86,9 @@ def begin_planning(
 
 
 def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
-    """Insert the tasks of a piece of a job; the last piece makes a `planning` job `queued`.
+    """Insert the tasks of a piece of a job, and end the planning with the last piece.
 
-    If its dataset exists already, the job ends once the dataset has been checked
+    If the dataset exists already, the job ends once the dataset has been checked
     (`existing_datasets`).
     """
     known = _insert_plan(tx, job, piece)
@@ -95,14 +98,17 @@ def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
         return
     key = piece.publish_key
     publish_task = tx.connection.scalar(select(tasks.c.seq).where(tasks.c.key == key))
+    # The plan is complete, so the claim of the planner ends with it.
     planned = {"publish_task": publish_task, "planner": None, "planner_until": None}
     tx.connection.execute(update(jobs).where(own).values(planned))
+    # A dataset in the database may be damaged in the store, so it is checked before the job ends.
     if key in known and known[key].state == TaskState.succeeded:
         message = "the dataset exists already: its files are being checked"
         set_job_state(tx, job, JobState.queued, message=message)
         return
     row = tx.connection.execute(select(jobs.c.state, jobs.c.started_at).where(own)).one()
     if row.state == JobState.planning:
+        # Workers may have run tasks of earlier pieces during the planning.
         started = row.started_at is not None
         set_job_state(tx, job, JobState.running if started else JobState.queued)
 
@@ -111,7 +117,7 @@ def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
 
 
 class _KnownTask(NamedTuple):
-    """A task that was in the database before the piece."""
+    """A task that the database had before the piece."""
 
     seq: int
     stage: str
@@ -171,9 +177,10 @@ _REWRITE = Statement(
 
 
 def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> dict[bytes, _KnownTask]:
-    """Insert the tasks and samples of a piece; return the tasks that were known before."""
+    """Insert the tasks and samples of a piece, and return the tasks that were known before."""
     connection = tx.connection
     known = _find_known(connection, plan)
+    # Pieces of one job may share tasks. Such a task is linked and counted once.
     earlier: set[int] = set()  # of earlier pieces of this job
     restarted: list[_KnownTask] = []
     if known:
@@ -181,6 +188,7 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> dict[bytes, _Kno
         earlier = set(_TASKS_OF_JOB.values(connection, {"b_job": job, "b_tasks": seqs}))
         shared = [task for task in known.values() if task.seq not in earlier]
         restarted = _restart(tx, job, plan, shared)
+        # The restart has changed states that the next steps read.
         if restarted:
             known = _find_known(connection, plan)
 
@@ -190,15 +198,17 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> dict[bytes, _Kno
     _insert_links(connection, job, plan, new, earlier)
     _insert_samples(connection, job, plan, new.seqs)
 
+    # Shared tasks that can run now enter the queue of this job too.
     shared_seqs = [task.seq for task in known.values() if task.seq not in earlier]
     add_ready(connection, shared_seqs)
     return known
 
 
 def _find_known(connection: Connection, plan: Plan) -> dict[bytes, _KnownTask]:
-    """Return the tasks of a piece, and their dependencies, that the database has, by key."""
+    """Return the tasks of a piece and their dependencies that the database has, by key."""
     if _ANY_TASK.first(connection) is None:
         return {}
+    # A dependency may be in an earlier piece: the publish task needs the pack tasks of all pieces.
     keys = set(plan.tasks)
     for task in plan.tasks.values():
         keys.update(task.depends_on)
@@ -211,15 +221,17 @@ def _restart(
 ) -> list[_KnownTask]:
     """Give shared tasks that failed, or that nobody needs any more, all their tries.
 
-    Their rows are written anew where they may be damaged, or name another job. Returns these tasks.
+    Writes their rows anew if these may be damaged or name another job. Returns these tasks.
     """
     failed = [task for task in shared if task.state == TaskState.failed]
     waiting = [task for task in shared if task.state in (TaskState.pending, TaskState.soft_failed)]
+    # A task that another job waits for keeps its tries: that job counts them.
     needed = set(_NEEDED_TASKS.values(tx.connection, {"b_tasks": [t.seq for t in waiting]}))
     abandoned = [task for task in waiting if task.seq not in needed]
 
     rewritten: list[dict[str, object]] = []
     for task in (*failed, *abandoned):
+        # Pack and publish tasks read the slots of the job that they name, and that job may be gone.
         names_a_job = task.stage in (Stage.pack, Stage.publish)
         if task.key in plan.tasks and (names_a_job or task.state == TaskState.failed):
             planned = plan.tasks[task.key]
@@ -237,7 +249,8 @@ def _restart(
 
     if failed:
         reset_tasks(tx, [task.seq for task in failed])
-        # A failed render may belong to a simulation that has been rejected before.
+        # A failed render may belong to a simulation that was rejected before. Then it must not run
+        # again.
         reject_renders(tx, [t.seq for t in shared if t.state == TaskState.rejected])
     return [*failed, *abandoned]
 
@@ -245,14 +258,16 @@ def _restart(
 def _rewire(
     tx: QueueTransaction, plan: Plan, seqs: Mapping[bytes, int], restarted: Iterable[_KnownTask]
 ) -> None:
-    """Let restarted tasks depend on the tasks of the plan, where they depend on others.
+    """Restore the dependencies of restarted tasks that lack tasks of the plan.
 
-    The key of a dependency may have been damaged: the plan then has another task in its place.
+    The key of a dependency may have been damaged. Then the plan has another task in its place.
     """
     expected: dict[int, set[int]] = {}
     for task in restarted:
         if task.key in plan.tasks:
             expected[task.seq] = {seqs[key] for key in plan.tasks[task.key].depends_on}
+    # More dependencies than the plan has are right: a task may wait for the producers of its
+    # inputs.
     actual: dict[int, set[int]] = {seq: set() for seq in expected}
     for edge in _EDGES.batched_rows(tx.connection, "b_tasks", expected):
         actual[edge.task].add(edge.depends_on)
@@ -263,6 +278,7 @@ def _rewire(
         edges = delete(task_dependencies).where(task_dependencies.c.task.in_(batch))
         tx.connection.execute(edges)
         tx.connection.execute(update(tasks).where(tasks.c.seq.in_(batch)).values(waiting_on=0))
+    # Without edges each task waits for nothing. This counts its missing results anew.
     for seq in wrong:
         wait_for(tx, seq, sorted(expected[seq]))
 
@@ -278,13 +294,18 @@ class _NewTasks:
         self.seqs = {key: task.seq for key, task in known.items()}
         """The `seq` of every task of the piece."""
         self.rejected: set[int] = set()
-        """New renders whose simulation was rejected before, which is their result."""
+        """New renders whose simulation was rejected before.
+
+        This rejection is their result.
+        """
         self._rows: list[tuple[object, ...]] = []
         self._dependencies: list[tuple[int, int]] = []
         self._ready: list[tuple[int, int, str, str]] = []
 
     def insert(self, connection: Connection) -> None:
-        """Insert them in the order of the plan, with their dependencies and places in the queue."""
+        """Insert the tasks in the order of the plan, with their dependencies and queue entries."""
+        # The transaction excludes other writers, so the numbers can be given here, without a query
+        # a task.
         seq = _LAST_TASK.first(connection) or 0
         for key, task in self._plan.tasks.items():
             if key not in self.seqs:
@@ -308,6 +329,7 @@ class _NewTasks:
             result = self._with_result.get(needed)
             if result is None:
                 waiting_on += 1
+            # A render of a rejected simulation would have nothing to render.
             elif stage == Stage.render and result.state == TaskState.rejected:
                 rejection = result
         payload = _payload(task, self._job)
@@ -345,7 +367,7 @@ _TASK_COLUMNS = (
 def _payload(task: PlannedTask, job: int) -> str:
     """Return the document of a task.
 
-    The slots of pack and publish are those of the job that came first.
+    A pack or publish task reads the slots of a job, so its document names the job that came first.
     """
     if task.stage in (Stage.pack, Stage.publish):
         return json.dumps({**json.loads(task.payload), "job": job})
@@ -363,6 +385,7 @@ def _insert_links(
     links: list[tuple[int, int, bool]] = []
     counts = Counter[tuple[str, str, str]]()
     for key, seq in new.seqs.items():
+        # An earlier piece has linked and counted it.
         if seq in earlier:
             continue
         task = known.get(key)

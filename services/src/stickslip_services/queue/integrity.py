@@ -7,11 +7,11 @@
 | sample | all its columns | its shard or its dataset is made; it is listed |
 | job | spec, builds, certificate | it is planned, served, packed, published or shown |
 
-Nothing is mended. `failures.fail_damaged` ends the jobs that need the row, with the reason
-`damaged_row`. To go on, restore a backup of the database, or submit the spec again: the damaged
-result is computed again, and all others are kept.
+The coordinator mends nothing. `failures.fail_damaged` ends the jobs that need the row, with the
+reason `damaged_row`. To go on, restore a backup of the database, or submit the spec again. A new
+submission computes the damaged result again and keeps all others.
 
-An error that is not one of these is a bug, and is treated like one.
+Any other error is a bug, and is treated like one.
 """
 
 import hashlib
@@ -46,7 +46,7 @@ def row_digest(*values: object) -> int:
 def payload_digest(key: bytes, stage: str, build: str, payload: str) -> int:
     """Return 63 bits of a digest of a task.
 
-    Unlike `row_digest` it needs no JSON: planning computes a million of them.
+    Unlike `row_digest` it needs no JSON, because planning computes a million of these digests.
     """
     data = b"".join((key, stage.encode(), build.encode(), payload.encode()))
     return int.from_bytes(hashlib.blake2b(data, digest_size=8).digest()) >> 1
@@ -62,7 +62,7 @@ class _PlannedTask(TaskRow, Protocol):
 
 
 def check_task(task: _PlannedTask) -> None:
-    """Raise DamagedRowError where a task is not the one that was planned."""
+    """Raise DamagedRowError if a task differs from the planned one."""
     if payload_digest(task.key, task.stage, task.build, task.payload) != task.payload_digest:
         raise DamagedRowError(f"row {task.seq} of tasks")
 
@@ -75,12 +75,13 @@ def result_digest(
 
 
 def check_results(rows: Iterable[TaskResultRow]) -> None:
-    """Raise DamagedRowError where the result of a task differs from the one that was reported."""
+    """Raise DamagedRowError if the result of a task differs from the reported one."""
     damaged: list[TaskResultRow] = []
     for row in rows:
         digest = result_digest(row.key, row.state, row.reason, row.message, row.output)
         if digest != row.digest:
             damaged.append(row)
+    # Name all damaged results: each of them must be computed again.
     if damaged:
         first = damaged[0]
         name = f"row {first.seq} of tasks, the result of {task_id(first.stage, first.key)}"
@@ -101,10 +102,11 @@ def sample_digest(
 
 
 def check_samples(rows: Sequence[SampleRow], job: int, slots: Iterable[int]) -> None:
-    """Raise DamagedRowError where rows of `samples` differ, or are not those of `slots`."""
+    """Raise DamagedRowError if rows of `samples` differ, or are not the rows of `slots`."""
     row_of_slot = {row.slot: row for row in rows}
     for slot in slots:
         row = row_of_slot.get(slot)
+        # A missing row is damage too: the slot would silently disappear from the dataset.
         if row is None or sample_digest(*row[:-1]) != row.digest:
             raise DamagedRowError(f"row (job {job}, slot {slot}) of samples")
 
@@ -125,19 +127,25 @@ class _PlannedJob(Protocol):
 
 
 def check_job(row: _PlannedJob) -> None:
-    """Raise DamagedRowError where spec, builds or certificate of a job differ."""
+    """Raise DamagedRowError if spec, builds or certificate of a job differ."""
     if row_digest(row.spec, row.builds, row.certificate) != row.digest:
         raise DamagedRowError(f"row {row.seq} of jobs")
 
 
 def spec_of(row: _PlannedJob) -> JobSpec:
-    """Return the spec of a job; raise DamagedRowError."""
+    """Return the spec of a job.
+
+    Raises DamagedRowError if the row of the job is damaged.
+    """
     check_job(row)
     return job_spec_adapter.validate_json(row.spec)
 
 
 def plan_inputs_of(row: _PlannedJob) -> PlanInputs | None:
-    """Return builds and certificate of a job, None before its planning; raise DamagedRowError."""
+    """Return builds and certificate of a job, or None before its planning.
+
+    Raises DamagedRowError if the row of the job is damaged.
+    """
     check_job(row)
     if row.builds is None:
         return None
@@ -146,7 +154,7 @@ def plan_inputs_of(row: _PlannedJob) -> PlanInputs | None:
 
 @contextmanager
 def reported_damage() -> Iterator[None]:
-    """Raise DamagedRowError where the database itself reports that its file is damaged."""
+    """Raise DamagedRowError if the database itself reports that its file is damaged."""
     try:
         yield
     except DBAPIError as error:

@@ -1,6 +1,7 @@
 """The builds that jobs were planned for, read and checked once each.
 
-They never change once a job is planned. A request for tasks needs them of all schedulable jobs.
+The builds of a planned job never change. A request for tasks needs the builds of all schedulable
+jobs.
 """
 
 from sqlalchemy import Connection, bindparam, select
@@ -24,7 +25,7 @@ class JobBuilds:
         """Jobs whose rows are damaged, so that nobody can say which workers serve them."""
 
     def read(self, connection: Connection, job: int) -> Builds | None:
-        """Return the builds of a job; None before its planning, or where its row is damaged."""
+        """Return the builds of a job, or None before its planning or if its row is damaged."""
         builds = self._builds.get(job)
         if builds is not None or job in self._damaged:
             return builds
@@ -34,6 +35,8 @@ class JobBuilds:
         try:
             inputs = plan_inputs_of(row)
         except DamagedRowError as error:
+            # The caller holds a read transaction only. The sweep ends the job
+            # (`background.fail_damaged_jobs`).
             self._damaged[job] = error
             return None
         if inputs is None:

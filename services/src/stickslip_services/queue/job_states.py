@@ -1,9 +1,9 @@
 """States of jobs: how they start, pause, end and publish, with the events that tell it.
 
-Each of these is one row of `jobs`, whatever the number of tasks: nobody leases tasks for a job that
-is not schedulable, and workers hear at their next heartbeat which tasks to drop. Transitions that
-wait for workers (`pausing` to `paused`, `cancelling` to `cancelled`, the end of a job of which only
-quarantined tasks are left) are made by `settle_jobs`, which the sweep calls.
+Each transition writes one row of `jobs`, whatever the number of tasks. Nobody leases tasks for a
+job that is not schedulable, and workers hear at their next heartbeat which tasks to drop. Some
+transitions wait for workers: `pausing` to `paused`, `cancelling` to `cancelled`, and the end of a
+job of which only quarantined tasks are left. The sweep calls `settle_jobs`, which makes them.
 """
 
 from collections.abc import Collection, Sequence
@@ -80,6 +80,7 @@ def set_job_state(
     """Set the state of a job with its reason and message, and store the event."""
     values: dict[str, object] = {"state": state, "reason": reason, "message": message}
     if state is JobState.running:
+        # A job that goes on after a pause keeps its first start.
         values["started_at"] = func.coalesce(jobs.c.started_at, tx.now)
     if not state.is_open:
         values["finished_at"] = tx.now
@@ -104,7 +105,7 @@ _JOBS_TO_START = RowQuery(
 
 
 def start_jobs(tx: QueueTransaction, leased_tasks: Collection[int]) -> None:
-    """Make the queued jobs that need tasks that have just been leased `running`."""
+    """Make the queued jobs that need the newly leased tasks `running`."""
     for batch in batches(leased_tasks):
         for job in _JOBS_TO_START.rows(tx.connection, {"b_tasks": batch}):
             _start(tx, job)
@@ -114,13 +115,13 @@ def _start(tx: QueueTransaction, job: _StartedJob) -> None:
     if job.state == JobState.queued:
         set_job_state(tx, job.seq, JobState.running)
     else:
-        # It is still being planned: it becomes `running` once it is planned.
+        # The planner is still at work, and makes the job `running` with the last piece.
         start = update(jobs).where(jobs.c.seq == job.seq).values(started_at=tx.now)
         tx.connection.execute(start)
 
 
 class Version(Protocol):
-    """A row of `dataset_versions` that is committed."""
+    """A committed row of `dataset_versions`."""
 
     @property
     def dataset(self) -> str: ...
@@ -162,7 +163,7 @@ def end_job(
 ) -> None:
     """End a job, unless it is not active any more.
 
-    Its tasks stay as they are: without an active job nobody leases them.
+    Its tasks stay as they are, because nobody leases them without an active job.
     """
     if is_active(tx.connection, job):
         set_job_state(tx, job, state, reason=reason, message=message)
@@ -176,7 +177,7 @@ def is_active(connection: Connection, job: int) -> bool:
 
 # ---- Transitions that wait for workers -----------------------------------------------------------
 
-# Looked for among the tasks on lease, which are fewer than the tasks of a job.
+# Search among the tasks on lease, which are fewer than the tasks of a job.
 _EXCLUSIVE_LEASE: ValueQuery[int] = ValueQuery(
     text(
         "SELECT tasks.seq FROM tasks WHERE tasks.owner IS NOT NULL "
@@ -208,8 +209,8 @@ _QUEUED_JOBS_ON_LEASE = RowQuery(
     "WHERE tasks.owner IS NOT NULL AND job_tasks.task = tasks.seq AND jobs.seq = job_tasks.job "
     "AND jobs.state = 'queued'",
 )
-# A job is blocked if tasks of it have failed for good, nothing of it is in flight, and nothing is
-# ready: all the rest waits for a quarantined task.
+# A job is blocked if tasks of it have failed for good, no worker has a task of it, none waits for a
+# retry, and none is ready. Then all the rest waits for a quarantined task.
 _BLOCKED_JOBS: ValueQuery[int] = ValueQuery(
     "SELECT DISTINCT jobs.seq FROM job_totals CROSS JOIN jobs "
     "WHERE job_totals.failed > 0 AND jobs.seq = job_totals.job "
@@ -263,7 +264,7 @@ def settle_jobs(tx: QueueTransaction) -> None:
 
 
 def settle_job(tx: QueueTransaction, job: int) -> None:
-    """Make the transition of one job that was just paused or cancelled, if nothing of it runs."""
+    """Make the transition of a job that was just paused or cancelled, if none of its tasks runs."""
     for waiting in _WAITING_JOBS.rows(tx.connection):
         if waiting.seq == job:
             _settle(tx, waiting)
@@ -271,9 +272,12 @@ def settle_job(tx: QueueTransaction, job: int) -> None:
 
 def _settle(tx: QueueTransaction, job: _WaitingJob) -> None:
     if job.state == JobState.pausing:
+        # A task that another schedulable job needs runs on for that job, so nobody waits for it
+        # here.
         if has_exclusive_lease(tx.connection, job.seq, SCHEDULABLE):
             return
         reason = None if job.reason is None else Reason(job.reason)
+        # A job that waits for the store keeps the message with the fault of the store.
         message = job.message if job.reason else "paused; resume it to go on"
         set_job_state(tx, job.seq, JobState.paused, reason=reason, message=message)
     elif not has_exclusive_lease(tx.connection, job.seq, ACTIVE):
