@@ -1,1 +1,1 @@
-"""Who may do what, who has done what, and which programs receive job events."""
+"""Permissions, the log of changes, and the programs that receive job events."""

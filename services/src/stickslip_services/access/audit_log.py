@@ -1,4 +1,4 @@
-"""The audit log: who changed what, and when.
+"""The audit log: the author, the subject and the time of each change.
 
 It is append-only: the database refuses to change or delete an entry. An entry is written in the
 transaction of the change itself, so that neither exists without the other.
@@ -23,7 +23,7 @@ class Entry(Document):
     actor: str
     """Name of the principal."""
     action: str
-    """What was done, for example `job.cancel`."""
+    """The action, for example `job.cancel`."""
     subject: str
     """The id of the job, version, key, webhook or certificate that was changed."""
     details: dict[str, Any]

@@ -80,7 +80,10 @@ def list_keys(connection: Connection) -> Sequence[Row[Any]]:
 
 
 def revoke_key(connection: Connection, key_id: str, now: float) -> None:
-    """Revoke a key; raise NotFoundError."""
+    """Revoke a key.
+
+    Raises NotFoundError if there is no such key.
+    """
     # The row stays: the audit log names the key, and its first revocation counts.
     revoked = update(api_keys).values(revoked_at=func.coalesce(api_keys.c.revoked_at, now))
     if connection.execute(revoked.where(api_keys.c.id == key_id)).rowcount == 0:
@@ -91,7 +94,7 @@ def revoke_key(connection: Connection, key_id: str, now: float) -> None:
 def secret_in(path: Path) -> str:
     """Return the secret in a key file.
 
-    Make the file where it is missing, readable by its owner alone.
+    Makes the file if it is missing, readable by its owner alone.
     """
     if not path.exists():
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -141,7 +144,7 @@ class KeyRing:
 
     @property
     def is_fresh(self) -> bool:
-        """True where `holder_of` does not need the database."""
+        """Whether `holder_of` can answer without the database."""
         return time.monotonic() < self._read_at + FRESH_SECONDS
 
     def holder_of(self, secret: str) -> Principal | None:

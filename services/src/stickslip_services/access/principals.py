@@ -27,10 +27,10 @@ _PROJECT = re.compile(r"([a-z0-9][a-z0-9-]{0,62})?")
 
 
 class Scope(StrEnum):
-    """What a key permits. `submit` includes `read`; `admin` includes everything."""
+    """The permission of a key: `submit` includes `read`, and `admin` includes everything."""
 
     read = "read"
-    """Read what belongs to the project of the key: jobs, datasets, pages."""
+    """Read the jobs, datasets and pages of the project of the key."""
     submit = "submit"
     """Submit jobs, and pause, resume, cancel and prioritise them."""
     work = "work"

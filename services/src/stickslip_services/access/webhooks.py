@@ -139,7 +139,7 @@ class WebhookDelivery:
             thread.join(max(0.0, end - time.monotonic()))
 
     def _claim(self, seq: int) -> bool:
-        """Claim a webhook; return False where another coordinator or thread has it."""
+        """Claim a webhook, or return False if another coordinator or thread has it."""
         due = and_(webhooks.c.seq == seq, _is_due(self._clock()))
         claim = update(webhooks).where(due).values(next_at=self._clock() + CLAIM_SECONDS)
         with self._database.write() as connection:
@@ -152,7 +152,7 @@ class WebhookDelivery:
         wait: float | None = None
         try:
             while wait is None and not self._stopping.is_set():
-                wait = WAITS[0]  # where it raises
+                wait = WAITS[0]  # the wait if it raises
                 wait = self._deliver_one(seq)
         finally:
             with self._database.write() as connection:

@@ -1,1 +1,1 @@
-"""What has been made: dataset versions and certificates."""
+"""The products: dataset versions and certificates."""

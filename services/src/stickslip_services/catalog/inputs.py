@@ -1,4 +1,4 @@
-"""What jobs build on: certificates, and the uploaded files that specs name by digest."""
+"""The foundations of jobs: certificates, and the uploaded files that specs name by digest."""
 
 from pydantic import TypeAdapter
 from sqlalchemy import Connection, Row, insert, select, update
@@ -158,7 +158,7 @@ def _broken_rule(
     store: Store, spec: JobSpec, pointer: str, digest: Sha256, visible: set[Sha256]
 ) -> str:
     """Return the rule that a file at a pointer breaks; an empty text if it fits."""
-    # Everybody may use what comes with the distribution.
+    # Everybody may use the files that come with the distribution.
     built_in = built_in_files().get(digest)
     if built_in is not None and not store.exists(digest):
         store.publish(built_in)

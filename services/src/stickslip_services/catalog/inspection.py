@@ -55,7 +55,7 @@ def _inspect_scene_file(data: bytes, _question: Answer) -> object:
 
 
 def _inspect_artifact(data: bytes, question: Answer) -> object:
-    """Check that a file is what a spec needs at a pointer."""
+    """Check that a file fits the place in a spec that a pointer names."""
     spec = job_spec_adapter.validate_json(question["spec"])
     place = spec.scene_place(question["pointer"])
     if place is None:
@@ -113,7 +113,7 @@ def _answer(question: Answer, data: bytes) -> Answer:
 def _limit() -> None:
     """Limit the memory and the CPU time of this process.
 
-    Memory is limited where the kernel says how much address space the process has already.
+    Memory is limited if the kernel tells how much address space the process has already.
     """
     limits = {
         resource.RLIMIT_CPU: CPU_SECONDS,

@@ -1,4 +1,4 @@
-"""The scenes that the coordinator knows: the built-in ones, and those of jobs."""
+"""The scenes that the coordinator knows: the built-in scenes, and the scenes of jobs."""
 
 import json
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class KnownScene:
 
 
 def known_scenes(connection: Connection) -> dict[str, KnownScene]:
-    """Return scenes by digest: the built-in ones, and those of the newest jobs."""
+    """Return scenes by digest: the built-in scenes, and the scenes of the newest jobs."""
     built_in = [load_scene(name) for name in scene_names()]
     known = {scene.digest: KnownScene(scene, is_built_in=True) for scene in built_in}
     query = (

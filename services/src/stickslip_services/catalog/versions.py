@@ -47,9 +47,9 @@ HEADS_AT_ONCE = 128
 
 
 def stored_contents(store: Store, manifest: Sha256) -> Contents:
-    """Return what a manifest in the store lists; raise OSError or ValueError.
+    """Return the contents that a manifest in the store lists.
 
-    Sections are read on demand.
+    Raises OSError or ValueError. Sections are read on demand.
     """
     # The store compares an artifact with its digest, so a damaged manifest raises here.
     document = Manifest.model_validate_json(store.read(manifest))
@@ -96,9 +96,9 @@ def sign_version(store: Store, dataset: str, version: int, seal: bytes, key: Pat
 
 
 def mend_signature(store: Store, dataset: str, version: int, seal: bytes, key: Path) -> bool:
-    """Sign a version whose signature is missing or broken; return whether it was signed.
+    """Sign a version whose signature is missing or broken, and return whether it was signed.
 
-    Raises ClientError if the key cannot sign, OSError where the store is out of reach.
+    Raises ClientError if the key cannot sign, and OSError if the store is out of reach.
     """
     try:
         if is_signature(store.read_shown(dataset, version, SIGNATURE_NAME), seal):
@@ -110,7 +110,7 @@ def mend_signature(store: Store, dataset: str, version: int, seal: bytes, key: P
 
 
 def check_output(store: Store, output: SimulateOutput | RenderOutput | PackOutput) -> None:
-    """Raise CorruptArtifactError where an artifact of a worker's output is not in the store."""
+    """Raise CorruptArtifactError if an artifact of a worker's output is not in the store."""
     # An artifact must be at least as long as its parts that the output names.
     min_sizes: dict[Sha256, int] = {}
     if isinstance(output, SimulateOutput):
@@ -266,9 +266,10 @@ def find_version(connection: Connection, dataset: str, version: int) -> DatasetV
 
 
 def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
-    """Return the file at `path` of a version; raise NotFoundError where the version has none.
+    """Return the file at `path` of a version.
 
-    Raises OSError or BrokenSectionError where the store has lost or damaged it, or what lists it.
+    Raises NotFoundError if the version has no such file. Raises OSError or BrokenSectionError if
+    the store has lost or damaged the file, or the section that lists it.
     """
     # The manifest cannot list itself, nor the seal that holds its digest.
     digests = sealed_digests(version.manifest, version.group)
@@ -285,8 +286,9 @@ def find_file(store: Store, version: DatasetVersion, path: str) -> FileEntry:
 
 
 read_contents = lru_cache(maxsize=16)(stored_contents)
-"""Returns what a manifest lists. It never changes; a section is read with the first request for one
-of its files.
+"""Returns the contents that a manifest lists.
+
+They never change. A section is read with the first request for one of its files.
 """
 
 
@@ -312,9 +314,10 @@ def _dataset_of(connection: Connection, row: Row[Any, Any, Any, Any, Any]) -> Da
 def _visible_name(connection: Connection, dataset: str, first_name: str | None) -> str | None:
     """Return the name of a dataset for the principal.
 
-    Projects share what they have specified alike, but not the names that they gave it. So a project
-    sees the name in the first of its own jobs that has one. `first_name`, which the dataset got
-    with its first version, is for those who see all projects, and for versions without a job.
+    Projects share a dataset that they have specified alike, but not the names that they gave it. So
+    a project sees the name in the first of its own jobs that has one. The dataset got `first_name`
+    with its first version. It is for principals who see all projects, and for versions without a
+    job.
     """
     if current_principal().sees_all:
         return first_name

@@ -74,10 +74,10 @@ class Database:
             yield connection
 
     def touch(self) -> AbstractContextManager[Connection]:
-        """Connect for changes that may be lost, beside writers where the database has row locks.
+        """Connect for changes that may be lost, beside writers if the database has row locks.
 
-        There each statement is a transaction, which must not wait for a row while it holds another:
-        `with_for_update(skip_locked=True)`.
+        With row locks each statement is a transaction. It must not wait for a row while it holds
+        another: `with_for_update(skip_locked=True)`.
         """
         return self.write()
 
@@ -94,7 +94,10 @@ class Database:
         return
 
     def close(self) -> None:
-        """Close all connections; one that a thread still uses is closed when it is returned."""
+        """Close all connections.
+
+        A connection that a thread still uses is closed when the thread returns it.
+        """
         for engine in self._engines:
             event.listen(engine, "checkin", lambda _, record: record.close())
             engine.dispose()

@@ -1,4 +1,4 @@
-"""Opening a coordinator's database and migrating it, or refusing it with what to do."""
+"""Opening and migration of a coordinator's database, or a refusal that says how to go on."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ MIGRATIONS = Path(__file__).parent / "migrations"
 def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
     """Return the database of a coordinator, unchanged.
 
-    Raise DatabaseRefusedError where its driver is missing.
+    Raises DatabaseRefusedError if its driver is missing.
     """
     url = settings.database_url
     if url is None:
@@ -58,7 +58,7 @@ def upgrade(connection: Connection) -> None:
 def opened(settings: Settings, role: Role) -> Iterator[Database]:
     """Open the database of a coordinator, and migrate it, or make it if there is none.
 
-    Raises DatabaseRefusedError where it is damaged, has an unknown schema, or refuses the role.
+    Raises DatabaseRefusedError if it is damaged, has an unknown schema, or refuses the role.
     """
     check(settings, role)
     database = connect(settings, role)
@@ -73,9 +73,8 @@ def opened(settings: Settings, role: Role) -> Iterator[Database]:
 def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     """Return whether the database exists.
 
-    Raise DatabaseRefusedError where it cannot be used in a role.
-
-    With `with_store`, a missing database is refused where the store holds datasets: it was lost.
+    Raises DatabaseRefusedError if the role cannot use the database. With `with_store`, it also
+    refuses a missing database if the store holds datasets, because the database was lost.
     """
     if settings.database_url is None:
         revision = _sqlite_revision(settings.database_path)
@@ -126,7 +125,7 @@ def _remedy(settings: Settings) -> str:
 def _has_versions(settings: Settings) -> bool:
     """Return whether a store holds datasets.
 
-    Raises DatabaseRefusedError where it is out of reach.
+    Raises DatabaseRefusedError if the store is out of reach.
     """
     try:
         return next(open_store(settings.store_place).versions(MANIFEST_NAME), None) is not None

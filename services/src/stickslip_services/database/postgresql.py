@@ -79,7 +79,7 @@ class PostgresqlDatabase(Database):
     """Transactions on one PostgreSQL database.
 
     Reads see a snapshot (REPEATABLE READ). Writes go through one connection, which also holds the
-    lock of the role. The first write raises DatabaseRefusedError where the role is refused.
+    lock of the role. The first write raises DatabaseRefusedError if the role is refused.
     """
 
     def __init__(self, url: URL, *, durable: bool = True, role: Role = Role.coordinator) -> None:
@@ -129,9 +129,9 @@ class PostgresqlDatabase(Database):
         return self._toucher.begin()
 
     def analyse(self) -> None:
-        """Tell the server what it would learn a minute later.
+        """Tell the server the sizes of the tables, which it would learn a minute later.
 
-        Until then its plans are those for empty tables.
+        Until then its plans are plans for empty tables.
         """
         with self._toucher.connect() as connection:
             connection.exec_driver_sql(

@@ -149,7 +149,10 @@ def _value(name: str, parameter: BindParameter[object], values: Values) -> objec
 
 
 def _positional(compiled: SQLCompiler, values: Values) -> list[object]:
-    """Return the values in the order of the SQL; raise KeyError where one is missing."""
+    """Return the values in the order of the SQL.
+
+    Raises KeyError if a value is missing.
+    """
     parameters: list[object] = []
     for name in compiled.positiontup or ():
         parameter = compiled.binds[name]
@@ -165,10 +168,10 @@ RowType = TypeVar("RowType", bound=tuple[Any, ...])
 
 
 class RowQuery(Statement, Generic[RowType]):
-    """A query whose rows have a type: a NamedTuple with a field for each selected column, in order.
+    """A query with typed rows: a NamedTuple with a field for each selected column, in order.
 
-    Raises TypeError where the fields are not the columns of the statement. Of one that is written
-    as text the columns are not known.
+    Raises TypeError if the fields are not the columns of the statement. The columns of a statement
+    in text are not known, so they are not checked.
     """
 
     def __init__(self, row_type: type[RowType], statement: Executable | str) -> None:

@@ -196,7 +196,7 @@ def fail_permanently(
     times = "once" if count == 1 else f"{count} times, at last"
     explanation = f"task {name} failed {times} with {reason}: {failure.message}"
     message = failure.message
-    # Such a task hurts only itself: its jobs can go on without it.
+    # Quarantine such a task: its jobs can go on without it, up to `max_quarantined` of them.
     if reason.ends_a_process:
         message = (
             f"quarantined after {count} tries, at last {reason}: {failure.message}. To reproduce: "

@@ -225,7 +225,7 @@ def _restart(
     """
     failed = [task for task in shared if task.state == TaskState.failed]
     waiting = [task for task in shared if task.state in (TaskState.pending, TaskState.soft_failed)]
-    # A task that another job waits for keeps its tries: that job counts them.
+    # A task that another job waits for keeps its count of failed tries.
     needed = set(_NEEDED_TASKS.values(tx.connection, {"b_tasks": [t.seq for t in waiting]}))
     abandoned = [task for task in waiting if task.seq not in needed]
 

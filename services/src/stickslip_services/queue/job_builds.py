@@ -35,8 +35,7 @@ class JobBuilds:
         try:
             inputs = plan_inputs_of(row)
         except DamagedRowError as error:
-            # The caller holds a read transaction only. The sweep ends the job
-            # (`background.fail_damaged_jobs`).
+            # The next sweep ends the job (`background.fail_damaged_jobs`).
             self._damaged[job] = error
             return None
         if inputs is None:

@@ -1,4 +1,4 @@
-"""Jobs as they are shown: lists, details, samples, previews and events."""
+"""Jobs as the API shows them: lists, details, samples, previews and events."""
 
 import json
 from collections.abc import Collection, Iterable, Sequence
@@ -59,7 +59,10 @@ def has_schedulable_job(connection: Connection) -> bool:
 
 
 def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
-    """Return the row of a job; raise NotFoundError."""
+    """Return the row of a job.
+
+    Raises NotFoundError if the principal sees no such job.
+    """
     row = connection.execute(
         select(jobs).where(jobs.c.id == job_id, is_visible_project(jobs.c.project))
     ).one_or_none()
@@ -95,7 +98,7 @@ def list_jobs(
 ) -> Page[Job]:
     """Return a page of jobs of a state and of a project.
 
-    With `search`, those that have it in the name, kind, id or dataset.
+    `search` keeps the jobs that have it in the name, kind, id or dataset.
     """
     workers = alive_workers(context, connection)
     query = select(jobs).where(is_visible_project(jobs.c.project))
@@ -112,7 +115,7 @@ def list_jobs(
 
 
 def job_projects(connection: Connection) -> list[str]:
-    """Return the projects that have jobs, those that the principal sees."""
+    """Return the projects of the jobs that the principal sees."""
     query = select(jobs.c.project).where(is_visible_project(jobs.c.project)).distinct()
     return list(connection.scalars(query.order_by(jobs.c.project)))
 
@@ -153,11 +156,14 @@ class _JobOfSamples(NamedTuple):
 
 
 _UNFINISHED = [state.value for state in TaskState if state not in FINISHED]
-"""States of a task that a job does not get any more once it has ended: shown as `cancelled`."""
+"""States of a task that a job does not get any more once it has ended.
+
+The API shows them as `cancelled`.
+"""
 
 
 def _stored_states(state: TaskState, job: _JobOfSamples) -> list[str]:
-    """Return the states in the database of the samples that are shown in a state."""
+    """Return the states in the database of the samples that the API shows in a state."""
     if not job.has_ended:
         return [state.value]
     if state is TaskState.cancelled:
@@ -181,7 +187,7 @@ def _sample_states(
         slots = [row.slot for row in sample_rows]
     check_samples(sample_rows, job.seq, slots)
 
-    # A state that is none of the others is damaged: its result is checked, too.
+    # A damaged row may have an unknown state. Its result is checked too, which finds the damage.
     with_result = [row.seq for row in rows if row.state not in _WITHOUT_RESULT]
     check_results(_RESULTS.batched_rows(connection, "b_tasks", with_result))
 
@@ -200,7 +206,7 @@ def _sample_states(
 def list_previews(
     connection: Connection, job: int, *, count: int = 1000, newest: bool = False
 ) -> list[Preview]:
-    """Return at most `count` previews of a job: the first ones by slot, or the newest ones."""
+    """Return at most `count` previews of a job: the first previews by slot, or the newest."""
     query = select(samples.c.slot, samples.c.labels, previews.c.digest).where(samples.c.job == job)
     query = query.join(previews, previews.c.task == samples.c.render_task)
     if newest:
@@ -269,9 +275,9 @@ def slowest_tasks(connection: Connection, job: int, count: int) -> list[SlowTask
 
 
 def is_preview(connection: Connection, digest: str) -> bool:
-    """Return whether an artifact is a preview, which is served without a dataset.
+    """Return whether an artifact is a preview, which the API serves without a dataset.
 
-    Previews of jobs that the principal does not see are none.
+    A preview of a job that the principal does not see does not count.
     """
     query = select(previews.c.task).where(
         previews.c.digest == digest, is_visible_task(previews.c.task)

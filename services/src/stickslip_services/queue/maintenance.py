@@ -65,9 +65,9 @@ PIECE = 10_000
 
 
 def remove(database: Database, store: Store, dataset: str, version: int) -> tuple[int, int]:
-    """Remove a version; return the number of jobs and tasks that went with it.
+    """Remove a version, and return the number of jobs and tasks that went with it.
 
-    Raises NotFoundError where it does not exist, ConflictError where a job is making it.
+    Raises NotFoundError if the version does not exist, and ConflictError if a job is making it.
     """
     with database.write() as connection:
         columns = dataset_versions.c
@@ -115,7 +115,7 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
             connection.execute(delete(table).where(table.c.job.in_(removed_jobs)))
     connection.execute(delete(jobs).where(jobs.c.seq.in_(removed_jobs)))
 
-    # A task stays where another job needs it. A job has all dependencies of its tasks, too.
+    # A task stays if another job needs it. That job has all dependencies of its tasks, too.
     links = rows_with(connection, select(job_tasks.c.task), job_tasks.c.task, candidates)
     removed_tasks = candidates - {link.task for link in links}
     for batch in batches(removed_tasks):
@@ -128,8 +128,8 @@ def _remove_jobs(connection: Connection, publish_task: int) -> tuple[int, int]:
 def unused(database: Database, store: Store, *, older_than: float) -> Iterator[Stored]:
     """Yield artifacts and temporary files without references, unchanged for `older_than` seconds.
 
-    References are those of tasks, jobs, versions and certificates in the database, and of versions
-    in the store. Raises CorruptArtifactError, OSError or ValueError where the manifest of a version
+    Tasks, jobs, versions and certificates in the database refer to artifacts, and so do versions in
+    the store. Raises CorruptArtifactError, OSError or ValueError if the manifest of a version
     cannot be read.
     """
     needed = _needed(database, store)
@@ -175,14 +175,14 @@ class Found:
     """Dataset and version, as in `ds-0123456789abcdef:v1`."""
     samples: int
     fault: str
-    """Why it was left out; empty if it was not."""
+    """The reason why it was left out, or an empty text."""
     is_new: bool = True
 
 
 def reindex(database: Database, store: Store) -> Iterator[Found]:
     """Insert the versions that only the store has, one transaction each.
 
-    Yield all versions of the store.
+    Yields all versions of the store.
     """
     for shown in store.versions(MANIFEST_NAME):
         name = f"{shown.dataset}:v{shown.version}"
@@ -196,7 +196,7 @@ def reindex(database: Database, store: Store) -> Iterator[Found]:
 
 
 def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
-    """Read a version; restore lost artifacts from the files of the version."""
+    """Read a version, and restore lost artifacts from the files of the version."""
     place = shown.dataset, shown.version
     content, group, seal = (
         store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
@@ -223,7 +223,10 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
 def _insert(
     database: Database, store: Store, manifest: Manifest, output: PublishOutput, made_at: float
 ) -> bool:
-    """Insert a version as the result of an ended job; return False where it is known."""
+    """Insert a version as the result of an ended job.
+
+    Returns False if the version is known.
+    """
     inputs = PlanInputs(manifest.builds, manifest.certificate)
     with database.write() as connection:
         known = select(dataset_versions).filter_by(

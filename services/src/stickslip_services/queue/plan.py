@@ -28,11 +28,11 @@ _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
 
 
 def plan_inputs_for(connection: Connection, spec: JobSpec) -> PlanInputs | None:
-    """Return builds and certificate for a job of `spec`, None if no worker has ever registered.
+    """Return builds and certificate for a job of `spec`, or None if no worker has ever registered.
 
-    Raises KindNotAvailableError where no worker makes the kind, UnknownKindError where its class is
-    not registered, and PresetNotCertifiedError where the spec needs a certificate and its preset
-    has none that passed for the workers' build with all protocols that the spec needs.
+    Raises KindNotAvailableError if no worker makes the kind, and UnknownKindError if its class is
+    not registered. A spec may need a certificate for its preset and the workers' build. Raises
+    PresetNotCertifiedError if none passed with all protocols that the spec needs.
     """
     builds = builds_for(connection, registered(spec).kind)
     if builds is None:
@@ -88,7 +88,7 @@ class Plan:
 
     @property
     def is_last(self) -> bool:
-        """True where it ends with the task that publishes."""
+        """Whether the piece ends with the task that publishes."""
         return self.end == self.spec.sample_count
 
     @property
@@ -135,7 +135,7 @@ class _Piece:
         self._inputs = inputs
         self._preview_slots = preview_slots
         self._renders: dict[tuple[object, ...], dict[bytes, PlannedTask]] = {}
-        """Renders by simulation and shading: those that can be rendered together."""
+        """Renders by simulation and shading: the renders of a group can run together."""
 
     def plan(self, batch: Sequence[Shard], pack_keys: list[str]) -> Plan:
         """Return the plan; add the keys of its pack tasks to `pack_keys`."""

@@ -75,7 +75,7 @@ def release_claims(connection: Connection) -> None:
 
 
 def plan_at_once(context: Context, spec: JobSpec, inputs: PlanInputs) -> Plan | None:
-    """Return the plan of a job of few samples; None of one that is planned piece by piece."""
+    """Return the plan of a job of few samples, or None if the planner plans it piece by piece."""
     if spec.sample_count > context.settings.plan_samples:
         return None
     return expand(spec, inputs, previews=context.settings.previews_per_job)
@@ -84,7 +84,7 @@ def plan_at_once(context: Context, spec: JobSpec, inputs: PlanInputs) -> Plan | 
 def plan_waiting_jobs(context: Context) -> None:
     """Plan the jobs that were submitted before the first worker registered.
 
-    Fail those that cannot be planned.
+    Fails the jobs that cannot be planned.
     """
     with context.database.read() as connection:
         # Without a worker thousands of jobs may wait: ask for all of them only if there is one.
@@ -116,7 +116,7 @@ def _plan_waiting_job(context: Context, tx: QueueTransaction, row: JobRow) -> No
 
 
 class Planner:
-    """Plans the jobs that are `planning`: those of the highest priority first, then the oldest."""
+    """Plans the `planning` jobs, the highest priority first, and of equal ones the oldest first."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -131,7 +131,7 @@ class Planner:
             pass
 
     def step(self) -> bool:
-        """Plan a piece of a job; return whether there was any to plan."""
+        """Plan a piece of a job, and return whether there was any to plan."""
         with self._context.database.read() as connection:
             if _ANY_PLANNING_JOB.first(connection) is None:
                 return False
@@ -171,7 +171,7 @@ class Planner:
         return row
 
     def _continues(self, row: JobRow) -> bool:
-        """Return whether a job is the one of the last step, and nobody else has planned it."""
+        """Return whether a job is the job of the last step, and nobody else has planned it."""
         return (row.seq, row.planned) == (self._job, self._end)
 
     def _begin(self, row: JobRow, packed: list[str]) -> Iterator[Plan]:

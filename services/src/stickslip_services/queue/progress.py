@@ -26,7 +26,10 @@ Frames = Mapping[str, tuple[int, int]]
 """Progress of running simulations by task: (frames done, frames total)."""
 
 _HAS_ETA = (JobState.queued, JobState.running)
-"""States of a job whose time left is estimated; in others the work is not known, or rests."""
+"""States of a job whose time left is estimated.
+
+In other states the work is not known, or rests.
+"""
 
 
 class ShownJob(Protocol):
@@ -51,7 +54,10 @@ class _RunningFrames:
     done: int = 0
     total: int = 0
     finished: float = 0.0
-    """The same as a number of tasks: each counts as the fraction of its frames that are done."""
+    """The progress as a number of tasks.
+
+    Each task counts as the fraction of its frames that are done.
+    """
 
     def add(self, done: int, total: int) -> None:
         self.done += done
@@ -65,7 +71,7 @@ _GroupOfJob = tuple[int, str, str]
 
 @dataclass(slots=True)
 class _Numbers:
-    """What the database says of the shown jobs."""
+    """The numbers of the shown jobs in the database."""
 
     totals: Mapping[int, Sequence[GroupTotals]]
     in_flight: Sequence[InFlight]
@@ -126,7 +132,7 @@ def _progress_of(row: ShownJob, numbers: _Numbers) -> Progress:
 def _counts_of(
     row: ShownJob, stage: Stage, groups: Sequence[GroupTotals], in_flight: Sequence[InFlight]
 ) -> dict[TaskState, int]:
-    """Return the numbers of tasks of a stage by state, those that are not 0."""
+    """Return the numbers of tasks of a stage by state, without zeros."""
     counts = Counter[TaskState]()
     waiting = 0
     for group in groups:

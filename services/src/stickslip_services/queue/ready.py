@@ -1,6 +1,6 @@
-"""The queue: which tasks can run now, a row of `ready_tasks` for each active job that needs one.
+"""The queue of tasks that can run now: a row of `ready_tasks` for each active job that needs one.
 
-Whatever makes a task ready, or ends that, calls one of these two functions. A task is ready while
+Code that makes a task ready, or ends that, calls one of these two functions. A task is ready while
 it is `pending` and all its dependencies have results.
 """
 
@@ -30,7 +30,7 @@ _REMOVE = Statement(
 
 
 def add_ready(connection: Connection, tasks: Iterable[int]) -> None:
-    """Put those of the tasks that can run into the queue of each active job that needs them."""
+    """Put the tasks that can run into the queue of each active job that needs them."""
     for batch in batches(tasks):
         _ADD.run(connection, {"b_tasks": batch})
 

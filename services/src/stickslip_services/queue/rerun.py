@@ -1,8 +1,8 @@
 """Artifacts that are damaged or lost in the store: the tasks that produced them run again.
 
-A worker that finds its inputs damaged reports them. Their producers, looked for among the
-dependencies of its task, return to `pending`, and their dependents wait for them. If the inputs of
-a producer are damaged too, its worker reports that in turn.
+A worker reports inputs that it finds damaged. The coordinator looks for their producers among the
+dependencies of the worker's task. The producers return to `pending`, and their dependents wait for
+them. If the inputs of a producer are damaged too, its worker reports that in turn.
 """
 
 import re
@@ -80,7 +80,10 @@ def reset_tasks(tx: QueueTransaction, seqs: Sequence[int]) -> None:
 
 
 def reset_results(tx: QueueTransaction, producers: Sequence[Producer]) -> None:
-    """Do the same with tasks whose states are known; their outputs stay until the next result."""
+    """Let tasks whose states are known run again, with all their tries.
+
+    Their outputs stay until the next result.
+    """
     finished = [producer.seq for producer in producers if producer.state in FINISHED]
     settled = [producer.seq for producer in producers if producer.state in HAS_RESULT]
     remove_results(tx.connection, finished)

@@ -1,8 +1,7 @@
-"""Reports of workers: verdicts, results, and what follows from them.
+"""Reports of workers: verdicts, results, and their consequences.
 
-The first result from the holder of the lease is final. A dataset version is committed by the
-transaction that accepts the report of its publish task. `failures` has the leases that end without
-a result.
+The first result from the holder of the lease is final. The transaction that accepts the report of a
+publish task also commits the dataset version. `failures` ends the leases without a result.
 """
 
 from collections.abc import Mapping, Sequence
@@ -73,7 +72,10 @@ class _Judgement:
 
 
 def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
-    """Judge the reports of a worker and store the results; raise UnknownWorkerError."""
+    """Judge the reports of a worker, and store the results.
+
+    Raises UnknownWorkerError.
+    """
     # The store may answer slowly, so it is asked before the transaction.
     versions: dict[str, Manifest] = {}
     reports = [_check_in_store(context, report, versions) for report in batch.reports]
@@ -103,7 +105,10 @@ def report_results(context: Context, batch: ReportBatch) -> ReportAnswer:
 def _delete_sections(
     context: Context, verdicts: Sequence[ReportVerdict], versions: Versions
 ) -> None:
-    """Delete the temporary artifacts of published versions; `gc` finds those that stay."""
+    """Delete the temporary artifacts of published versions.
+
+    `gc` finds the artifacts that cannot be deleted now.
+    """
     for verdict in verdicts:
         if verdict.verdict == "accepted" and verdict.task_id in versions:
             with suppress(OSError):
@@ -115,9 +120,9 @@ def _delete_sections(
 
 
 def _check_in_store(context: Context, report: Report, versions: dict[str, Manifest]) -> Report:
-    """Return the report, or a failure where the store lacks its artifacts.
+    """Return the report, or a failure if the store lacks its artifacts.
 
-    Add the summary of a manifest, signed, to `versions`.
+    Adds the summary of a manifest, signed, to `versions`.
     """
     if report.result is None or report.result.output is None:
         return report
@@ -199,7 +204,7 @@ def _judge(
 def _check_against_task(
     tx: QueueTransaction, task: LeasedTask, result: TaskResult, versions: Versions
 ) -> TaskResult:
-    """Return the result, or a failure where it does not fit the task."""
+    """Return the result, or a failure if it does not fit the task."""
     if result.output is not None and result.output.stage != task.stage:
         message = f"the worker answered with the output of stage {result.output.stage}"
         return _as_failure(result, Reason.internal_error, message)

@@ -18,9 +18,12 @@ from stickslip_services.queue.jobs import has_schedulable_job
 from stickslip_services.queue.transaction import QueueTransaction
 
 EVERY_SECONDS = 30 * 24 * 3600.0
-"""A coordinator reads each version once in this time [s]..."""
+"""Time in which a coordinator reads each version once [s]."""
 IDLE_RATE = 50e6
-"""...while no job runs, and at this rate at most [bytes/s], a third of what a hard disk reads."""
+"""Rate at which a coordinator reads while no job runs, at most [bytes/s].
+
+It is a third of the rate of a hard disk.
+"""
 
 
 class _ScrubbedVersion(NamedTuple):
@@ -51,12 +54,11 @@ _DUE: ValueQuery[int] = ValueQuery(
 def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, list[str]] | None:
     """Read the version that was read longest ago, at `rate` [bytes/s].
 
-    Return its name, and paths of damaged files.
-
-    A damaged version gets a job with the builds that it was computed with, which recomputes the
-    files (`existing_datasets`). With a signing key, a version without a good signature is signed
-    again. Returns None if all versions were read since `before` [s]. Raises OSError where the store
-    is out of reach, ClientError if the key cannot sign.
+    Returns its name, and the paths of damaged files. A damaged version gets a job with the builds
+    that it was computed with, which recomputes the files (`existing_datasets`). With a signing key,
+    a version without a good signature is signed again. Returns None if all versions were read since
+    `before` [s]. Raises OSError if the store is out of reach, and ClientError if the key cannot
+    sign.
     """
     version = _find_due(context, before)
     if version is None:

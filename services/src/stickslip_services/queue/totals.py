@@ -84,7 +84,7 @@ def add_results(connection: Connection, tasks: Collection[int]) -> None:
 
 
 def remove_results(connection: Connection, tasks: Collection[int]) -> None:
-    """Take tasks that are about to run again out of the totals; what they cost was spent."""
+    """Take tasks that are about to run again out of the totals of results, but keep their cost."""
     for batch in batches(tasks):
         rows = _RESULTS_BY_JOB.rows(connection, {"b_tasks": batch})
         _REMOVE_RESULTS.run_all(connection, [row._asdict() for row in rows])

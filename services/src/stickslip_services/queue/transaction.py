@@ -1,4 +1,4 @@
-"""A write transaction of the queue: its connection, and the time that all of its changes have."""
+"""A write transaction of the queue, with one time for all of its changes."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from sqlalchemy import Connection
 
 @dataclass(frozen=True, slots=True)
 class QueueTransaction:
-    """The functions of the queue that change something take one."""
+    """A connection and a time, which every function that changes the queue takes."""
 
     connection: Connection
     now: float

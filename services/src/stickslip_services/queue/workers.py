@@ -1,4 +1,4 @@
-"""Workers: registered dispatchers, what they can run, and jobs that no connected worker can run."""
+"""Workers: registered dispatchers, their builds, and jobs that no connected worker can run."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -87,7 +87,10 @@ _WORKER = RowQuery(_WorkerRow, select(*_COLUMNS).where(workers.c.id == bindparam
 
 
 def find_worker(connection: Connection, worker_id: str) -> RegisteredWorker:
-    """Return a worker, superseded or not; raise UnknownWorkerError."""
+    """Return a worker, superseded or not.
+
+    Raises UnknownWorkerError if no worker has the id.
+    """
     row = _WORKER.first(connection, {"b_id": worker_id})
     if row is None:
         raise UnknownWorkerError(f"no worker has the id {worker_id!r}: register again")
@@ -107,17 +110,17 @@ def present_workers(
 ) -> list[RegisteredWorker]:
     """Return the newest session of every name, newest first.
 
-    With `seen_since`, those alive since then.
+    `seen_since` keeps the sessions that have been alive since then.
     """
     since = float("-inf") if seen_since is None else seen_since
     return [_worker(row) for row in _PRESENT_WORKERS.rows(connection, {"b_since": since})]
 
 
 def builds_for(connection: Connection, kind: str) -> Builds | None:
-    """Return the builds for new jobs of `kind`: those of the newest worker that makes it.
+    """Return the builds for new jobs of `kind`, from the newest worker that makes it.
 
-    None if no worker has ever told its builds; raise KindNotAvailableError where none of those
-    makes it.
+    Returns None if no worker has ever told its builds. Raises KindNotAvailableError if some have,
+    and none of them makes the kind.
     """
     workers = [worker for worker in present_workers(connection) if worker.builds]
     if not workers:
@@ -154,9 +157,9 @@ _TOUCH = RowQuery(
 def touch_workers(
     connection: Connection, ids: Sequence[str], now: float
 ) -> dict[str, WorkerCondition]:
-    """Store the time of messages of workers.
+    """Store the time of messages of workers, and return their conditions.
 
-    Return their conditions, without those that a writer has locked or nobody knows.
+    Leaves out workers that a writer has locked or nobody knows.
     """
     conditions: dict[str, WorkerCondition] = {}
     for row in _TOUCH.rows(connection, {"b_ids": ids, "b_now": now}):
@@ -167,7 +170,7 @@ def touch_workers(
 def record_condition(
     connection: Connection, worker_id: str, now: float, condition: WorkerCondition
 ) -> None:
-    """Store how a worker says that it is."""
+    """Store the condition that a worker reports."""
     values = {"last_seen_at": now, "condition": condition.model_dump_json()}
     connection.execute(update(workers).where(workers.c.id == worker_id).values(values))
 
@@ -295,7 +298,7 @@ _JOBS_OF_GROUP = RowQuery(
 def update_unschedulable_jobs(context: Context) -> None:
     """Set reason and message of the jobs that no connected worker can run.
 
-    Those of the others are cleared.
+    Clears them for jobs that a worker can run again.
     """
     with context.database.read() as connection:
         alive = alive_workers(context, connection)
