@@ -73,7 +73,7 @@ class Database:
         with self._writing, self._writer.begin() as connection:
             yield connection
 
-    def touch(self) -> AbstractContextManager[Connection]:
+    def write_relaxed(self) -> AbstractContextManager[Connection]:
         """Connect for changes that may be lost, beside writers if the database has row locks.
 
         With row locks each statement is a transaction. It must not wait for a row while it holds

@@ -121,7 +121,7 @@ class PostgresqlDatabase(Database):
             self._ahead = now - time.monotonic()
             yield connection
 
-    def touch(self) -> AbstractContextManager[Connection]:
+    def write_relaxed(self) -> AbstractContextManager[Connection]:
         """Connect beside writers; each statement is a transaction.
 
         A crash of the server may lose it.

@@ -201,7 +201,7 @@ samples = _table(
     sa.Column("render_task", _Wide),
     sa.Column("split", sa.Integer, nullable=False),
     sa.Column("labels", sa.Text, nullable=False),  # JSON: the point of the grid
-    sa.Column("digest", _Wide, nullable=False),  # of the other columns (queue/recompute.py)
+    sa.Column("digest", _Wide, nullable=False),  # of the other columns (queue/integrity.py)
     sqlite_with_rowid=False,
 )
 

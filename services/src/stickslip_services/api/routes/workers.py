@@ -112,8 +112,8 @@ async def post_heartbeat(request: Request) -> Response:
     else:
         heartbeat = _HEARTBEAT.read(body)
 
-    # Most heartbeats only renew leases: one statement does that for many workers. The others name
-    # a lease that the worker has lost, and are sorted out one by one.
+    # Most heartbeats only renew leases: one statement does that for many workers. The others differ
+    # from the database, for example by a task that has started, and take a transaction each.
     disputed = await request.app.state.renewals.add(heartbeat)
     if disputed is None:
         answer = worker_api.HeartbeatAnswer(drop=())
