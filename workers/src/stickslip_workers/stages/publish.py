@@ -7,6 +7,7 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +134,7 @@ def publish(task: PublishTask, store: Store) -> PublishOutput:
     sections = _sections(task, parts, store)
     manifest = _manifest(task, parts, labels, files, sections)
     files.append(_stored(store, CARD_NAME, card(manifest)))
-    of_shards = [file for part in parts for file in part.files]
+    of_shards = list(chain.from_iterable(part.files for part in parts))
     # If the manifest has sections, they list the files of the shards.
     listed = files if sections else [*files, *of_shards]
     in_order = tuple(sorted(listed, key=lambda file: file.path))
@@ -161,9 +162,9 @@ def _manifest(
 
     If it has sections, they hold the lists of samples.
     """
-    rejections = [rejection for part in parts for rejection in part.rejections]
+    rejections = list(chain.from_iterable(part.rejections for part in parts))
     counts = Counter(str(rejection.reason) for rejection in rejections)
-    sample_keys = [key for part in parts for key in part.sample_keys]
+    sample_keys = list(chain.from_iterable(part.sample_keys for part in parts))
     return Manifest(
         dataset=task.dataset,
         version=task.version,
@@ -374,7 +375,7 @@ def _preview(
     array = pictured(task.spec)
     if array is None:
         return None
-    files = {file.path: file for part in parts for file in part.files}
+    files = {file.path: file for file in chain.from_iterable(part.files for part in parts)}
     samples_per_shard = task.spec.samples_per_shard
     index_bytes = shard_index_size(samples_per_shard)
 
