@@ -68,7 +68,7 @@ CASES: dict[str, str] = {
 
 DEARER = {
     ("stepping.stalled_soon", 0.5): 20.0,
-    # 3.2 times the iterations of GMRES since friction has a single law: thinner proxies bend more.
+    # 3.2 times the iterations of GMRES since friction has a single law.
     ("medial_axis.thickness_max", 0.5): 4.0,
 }
 """Factors of the cost beyond COST."""
