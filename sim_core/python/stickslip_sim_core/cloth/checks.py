@@ -1,8 +1,8 @@
-"""Checks of a run of cloth: whether it is valid follows from this table alone.
+"""Checks of a run of cloth: this table alone decides whether the run is valid.
 
-The solver measures after every step that it takes. The worst value of each check is stored with the
-sample, and a value beyond its limit is the reason why a run is not valid. A value that is not a
-number is beyond every limit.
+The solver measures every step that it takes. The worst value of each check is stored with the
+sample. A run with a value beyond its limit is not valid, and the check is the reason. A value that
+is not a number is beyond every limit.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,10 +19,10 @@ from stickslip_sim_core.cloth.solver import Cloth
 
 @dataclass(frozen=True)
 class Seen:
-    """What a run is judged by."""
+    """The evidence by which the checks judge a run."""
 
     cloth: Cloth
-    """After its last step."""
+    """The cloth after its last step."""
 
     positions: Floats
     """(frames, V, 3) [m]"""
@@ -33,24 +33,24 @@ class Seen:
 
     @property
     def total(self) -> StepReport:
-        """Of all steps."""
+        """The report of all steps together."""
         return self.cloth.total
 
 
 @dataclass(frozen=True)
 class Check:
-    """One check. Its name is that of the label, and the code of the reason."""
+    """One check. Its name is also the name of the label and the code of the reason."""
 
     name: str
     formula: str
-    """What is measured, in words."""
+    """The measured quantity, in words."""
 
     value: Callable[[Seen], float]
     limit: float | None
     """Largest value of a valid run; None: the value is recorded and not judged."""
 
     why: str
-    """Where the limit comes from."""
+    """The grounds for the limit."""
 
     unit: str = "1"
 
@@ -162,10 +162,12 @@ CHECKS = (
         "for its scene reaches 1",
     ),
 )
-"""All checks. The first that fails is the reason: causes come before what follows from them."""
+"""All checks. The first that fails is the reason, so causes come before their consequences."""
 
 
 def _ratio(part: float, whole: float) -> float:
+    # A run without a flow of energy, or a preset that allows no unconverged step, has a whole of
+    # zero. Any part of it fails every limit, and no part passes.
     return 0.0 if part == 0.0 else part / whole if whole else np.inf
 
 
@@ -178,6 +180,7 @@ def failed(worst: Mapping[str, float]) -> tuple[str, str]:
     """Return the code and the text of the first check that fails, or empty texts."""
     for check in CHECKS:
         value = worst[check.name]
+        # `not value <= limit` is also true for NaN; `value > limit` would let it pass.
         if check.limit is not None and not value <= check.limit:
             unit = "" if check.unit == "1" else f" {check.unit}"
             return (

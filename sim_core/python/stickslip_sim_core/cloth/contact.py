@@ -1,4 +1,4 @@
-"""What cloth touches: rigid bodies, itself and other cloth, and surfaces of triangles."""
+"""Contact of cloth with rigid bodies, with itself and other cloth, and with triangle surfaces."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 from stickslip_sim_core.arrays import Floats, check_positive
 
 ORTHONORMAL = 1e-6
-"""Largest deviation of the scalar products of a rotation's axes from 0 and 1."""
+"""Largest deviation of the scalar products of a rotation's axes from 0 or 1."""
 
 MU_MAX = 10.0
 """Largest coefficient of friction."""
 
 ROUNDING = 5e-3
-"""Default radius of the edges of a box [m]; of a box thinner than two of these, half its shortest
-edge. Cells of up to twice the radius slide over such an edge."""
+"""Default radius of the edges of a box [m].
+
+A box thinner than two of these radii has half its shortest edge as the radius. Cells of up to twice
+the radius slide over such an edge.
+"""
 
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -29,8 +32,8 @@ BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
 class Body:
     """A rigid body: a half-space, or all points within a radius of a core.
 
-    The core is a box about the origin: a point of a sphere, a segment of a capsule, an endless line
-    of a cylinder.
+    The core is a box about the origin. It shrinks to a point for a sphere, to a segment for a
+    capsule, and to an endless line for a cylinder.
 
     Raises:
         ValueError: `mu` is out of range, `origin` is not finite, or `rotation` is no rotation.
@@ -40,25 +43,30 @@ class Body:
     """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
 
     shape: int = 0
-    """0 plane, which fills z < 0 in its own axes; 1 rounded: `Body::Shape` of the core."""
+    """0 for a plane, which fills z < 0 in its own axes, or 1 for a rounded body.
+
+    The numbers are those of `Body::Shape` in C++.
+    """
 
     core: tuple[float, float, float] = ORIGIN
-    """Half edges of the core along the body's own axes [m], 0 or more; inf along the axis of an
-    endless cylinder.
+    """Half edges of the core along the body's own axes [m], 0 or more.
+
+    An endless cylinder has inf along its axis.
     """
 
     radius: float = 0.0
     """Distance of the body's face from its core [m]."""
 
     origin: ArrayLike = ORIGIN
-    """(3,) [m]"""
+    """Origin of the body's axes in the world: (3,) [m]."""
 
     rotation: ArrayLike = UPRIGHT
-    """(3, 3): columns are the axes of the body in the world."""
+    """Axes of the body in the world, as columns: (3, 3)."""
 
     def __post_init__(self) -> None:
         check_friction(self.mu)
         origin, turn = np.asarray(self.origin, float), np.asarray(self.rotation, float)
+        # A pose comes from a user's motion, so NaN and mirrored axes must stop here.
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"origin: must be three finite numbers [m], got {origin.tolist()}")
         if (
@@ -72,7 +80,7 @@ class Body:
 
     @property
     def pose(self) -> Floats:
-        """(3, 4): from its own axes to the world, x -> A x + b [m]."""
+        """The motion x -> A x + b from the body's own axes to the world: (3, 4) [m]."""
         return np.column_stack([self.rotation, self.origin])
 
     def as_tuple(self) -> BodyTuple:
@@ -105,13 +113,15 @@ def plane(
 ) -> Body:
     """Return the half-space below a plane.
 
-    Its axes are those of the world after the shortest turn from z to the normal.
+    The axes of the body are the world's axes after the shortest turn from z to the normal.
     """
     n = np.asarray(normal, float)
     if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
         raise ValueError(f"normal: must be three finite numbers, not all 0, got {n.tolist()}")
     n = n / np.linalg.norm(n)
+    # A normal along -z has no shortest turn: a half turn about x is one of many.
     turn = np.diag([1.0, -1.0, -1.0])
+    # b = 1 + n_z. The second form of it does not cancel for a normal close to -z.
     b = 1.0 + n[2] if n[2] > 0.0 else (n[0] ** 2 + n[1] ** 2) / (1.0 - n[2])
     if b > 0.0:
         a = -n[0] * n[1] / b
@@ -126,7 +136,7 @@ def sphere(
 ) -> Body:
     """Return a ball.
 
-    Cloth that sticks to it turns with it as its rotation (3, 3) changes from step to step.
+    Cloth that sticks to the ball turns with it as its rotation (3, 3) changes from step to step.
     """
     check_positive(radius=radius)
     return Body(mu, 1, ORIGIN, radius, origin, rotation)
@@ -135,7 +145,7 @@ def sphere(
 def cylinder(
     mu: ArrayLike, radius: float, *, origin: ArrayLike = ORIGIN, rotation: ArrayLike = UPRIGHT
 ) -> Body:
-    """Return a cylinder without ends, whose axis is the last column of its rotation (3, 3)."""
+    """Return an endless cylinder, whose axis is the last column of its rotation (3, 3)."""
     check_positive(radius=radius)
     return Body(mu, 1, (0.0, 0.0, np.inf), radius, origin, rotation)
 
@@ -150,7 +160,8 @@ def capsule(
 ) -> Body:
     """Return a cylinder with half balls as ends, along the last column of its rotation (3, 3).
 
-    `length` is that of the cylinder between the two half balls [m], `origin` its middle (3,) [m].
+    `length` is the length of the cylinder between the two half balls [m]. `origin` is the middle of
+    the capsule (3,) [m].
     """
     check_positive(length=length, radius=radius)
     return Body(mu, 1, (0.0, 0.0, 0.5 * length), radius, origin, rotation)
@@ -166,18 +177,20 @@ def box(
 ) -> Body:
     """Return a box with edges of `size` (3,) [m], rounded with a radius [m].
 
-    None: 5 mm, or less for a thin box.
+    Without `rounding` the radius is 5 mm, or less for a thin box.
     """
     whole = np.asarray(size, float)
     if whole.shape != (3,) or not (np.isfinite(whole).all() and (whole > 0.0).all()):
         raise ValueError(f"size: must be three finite lengths > 0, got {size!r}")
     half = 0.5 * float(whole.min())
+    # The faces of a thin box would meet before its edges had the default radius.
     radius = min(ROUNDING, half) if rounding is None else rounding
     check_positive(rounding=radius)
     if radius > half:
         raise ValueError(
             f"rounding: must be at most half the shortest edge, {half:g} m, got {radius:g}"
         )
+    # `size` is the outer size. The radius grows the core by as much on every side.
     a, b, c = (0.5 * whole - radius).tolist()
     return Body(mu, 1, (a, b, c), radius, origin, rotation)
 
@@ -189,41 +202,54 @@ CREASE = float(np.radians(40.0))
 """Default angle from which edges of a surface stay sharp [rad]."""
 
 SELF_FRICTION = 0.5
-"""Default coefficient of friction of a cloth with itself in a scene: the mean of the two of the
-thesis's shawls, 0.3 and 0.7 [thesis, Fig. 4.16]."""
+"""Default coefficient of friction of a cloth with itself in a scene.
+
+It is the mean of the two coefficients of the thesis's shawls, 0.3 and 0.7 [thesis, Fig. 4.16].
+"""
 
 BEARING: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"all": (1.0, 1.0), "vertices": (0.9, 1.0), "first": (0.9, 0.9)}
 )
-"""Shares of the thickness that two sheets keep between edges, and between vertices of the later and
-faces of the earlier: see `SelfContact.bearing`."""
+"""Two shares of the thickness for each value of `SelfContact.bearing`.
+
+Two sheets keep the first share between edges. They keep the second between vertices of the later
+sheet and faces of the earlier sheet.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class SelfContact:
     """Contact of cloth with itself and with other cloth.
 
-    Nothing crosses, and friction is exactly that of Coulomb's law.
+    Nothing crosses, and friction obeys Coulomb's law exactly.
 
     Raises:
         ValueError: A number breaks its rule.
     """
 
     mu: float | ArrayLike
-    """Coefficient of friction, 0 ... 10, or one for each pair of sheets: (S, S), symmetric. Sheets
-    are the connected pieces of the mesh, in the order of their first vertices."""
+    """Coefficient of friction, 0 ... 10, or one for each pair of sheets: (S, S), symmetric.
+
+    Sheets are the connected pieces of the mesh, in the order of their first vertices.
+    """
 
     thickness: float | ArrayLike = THICKNESS
-    """Of all sheets [m], or of each: (S,). The middles of two sheets stay the mean of their
-    thicknesses apart. A sheet must be thinner than the distance at rest between any of its vertices
-    and edges that do not meet."""
+    """Thickness of all sheets [m], or of each sheet: (S,).
+
+    The middles of two sheets stay the mean of their thicknesses apart. A sheet must be thinner than
+    the distance at rest between any of its vertices and edges that do not meet.
+    """
 
     bearing: str = "all"
-    """Contacts that keep two sheets the full thickness apart; the others keep 0.9 of it. "all":
-    vertices, and edges that cross. "vertices": vertices of both sheets. "first": vertices of the
-    earlier sheet. Where sheets lie on each other over large, smooth faces, "vertices" and "first"
-    converge in fewer iterations. Choose "first" only where these are flat: over curved cloth its
-    forces are rough. Within a sheet all contacts keep the full thickness."""
+    """Contacts that keep two sheets the full thickness apart. The other contacts keep 0.9 of it.
+
+    "all": vertices, and edges that cross. "vertices": vertices of both sheets. "first": vertices of
+    the earlier sheet.
+
+    "vertices" and "first" converge in fewer iterations if sheets lie on each other over large,
+    smooth faces. Choose "first" only for flat faces, because its forces are rough over curved
+    cloth. Within a sheet all contacts keep the full thickness.
+    """
 
     def __post_init__(self) -> None:
         if self.bearing not in BEARING:
@@ -231,6 +257,7 @@ class SelfContact:
         mu = np.asarray(self.mu, float)
         if not ((mu >= 0.0) & (mu <= MU_MAX)).all():
             raise ValueError(f"mu: must be in [0, {MU_MAX:g}], got {mu.tolist()}")
+        # A pair of sheets has no order, so it cannot have two coefficients.
         if mu.ndim and not (mu.ndim == 2 and mu.shape[0] == mu.shape[1] and (mu == mu.T).all()):
             raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
         thickness = np.asarray(self.thickness, float)
@@ -243,8 +270,9 @@ class SelfContact:
         """Return friction (S, S) and thicknesses (S,) [m] of S sheets.
 
         Raises:
-            ValueError: `mu` or `thickness` is of another number of sheets.
+            ValueError: `mu` or `thickness` has another number of sheets.
         """
+        # Only the mesh gives the number of sheets, so `__post_init__` could not check it.
         mu, thickness = np.asarray(self.mu, float), np.asarray(self.thickness, float)
         if mu.ndim and mu.shape != (sheets, sheets):
             raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
@@ -259,8 +287,8 @@ class SelfContact:
 class Surface:
     """A body of any shape: triangles with prescribed motion, which cloth touches from either side.
 
-    It may be open or closed, cross itself, and bend as it moves. It has no inside: cloth stays on
-    the side where it starts.
+    The surface may be open or closed, cross itself, and bend as it moves. It has no inside: cloth
+    stays on the side of its start.
 
     Vertices of the cloth touch a smooth surface through the vertices of the triangles, as they
     touch a body. Between its vertices the cloth keeps a quarter of that distance from the
@@ -271,23 +299,28 @@ class Surface:
     """
 
     triangles: ArrayLike
-    """(T, 3): vertices of each triangle."""
+    """Vertices of each triangle: (T, 3)."""
 
     positions: ArrayLike | Callable[[float], ArrayLike]
-    """(N, 3) [m], or a function of the time [s] that returns them. Within a step vertices move on
-    straight lines.
+    """Positions of the vertices (N, 3) [m], or a function of the time [s] that returns them.
+
+    Within a step vertices move on straight lines.
     """
 
     mu: float | ArrayLike
     """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
 
     thickness: float = THICKNESS
-    """Of a skin around the triangles, half of it on each side [m]: cloth stays half of this and
-    half of its own thickness away from them. May be 0."""
+    """Thickness of a skin around the triangles, half of it on each side [m]. It may be 0.
+
+    Cloth stays half of this thickness and half of its own thickness away from the triangles.
+    """
 
     crease: float = CREASE
-    """Edges stay sharp where the normals of their triangles are further apart at time 0, 0 ... pi
-    [rad]. Borders are sharp."""
+    """Angle between the normals of two triangles from which their edge stays sharp [rad].
+
+    The angle is 0 ... pi, and the normals are taken at time 0. Borders are sharp.
+    """
 
     def __post_init__(self) -> None:
         check_friction(self.mu)
@@ -300,6 +333,7 @@ class Surface:
             raise ValueError(
                 f"triangles: must be (T, 3) numbers of vertices, got shape {triangles.shape}"
             )
+        # A frozen dataclass allows no plain assignment.
         object.__setattr__(self, "triangles", triangles)
         corners = self.at(0.0)
         if triangles.min() < 0 or triangles.max() >= len(corners):
@@ -307,6 +341,7 @@ class Surface:
                 f"triangles: must index {len(corners)} vertices, "
                 f"got {triangles.min()} ... {triangles.max()}"
             )
+        # A triangle without an area has no normal.
         a, b, c = np.moveaxis(corners[triangles], 1, 0)
         flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) == 0.0)
         if len(flat):
@@ -316,8 +351,9 @@ class Surface:
         """Return the positions of the vertices at a time [s]: (N, 3) [m].
 
         Raises:
-            ValueError: They are not (N, 3) or not finite.
+            ValueError: The positions are not (N, 3) or not finite.
         """
+        # A user's function may return lists, or other numbers at some times: check every time.
         found = np.ascontiguousarray(
             self.positions(time) if callable(self.positions) else self.positions, dtype=float
         )

@@ -1,4 +1,4 @@
-"""Fabrics: density, stiffness against stretching and against bending."""
+"""Fabrics: density, stretching stiffness and bending stiffness."""
 
 import tomllib
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from numpy.typing import ArrayLike
 from stickslip_sim_core.arrays import Floats, check_positive, check_range
 
 DENSITY_BOUNDS = (1e-3, 100.0)
-"""Of the mass per area [kg/m^2]."""
+"""Bounds of the mass per area [kg/m^2]."""
 
 STRETCHING_MAX = 1e7
-"""Of each number of the table [N/m]."""
+"""Largest number in the stretching table [N/m]."""
 
 RIGIDITY_BOUNDS = (1e-12, 10.0)
-"""Of the stiffness against bending in each direction [N m]."""
+"""Bounds of the eigenvalues of the bending stiffness [N m]."""
 
 DAMPING_MAX = 1e3
-"""[1/s]"""
+"""Largest damping [1/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fabric:
-    """Constitutive numbers of a cloth; the first axis of its rest plane is the warp.
+    """Constitutive numbers of a cloth. The first axis of its rest plane is the warp.
 
     Raises:
         ValueError: A number breaks its rule.
@@ -37,17 +37,21 @@ class Fabric:
     """Mass per area [kg/m^2]."""
 
     stretching: Floats
-    """(6, 4) [N/m]: k0 ... k3 of the energy per area k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3
-    G01^2, G being Green's strain. Row 0 holds at no strain, rows 1 ... 5 where the larger principal
-    stretch is 1 + 1/6, at 0, 22.5, ..., 90 degrees from the warp; bilinear in between."""
+    """Table of the coefficients k0 ... k3 of the stretching energy: (6, 4) [N/m].
+
+    The energy per area is k0 G00^2/2 + k1 G00 G11 + k2 G11^2/2 + k3 G01^2, with Green's strain G.
+    Row 0 holds at no strain. Rows 1 ... 5 hold at a larger principal stretch of 1 + 1/6, whose
+    direction is 0, 22.5, ..., 90 degrees from the warp. Coefficients are bilinear in between.
+    """
 
     rigidity: Floats
-    """(3, 3) [N m]: D of the energy per area H:D:H/2, H = (H11, H22, 2 H12) being the second
-    derivatives.
+    """Bending stiffness D of the energy per area H:D:H/2: (3, 3) [N m].
+
+    H = (H11, H22, 2 H12) has the second derivatives.
     """
 
     damping: float = 0.0
-    """Proportional to mass [1/s]: a free motion slows down by exp(-damping t)."""
+    """Damping proportional to mass [1/s]: a free motion slows down by exp(-damping t)."""
 
     def __post_init__(self) -> None:
         check_range("density", self.density, *DENSITY_BOUNDS)
@@ -58,12 +62,14 @@ class Fabric:
                 f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, "
                 f"got {k.tolist()}"
             )
+        # Otherwise some strain would have no energy, or a negative one.
         if not (k[:, 1] ** 2 < k[:, 0] * k[:, 2]).all():
             row = int(np.argmin(k[:, 0] * k[:, 2] - k[:, 1] ** 2))
             raise ValueError(
                 f"stretching: must have k1^2 < k0 k2 in every row, "
                 f"and row {row} is {k[row].tolist()}"
             )
+        # Products of measured numbers may be symmetric up to rounding only.
         if (
             d.shape != (3, 3)
             or not np.isfinite(d).all()
@@ -72,15 +78,17 @@ class Fabric:
             raise ValueError(
                 f"rigidity: must be a symmetric (3, 3) matrix of finite numbers, got {d.tolist()}"
             )
+        # The eigenvalues bound the stiffness in every direction, also between warp and weft.
         for value in np.linalg.eigvalsh(d):
             check_range("rigidity, an eigenvalue", float(value), *RIGIDITY_BOUNDS)
+        # A frozen dataclass allows no plain assignment.
         object.__setattr__(self, "stretching", k)
         object.__setattr__(self, "rigidity", d)
 
     def scaled(
         self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0
     ) -> "Fabric":
-        """Return a fabric whose numbers are those of this one times factors.
+        """Return a fabric whose numbers are the numbers of this one times factors.
 
         Raises:
             ValueError: A factor is not positive, or a product breaks its rule.
@@ -89,6 +97,7 @@ class Fabric:
         for name, factor in factors.items():
             if not (np.isfinite(factor) and factor > 0.0):
                 raise ValueError(f"{name}: must be a finite factor > 0, got {factor}")
+        # The name states the factors, so that messages about the new fabric are clear.
         changed = "".join(
             f", {name} x {factor:g}" for name, factor in factors.items() if factor != 1.0
         )
@@ -116,15 +125,21 @@ def custom_fabric(
 
     Give a stretching table with bending, or Young's modulus with the thickness.
 
-    Args: name: For messages. density: Mass per area [kg/m^2]. stretching: (6, 4) [N/m], as
-        `Fabric.stretching`; or `young`. young: Young's modulus [Pa], of an isotropic fabric with
-        `poisson` and `thickness`. poisson: Poisson's ratio, in [0, 0.5]; None is 0. thickness: [m]
-        bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). Without it, the
-        plate's of `young`, E h^3 / (12 (1 - poisson^2)). damping: Proportional to mass [1/s].
+    Args:
+        name: Name of the fabric in messages.
+        density: Mass per area [kg/m^2].
+        stretching: Table (6, 4) [N/m], as `Fabric.stretching`. It excludes `young`.
+        young: Young's modulus [Pa] of an isotropic fabric with `poisson` and `thickness`.
+        poisson: Poisson's ratio, in [0, 0.5]. None is 0.
+        thickness: Thickness [m], for `young`.
+        bending: D [N m]: (3,) of warp, weft and twist (D11, D22, D66), or (3, 3). None takes
+            the D of a plate with `young`, E h^3 / (12 (1 - poisson^2)).
+        damping: Damping proportional to mass [1/s].
 
     Raises:
-        ValueError: A number breaks its rule, or there are too many or too few.
+        ValueError: A number breaks its rule, is missing, or excludes another.
     """
+    # Both would determine the table, and they might disagree.
     if (stretching is None) == (young is None):
         raise ValueError(
             "stretching, young: must be one of both, got "
@@ -146,10 +161,12 @@ def custom_fabric(
         )
         table, rigidity = plate.stretching, plate.rigidity
     else:
+        # A table says nothing about the thickness, so bending cannot follow from it.
         table = np.asarray(stretching, float)
         if bending is None:
             raise ValueError("bending: must be given with stretching")
     if bending is not None:
+        # Measured bending replaces the bending of the plate.
         numbers = np.asarray(bending, float)
         rigidity = np.diag(numbers) if numbers.shape == (3,) else numbers
     return Fabric(name, float(density), table, rigidity, float(damping))
@@ -167,20 +184,23 @@ def isotropic(
     Args:
         density: Mass per area [kg/m^2].
         stretching: Y, Young's modulus times thickness [N/m].
-        rigidity: D of plates, E h^3 / (12 (1 - poisson^2)) [N m].
+        rigidity: Bending stiffness D of a plate, E h^3 / (12 (1 - poisson^2)) [N m].
         poisson: Poisson's ratio, in [0, 0.5].
-        name: For messages.
+        name: Name of the fabric in messages.
 
     Raises:
         ValueError: A number breaks its rule.
     """
     check_positive(density=density, stretching=stretching, rigidity=rigidity)
     check_range("poisson", poisson, 0.0, 0.5)
+    # Plane stress: a sheet is free to become thinner. Shear strain enters the energy as G01 and as
+    # G10, so k3 is twice the shear modulus Y / (2 (1 + poisson)).
     tension = stretching / (1.0 - poisson**2)
     row = [tension, poisson * tension, tension, stretching / (1.0 + poisson)]
     plate = rigidity * np.array(
         [[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - poisson)]]
     )
+    # All rows are the same: the stiffness depends neither on strain nor on its direction.
     return Fabric(name, float(density), np.tile(row, (6, 1)), plate)
 
 
@@ -188,11 +208,13 @@ def isotropic(
 def fabric(name: str) -> Fabric:
     """Return one of the fabrics of [Wang et al. 2011].
 
-    Its stretching numbers are doubled, as the authors' simulator does, negative ones are raised to
-    0, and the coupling is kept positive definite. Its bending numbers k are coefficients of hinges:
-    a plate as stiff has D = k/4 on equilateral triangles. D against curvature along warp, weft and
-    in between comes from hinges across it; with no coupling D12, D66 = D(45 degrees) - (D11 +
-    D22)/4. D is the mean over the tabulated curvatures.
+    Stretching numbers are doubled, as in the authors' simulator. Negative ones are raised to 0, and
+    the coupling is kept positive definite.
+
+    Bending numbers k are coefficients of hinges. A plate with the same stiffness has D = k/4 on
+    equilateral triangles. D against curvature along warp, weft and in between comes from the hinges
+    across that direction. Without a coupling D12, D66 = D(45 degrees) - (D11 + D22)/4. D is the
+    mean over the tabulated curvatures.
 
     Raises:
         ValueError: There is no such fabric.
@@ -202,14 +224,16 @@ def fabric(name: str) -> Fabric:
         raise ValueError(f"fabric: must be one of {', '.join(table)}, got {name!r}")
     facts = table[name]
     k = 2.0 * np.maximum(np.array(facts["stretching"]), 0.0)
+    # A measured coupling may exceed the limit of a positive energy. 0.95 leaves a margin.
     k[:, 1] = np.minimum(k[:, 1], 0.95 * np.sqrt(k[:, 0] * k[:, 2]))
     across_weft, between, across_warp = np.mean(facts["bending"], axis=1) / 4.0
+    # The difference of measured numbers may be negative, and D must be positive definite.
     twist = max(between - 0.25 * (across_weft + across_warp), 0.1 * min(across_weft, across_warp))
     return Fabric(name, float(facts["density"]), k, np.diag([across_warp, across_weft, twist]))
 
 
 def fabric_names() -> tuple[str, ...]:
-    """Return the names that `fabric` knows."""
+    """Return the names that `fabric` accepts."""
     return tuple(_table())
 
 

@@ -13,13 +13,13 @@ Diagonals = Literal["alternating", "left", "right", "random"]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangulated rectangle at rest."""
+    """Triangulated cloth at rest."""
 
     rest: NDArray[np.float64]
-    """(V, 2) [m]."""
+    """Positions of the vertices in the rest plane: (V, 2) [m]."""
 
     triangles: NDArray[np.int32]
-    """(T, 3), counter-clockwise."""
+    """Vertices of each triangle, counter-clockwise: (T, 3)."""
 
     @property
     def spacing(self) -> float:
@@ -30,7 +30,9 @@ class Mesh:
 
     @property
     def rim(self) -> NDArray[np.int32]:
-        """(R,): vertices of the boundary, ascending."""
+        """Vertices of the boundary, ascending: (R,)."""
+        # Sorted ends make the two directions of an edge equal. An inner edge belongs to two
+        # triangles, and an edge of the boundary to one.
         edges = np.sort(
             np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1
         )
@@ -46,7 +48,7 @@ def grid(
     diagonals: Diagonals = "alternating",
     seed: int = 0,
 ) -> Mesh:
-    """Triangulate a rectangle by columns x rows cells, each of which is cut along a diagonal.
+    """Triangulate a rectangle by columns x rows cells, and cut each cell along a diagonal.
 
     The rectangle is [-width/2, width/2] x [-length/2, length/2].
 
@@ -63,6 +65,7 @@ def grid(
     column, row = (
         cells.ravel() for cells in np.meshgrid(np.arange(columns), np.arange(rows), indexing="xy")
     )
+    # Corners of each cell, counter-clockwise from the lower left.
     a = row * (columns + 1) + column
     b, c, d = a + 1, a + columns + 2, a + columns + 1
     match diagonals:
@@ -78,6 +81,7 @@ def grid(
             raise ValueError(
                 f"diagonals: must be alternating, left, right or random, got {diagonals!r}"
             )
+    # Two triangles for either diagonal of every cell; `rising` then picks one diagonal each.
     up = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1)
     down = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], 1)
     triangles = np.where(rising[:, None, None], up, down).reshape(-1, 3)
@@ -87,13 +91,12 @@ def grid(
 def together(*parts: Mesh) -> Mesh:
     """Return a mesh of several sheets, which lie side by side at rest.
 
-    Vertices keep their order, part by part.
-
-    A single part stays as it is.
+    Vertices keep their order, part by part. A single part stays as it is.
     """
     if len(parts) == 1:
         return parts[0]
     rest, triangles, right, count = [], [], 0.0, 0
+    # A gap of a tenth of each sheet's width keeps the sheets apart at rest.
     for part in parts:
         low, high = part.rest[:, 0].min(), part.rest[:, 0].max()
         rest.append(part.rest + np.array([right - low, 0.0]))
@@ -108,13 +111,13 @@ def unstructured(
 ) -> Mesh:
     """Triangulate a rectangle by a Delaunay mesh of scattered vertices.
 
-    The rectangle is [-width/2, width/2] x [-length/2, length/2]. Rows of a triangular lattice with
-    edges of about `spacing` are displaced at random by up to 0.3
-    spacings, and edges are flipped until every circumcircle is empty [Lawson 1977]. The first
-    `aligned` rows of cells along the length are squares of side `spacing` instead.
+    The rectangle is [-width/2, width/2] x [-length/2, length/2]. The vertices are rows of a
+    triangular lattice with edges of about `spacing`, displaced at random by up to 0.3 spacings.
+    Edges are flipped until every circumcircle is empty [Lawson 1977]. The first `aligned` rows of
+    cells along the length are squares of side `spacing` instead.
 
     Raises:
-        ValueError: A size is not positive, or the length is less than that of the aligned rows.
+        ValueError: A size is not positive, or the aligned rows fill the whole length.
     """
     check_positive(width=width, length=length, spacing=spacing)
     start = aligned * spacing
@@ -125,11 +128,14 @@ def unstructured(
         )
     rng = np.random.default_rng(seed)
     columns = max(1, round(width / spacing))
+    # The height of an equilateral triangle is sqrt(0.75) times its side.
     rows = max(1, round((length - start) / (spacing * np.sqrt(0.75))))
     height = (length - start) / rows
     strips = []
     for row in range(-aligned, rows + 1):
         x = np.linspace(0.0, 1.0, columns + 1)
+        # Every other row is shifted by half a cell, as in a triangular lattice. It keeps a vertex
+        # at both ends, so that the long edges stay straight.
         if row > 0 and row % 2 and row != rows:
             x = np.concatenate([[0.0], (np.arange(columns) + 0.5) / columns, [1.0]])
         y = start + row * (height if row > 0 else spacing)
@@ -137,9 +143,13 @@ def unstructured(
     rows += aligned
     rest = np.concatenate(strips)
     size = np.array([width, length])
+    # Vertices move in both directions inside, and not across an edge that they lie on. Aligned rows
+    # do not move at all.
     inside = (rest > 1e-9 * size.max()) & (rest < size * (1.0 - 1e-9))
     inside[: (aligned + 1) * (columns + 1) if aligned else 0] = False
     rest += np.where(inside, rng.uniform(-0.3, 0.3, rest.shape) * min(width / columns, height), 0.0)
+    # Zip each row and the next from left to right into triangles. The choice of the side is not
+    # critical, since edges are flipped afterwards.
     starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
     triangles: list[tuple[int, int, int]] = []
     for row in range(rows):
@@ -149,6 +159,7 @@ def unstructured(
         )
         i = j = 0
         while i < len(low) - 1 or j < len(high) - 1:
+            # Advance on the row whose next edge has its middle further to the left.
             along_low = j == len(high) - 1 or (
                 i < len(low) - 1
                 and rest[low[i + 1], 0] + rest[low[i], 0] <= rest[high[j + 1], 0] + rest[high[j], 0]
@@ -166,9 +177,10 @@ def unstructured(
 def _delaunay(
     rest: NDArray[np.float64], triangles: list[tuple[int, int, int]]
 ) -> list[tuple[int, int, int]]:
-    """Flip edges whose opposite angles add up to more than pi, until there are none."""
+    """Flip edges whose opposite angles add up to more than pi, until no such edge remains."""
     cells = [list(t) for t in triangles]
-    sides: dict[tuple[int, int], int] = {}  # directed edge -> triangle on its left
+    # From a directed edge to the triangle on its left.
+    sides: dict[tuple[int, int], int] = {}
     for t, (a, b, c) in enumerate(cells):
         for edge in ((a, b), (b, c), (c, a)):
             sides[edge] = t
@@ -184,11 +196,15 @@ def _delaunay(
     todo = list(sides)
     while todo:
         a, b = todo.pop()
+        # An earlier flip removed the edge, or it is on the boundary.
         if (a, b) not in sides or (b, a) not in sides:
             continue
         left, right = sides[a, b], sides[b, a]
         c = next(v for v in cells[left] if v not in (a, b))
         d = next(v for v in cells[right] if v not in (a, b))
+        # Angles add up to more than pi if the sum of their cotangents is negative. The slack keeps
+        # four vertices on one circle, as in a square, from flipping back and forth forever. A flip
+        # in a quadrangle that is not convex would turn a triangle over.
         if (
             cotangent(c, a, b) + cotangent(d, a, b) > -1e-9
             or min(area(a, d, c), area(d, b, c)) <= 0.0
@@ -199,5 +215,6 @@ def _delaunay(
         for t, (p, q, r) in ((left, (a, d, c)), (right, (d, b, c))):
             for edge in ((p, q), (q, r), (r, p)):
                 sides[edge] = t
+        # The flip changed the angles opposite to the four sides of the quadrangle.
         todo.extend([(a, d), (d, b), (b, c), (c, a)])
     return [(t[0], t[1], t[2]) for t in cells]

@@ -10,7 +10,7 @@ import numpy as np
 from stickslip_sim_core import _sim_core
 
 STEP_ERROR = 2e-4
-"""Step error of `certified` [m]. Presets that choose no steps are judged by it, too."""
+"""Step error of `certified` [m]. Checks also judge presets with fixed steps by it."""
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,24 @@ class SolverSettings:
 
     name: str
     time_step: float
-    """Step where steps are not chosen by `step_error` [s], at most 1."""
+    """Length of a step if `step_error` does not choose it [s], at most 1."""
 
     tolerance: float = 1e-4
-    """Largest residual force of a node in a converged step, in weights of 25 mm^2 of the cloth; at
-    most 1.
+    """Largest residual force of a node in a converged step, at most 1.
+
+    Its unit is the weight of 25 mm^2 of the cloth.
     """
 
     newton_max: int = 40
-    """Iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
+    """Most iterations of Newton's method in a step that is not halved any more, 1 ... 1000."""
 
     krylov_tolerance: float = 0.005
-    """Residual over right-hand side at which GMRES stops, below 1."""
+    """Residual over right-hand side at which GMRES stops, at most 1."""
 
     refactor_after: int = 10
-    """GMRES iterations that a stale factor may cost beyond those with a fresh one before all of it
-    is made anew.
+    """Extra GMRES iterations that a stale factor may cost, compared with a fresh one, 0 ... 10,000.
+
+    Beyond them all of the matrix is factorised again.
     """
 
     patience: int = 10
@@ -46,37 +48,44 @@ class SolverSettings:
     """
 
     halvings_max: int = 6
-    """Times that a step which does not converge is halved, 0 ... 20."""
+    """Number of times that a step which does not converge is halved, 0 ... 20."""
 
     step_error: float | None = STEP_ERROR
-    """Distance of a vertex from where it was predicted, by which scenes choose steps [m]; None:
-    `time_step`.
+    """Distance of a vertex from its predicted position by which scenes choose steps [m].
+
+    None: all steps have the length `time_step`.
     """
 
     longest_step: float = 0.125
-    """Longest step where steps are chosen by `step_error` [s], at most 1."""
+    """Longest step that `step_error` may choose [s], at most 1."""
 
     finest: int = 64
-    """Parts, a power of two, that the longest step is cut into at most for the sake of
-    `step_error`; steps that do not converge are halved further."""
+    """Most parts, a power of two, into which `step_error` may cut the longest step.
+
+    Steps that do not converge are halved further.
+    """
 
     newton_per_second: int = 50_000
-    """Iterations of Newton's method in a second of scene time, 1 ... 1,000,000, beyond which a run
-    ends as not valid: four times 512 steps of 25 iterations each."""
+    """Most iterations of Newton's method in a second of scene time, 1 ... 1,000,000.
+
+    Beyond it a run ends as not valid. The default is about four times 512 steps of 25 iterations.
+    """
 
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
 
     constants: Mapping[str, float] = field(default_factory=dict, hash=False)
-    """Constants of the C++ solver to replace, by their names in `numbers`: for tests of how results
-    depend on them.
+    """Constants of the C++ solver to replace, by their names in `numbers`.
+
+    Tests replace them to learn how results depend on them.
     """
 
     def numbers(self) -> dict[str, Any]:
-        """Return all numbers that the preset stands for, by name.
+        """Return all numbers of the preset, by name.
 
-        Constants of the C++ solver are named "group.name".
+        Constants of the C++ solver have names of the form "group.name".
         """
+        # Constants of the preset come last, so that they replace the solver's defaults.
         own = {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"
         }
@@ -99,6 +108,7 @@ class SolverSettings:
             ("newton_per_second", 1, 1_000_000),
         ):
             value = getattr(self, name)
+            # True and False are integers in Python.
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise ValueError(f"{name}: must be an integer, {low} ... {high}, got {value}")
         if isinstance(self.finest, bool) or self.finest not in [2**power for power in range(13)]:
@@ -109,6 +119,7 @@ class SolverSettings:
             )
 
 
+# These presets end their iterations on purpose, so they may neither halve steps nor fail for it.
 _CUT_OFF: dict[str, Any] = {"halvings_max": 0, "step_error": None, "unconverged_share_max": 1.0}
 
 PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
@@ -117,10 +128,10 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
         for settings in (
             SolverSettings("certified", 0.02),
             SolverSettings("fast", 0.04, tolerance=2e-4, step_error=4e-4, finest=16),
-            # Where frames are compared.
+            # For comparisons of frames.
             SolverSettings("fine", 0.01, tolerance=5e-5, step_error=2e-5, longest_step=0.0625),
-            # Table 4.2 of the thesis: steps of its lengths; a solver that is cut off early leaves
-            # its residual.
+            # Steps have the lengths of the thesis's Table 4.2. Two of the presets imitate its
+            # inaccurate solver: iterations that end early leave a residual.
             SolverSettings("thesis-high", 0.0005, step_error=None),
             SolverSettings("thesis-low-small-dt", 0.0005, newton_max=2, **_CUT_OFF),
             SolverSettings("thesis-low-big-dt", 0.001, newton_max=1, **_CUT_OFF),
@@ -130,7 +141,7 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
 
 
 def preset_named(preset: str | SolverSettings) -> SolverSettings:
-    """Return the settings of this name; settings are returned as they are.
+    """Return the settings of this name, or the given settings as they are.
 
     Raises:
         ValueError: The name is unknown.

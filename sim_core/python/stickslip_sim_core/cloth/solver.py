@@ -1,6 +1,6 @@
 """Time stepping of cloth in contact with bodies, itself and surfaces.
 
-A thin layer over the C++ solver.
+The module is a thin layer over the C++ solver.
 """
 
 import os
@@ -38,36 +38,44 @@ PASSED_ON = (
 """Settings that the C++ solver takes as they are."""
 
 RESIDUAL_PATCH = 0.005**2
-"""Area whose weight residuals are measured in, whatever the mesh [m^2]."""
+"""Area whose weight is the unit of residuals [m^2]. It does not depend on the mesh."""
 
 EXTENT_MAX = 20.0
 """Largest length and width of all sheets at rest [m]: larger ones are a mistake in the unit."""
 
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Acceleration of gravity [m/s^2]."""
 
 Motion = Callable[[float], tuple[Floats, ArrayLike, Sequence[Body]]]
-"""From a time [s] to gravity (V, 3) [m/s^2], positions of the held vertices (K, 3) [m], and bodies.
+"""Function of the time [s] that returns gravity, held vertices and bodies.
+
+Gravity is (V, 3) [m/s^2]. The positions of the held vertices are (K, 3) [m].
 """
 
 Path = Callable[[Floats], tuple[ArrayLike, ArrayLike]]
-"""From times (T,) [s] to positions of the held vertices (T, K, 3) [m], and poses of the bodies (T,
-B, 3, 4) [m].
+"""Function of times (T,) [s] that returns held vertices and poses of bodies.
+
+The positions of the held vertices are (T, K, 3) [m]. The poses are (T, B, 3, 4) [m].
 """
 
 
 class Cloth:
     """Cloth with its state and solver settings: a sheet, or several in one mesh.
 
-    Args: mesh: The cloth at rest; `meshes.together` puts several sheets into one. fabric: Material
-        of the cloth, or of each sheet. Sheets are the connected pieces of the mesh, in the order of
-        their first vertices. preset: Solver settings. held: (K,) vertices whose positions are
-        prescribed. self_contact: Contact within and between sheets. None: off, the cloth passes
-        through itself. surfaces: Triangles that it touches. force_scale: Force that residuals are
-        measured in [N]; None is the weight of 25 mm^2 of the lightest fabric. kernel: Level of the
-        kernels, one of `_sim_core.kernels()`: levels differ in the last digits. None takes that of
-        the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest that this processor
-        runs.
+    Args:
+        mesh: The cloth at rest. `meshes.together` puts several sheets into one mesh.
+        fabric: Material of the cloth, or of each sheet. Sheets are the connected pieces of the
+            mesh, in the order of their first vertices.
+        preset: Solver settings.
+        held: Vertices whose positions are prescribed: (K,).
+        self_contact: Contact within and between sheets. Without it the cloth passes through
+            itself.
+        surfaces: Triangles that the cloth touches.
+        force_scale: Unit of residual forces [N]. None is the weight of 25 mm^2 of the lightest
+            fabric.
+        kernel: Level of the kernels, one of `_sim_core.kernels()`. Levels differ in the last
+            digits. None takes the environment variable STICKSLIP_CLOTH_KERNEL, or else the widest
+            level that this processor runs.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -87,7 +95,7 @@ class Cloth:
     ) -> None:
         self.mesh, self.preset = mesh, preset
         self.fabrics = (fabric,) if isinstance(fabric, Fabric) else tuple(fabric)
-        """One, or one for each sheet."""
+        """One fabric, or one for each sheet."""
         self.held = np.asarray(held, dtype=np.int32).reshape(-1)
         sheets = sheet_count(mesh.rest, mesh.triangles)
         extent = float(np.ptp(mesh.rest, axis=0).max())
@@ -98,19 +106,21 @@ class Cloth:
         self.surfaces = tuple(surfaces)
         self.self_contact = self_contact
         self.time = 0.0
-        """[s]"""
+        """Time at the end of the last step [s]."""
+        # The C++ solver has one list of vertices for all surfaces, one surface after the other.
         self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
         mu, thickness = self._touch(sheets)
         edge_share, second_share = BEARING[self_contact.bearing if self_contact else "all"]
+        # The lightest fabric gives the smallest unit, so no sheet converges too early.
         patch_weight = (
             min((fabric.density for fabric in self.fabrics), default=np.nan)
             * RESIDUAL_PATCH
             * GRAVITY
         )
         self.force_scale = patch_weight if force_scale is None else force_scale
-        """Force that residuals are measured in [N]: the weight of 25 mm^2, unless another is given.
-        """
+        """Unit of residual forces [N]: the weight of 25 mm^2, unless the caller gives another."""
+        # `hold` makes a new solver with other held vertices, and all else as here.
         self._make = partial(
             ClothSolver,
             mesh.rest,
@@ -121,6 +131,7 @@ class Cloth:
             ],
             tolerance=preset.tolerance * self.force_scale,
             **{name: getattr(preset, name) for name in PASSED_ON},
+            # A fixed step has no error to keep, and `advance` takes it as the longest step.
             step_error=preset.step_error or np.inf,
             longest_step=preset.longest_step if preset.step_error else preset.time_step,
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
@@ -128,6 +139,7 @@ class Cloth:
             mu=mu,
             edge_share=edge_share,
             second_share=second_share,
+            # Shift the numbers of a surface's vertices past the vertices of earlier surfaces.
             surface_triangles=np.concatenate(
                 [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))],
                 dtype=np.int32,
@@ -138,25 +150,28 @@ class Cloth:
             constants=dict(preset.constants),
         )
         self._solver = self._make(held=self.held.tolist())
+        # Time, positions and velocities before the last step. The time inf stands for no step yet.
         self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
         self.total = StepReport()
-        """Of all steps: counts, least distances and worst values, and `seen`, what `checks` judge.
-        """
+        """Report of all steps: counts, least distances, and in `seen` the values for `checks`."""
         self.spent = 0.0
-        """Most iterations in a second of `advance` over the preset's `newton_per_second`; beyond 1
-        it stops.
+        """Most iterations in a second of scene time over the preset's `newton_per_second`.
+
+        Beyond 1, `advance` stops.
         """
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
     def _touch(self, sheets: int) -> tuple[Floats, Floats]:
         """Return friction between sheets and surfaces (-1: no contact), and thicknesses."""
+        # Surfaces come after the sheets. Two surfaces have no contact: both are prescribed.
         mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
         thickness = np.full(sheets, THICKNESS)
         if self.self_contact:
             mu[:sheets, :sheets], thickness = self.self_contact.of_sheets(sheets)
         for column, surface in enumerate(self.surfaces, start=sheets):
             own = np.asarray(surface.mu, float)
+            # A surface does not have the number of sheets, so it could not check its friction.
             if own.ndim and own.shape != (sheets,):
                 raise ValueError(
                     f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}"
@@ -166,6 +181,7 @@ class Cloth:
 
     def _surfaces_at(self, time: float) -> Floats:
         found = [surface.at(time) for surface in self.surfaces]
+        # A function of time may return more or fewer vertices than it did at the start.
         if [len(one) for one in found] != self._surface_sizes:
             raise ValueError(
                 f"positions: of surfaces must keep their vertices, and do not at {time:g} s"
@@ -183,24 +199,25 @@ class Cloth:
 
     @property
     def masses(self) -> Floats:
-        """(V,) [kg]."""
+        """Masses of the vertices: (V,) [kg]."""
         return np.asarray(self._solver.masses())
 
     @property
     def positions(self) -> Floats:
-        """(V, 3) [m]."""
+        """Positions of the vertices: (V, 3) [m]."""
         return np.asarray(self._solver.positions())
 
     @property
     def velocities(self) -> Floats:
-        """(V, 3) [m/s]."""
+        """Velocities of the vertices: (V, 3) [m/s]."""
         return np.asarray(self._solver.velocities())
 
     @property
     def reactions(self) -> Floats:
-        """Forces on the vertices (V, 3) [N], by M a = forces.
+        """Forces on the vertices (V, 3) [N], from the balance M a = forces.
 
-        On a free vertex that of a body or a smooth surface, on a held one that of its holder.
+        A body or a smooth surface exerts the force on a free vertex. The holder exerts the force on
+        a held vertex.
         """
         return np.asarray(self._solver.reactions())
 
@@ -214,22 +231,23 @@ class Cloth:
 
     @property
     def sliding(self) -> NDArray[np.bool_]:
-        """(V,): whether a vertex slides on its body or surface."""
+        """Whether each vertex slides on its body or surface: (V,)."""
         return np.asarray(self._solver.sliding(), dtype=bool)
 
     @property
     def pair_forces(self) -> PairForces:
         """Forces of pairs of closest points at the end of the last step.
 
-        Of cloth and cloth, and of cloth and triangles of surfaces.
+        The pairs are between cloth and cloth, and between cloth and triangles of surfaces or
+        skeletons of bodies.
         """
         return self._solver.pair_forces()
 
     @property
     def surface_forces(self) -> list[Floats]:
-        """Forces of the cloth on the vertices of each surface (N, 3) [N].
+        """Forces of the cloth on the vertices of each surface at the end of the last step.
 
-        At the end of the last step.
+        The forces on a surface of N vertices are (N, 3) [N].
         """
         return np.split(
             np.asarray(self._solver.surface_forces()), np.cumsum(self._surface_sizes)[:-1]
@@ -240,10 +258,12 @@ class Cloth:
     ) -> None:
         """Set positions (V, 3) [m], and velocities (V, 3) [m/s].
 
-        Without `bodies`, those of this time, they do not move in the next step.
+        `bodies` are the bodies at this time. Without them, bodies do not move in the next step.
+        Without `velocities` the cloth is at rest.
 
-        Raises: ValueError: The cloth crosses a surface, or, with self-contact, itself; a free
-            vertex is more than 1 um inside a body; or an array has another shape.
+        Raises:
+            ValueError: The cloth crosses a surface, or, with self-contact, itself; a free vertex is
+                more than 1 um inside a body; or an array has another shape.
         """
         at = np.asarray(positions, float)
         speed = np.zeros_like(at) if velocities is None else np.asarray(velocities, float)
@@ -258,16 +278,18 @@ class Cloth:
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
         """Prescribe the positions of these vertices (K,) from now on, and let go of all others.
 
-        Positions and velocities stay: what is let go flies on as it was moved. `bodies` are those
-        of this time.
+        Positions and velocities stay: a released vertex flies on with its velocity. `bodies` are
+        the bodies at this time.
 
         Raises:
-            ValueError: A vertex is not there, or comes twice; or none is left free.
+            ValueError: A vertex does not exist, or comes twice; or no vertex is free.
         """
+        # The set of held vertices decides the unknowns of the C++ solver, so it needs a new one.
         positions, velocities = self.positions, self.velocities
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
         around = [body.as_tuple() for body in bodies]
+        # The run goes on: the state is a result of the solver, and no start that a user gave.
         self._solver.set_state(
             positions, velocities, self._surfaces_at(self.time), around, begins=False
         )
@@ -277,10 +299,11 @@ class Cloth:
     ) -> StepReport:
         """Advance by dt [s].
 
-        Positions of held vertices (K, 3), bodies and surfaces are those at its end.
+        `held` has the positions of the held vertices (K, 3) [m] at the end of the step. `bodies`
+        are the bodies at the end, and surfaces are taken there, too. `damping` is proportional to
+        mass [1/s] and adds to the damping of the fabric.
 
-        `damping` is proportional to mass [1/s]; that of the fabric is added.
-        A step that does not converge is counted, and its best iterate is kept.
+        The solver counts a step that does not converge, and keeps its best iterate.
         """
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
@@ -306,26 +329,29 @@ class Cloth:
     ) -> None:
         """Take steps until one ends at `end` [s] or later.
 
-        They are those of the controller, or of the preset's length.
+        The step control chooses their lengths, or the preset fixes them.
 
-        Steps depend on where the cloth is, not on how often this is called: `positions_at` has it
-        at any time of the last step. Gravity and damping are those at the ends of steps. Where held
-        vertices, bodies or surfaces do not move evenly in a step, it is halved: they are looked at
-        512 times a second, with `certified`.
+        Steps depend on the state of the cloth and not on the number of calls. `positions_at`
+        returns positions at any time of the last step. Gravity and damping are taken at the ends of
+        steps. A step is halved if held vertices, bodies or surfaces do not move evenly in it. For
+        example, `certified` looks at their motion 512 times a second.
 
         Args:
-            end: [s]
-            motion: What drives the cloth.
-            path: The same at many times, which is quicker; None: `motion` is asked at each.
-            event: Time [s] of the next sudden change of the motion, which a step must end at.
-            damping: Of all fabrics, on top of their own: proportional to mass [1/s].
+            end: Time to reach [s].
+            motion: Gravity, held vertices and bodies.
+            path: Held vertices and poses of bodies at many times, which is quicker. None calls
+                `motion` for each time.
+            event: Time of the next sudden change of the motion [s]. A step ends there.
+            damping: Damping proportional to mass [1/s], added to the damping of each fabric.
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
         """
+        # The loop below would end at once, as if the time had been reached.
         if np.isnan(end):
             raise ValueError("end: must be a number, got nan")
 
+        # The solver calls `drive` for the end of a step.
         def drive(time: float) -> tuple[Floats, Floats, Floats, list[BodyTuple], float]:
             self.gravity, held, bodies = motion(time)
             ends, tuples = (
@@ -334,6 +360,7 @@ class Cloth:
             )
             return self.gravity, ends, self._surfaces_at(time), tuples, damping(time)
 
+        # The solver calls `track` for many times within a step, to see whether the motion is even.
         def track(times: Sequence[float]) -> tuple[Floats, Floats]:
             at = np.array(times)
             if path is not None:
@@ -345,14 +372,18 @@ class Cloth:
             corners: ArrayLike = np.empty((len(at), 0, 3))
             if self.surfaces:
                 corners = [self._surfaces_at(time) for time in times]
+            # Vertices of surfaces are prescribed points as well, after the held vertices.
             points = np.concatenate([np.reshape(held, (len(at), -1, 3)), corners], axis=1)
             return points.reshape(-1, 3), np.reshape(np.asarray(poses, float), (-1, 4))
 
         while self.time < end and self.spent <= 1.0:
+            # `positions_at` interpolates between the two ends of this step.
             self._before = self.time, self.positions, self.velocities
             self.time, report = self._solver.advance(self.time, event, drive, track)
             self.total.add(report)
-            if self.preset.step_error is not None:  # iterations of the last second of scene time
+            # The sum of iterations drains at the allowed rate. A few hard steps therefore stay
+            # within the budget of a second, and many hard steps in a row exceed it.
+            if self.preset.step_error is not None:
                 allowed = self.preset.newton_per_second
                 self._spent = (
                     max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
@@ -362,9 +393,9 @@ class Cloth:
     def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
 
-        They are cubic in time between both ends of the step, with the velocities there, or
-        straight: a cubic goes on with the velocity before an impact, and may reach through what it
-        hits.
+        Positions are cubic in time between the ends of the step, with the velocities at both ends.
+        With `straight` they are linear. A cubic continues the velocity before an impact, and may
+        reach through the obstacle.
 
         Raises:
             ValueError: The time is not in the last step.
@@ -376,6 +407,7 @@ class Cloth:
             raise ValueError(
                 f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}"
             )
+        # Hermite's cubic: the straight part with zero velocities, and a bent part for velocities.
         h, s = self.time - begin, (time - begin) / (self.time - begin)
         way = self.positions - x
         if straight:
@@ -386,9 +418,10 @@ class Cloth:
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the rate of momentum less weight and the force of the holders; zero before the first
-        step.
+        It is the rate of momentum, minus the weight and the force of the holders. It is zero before
+        the first step.
         """
+        # The force comes from the balance of momentum, so it does not rely on the friction law.
         if not self.total.steps:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
@@ -398,6 +431,6 @@ class Cloth:
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state [1/s^2].
 
-        Contact does not count. The state is stable where it is > 0.
+        Contact is ignored. The state is stable if the eigenvalue is > 0.
         """
         return float(self._solver.softest(self.positions))

@@ -1,1 +1,1 @@
-"""Scenes: the simulations of each kind. `KIND` of the module of a kind runs them."""
+"""Scenes: the simulations of each kind. `KIND` in the module of a kind runs them."""

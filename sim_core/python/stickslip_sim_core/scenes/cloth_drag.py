@@ -38,20 +38,21 @@ LEGS = 4
 """Number of legs: there, back, there, back."""
 
 SPEED = 0.01
-"""Of the holders [m/s]."""
+"""Cruising speed of the holders [m/s]."""
 
 ACCELERATION = 0.01
-"""Of the holders [m/s^2]."""
+"""Acceleration of the holders at the start and end of a travel [m/s^2]."""
 
 FRAME_RATE = 2.4
-"""[1/s]"""
+"""Frames in a second [1/s]."""
 
 
 def travel(time: Floats, distance: Floats) -> Floats:
     """Return the displacement [m] of holders that start and end at rest.
 
-    They accelerate with `ACCELERATION` and cruise at `SPEED`.
+    The holders accelerate with `ACCELERATION` and cruise at `SPEED`.
     """
+    # Each ramp covers half the way of cruising as long, so both ramps together add one ramp.
     ramp = SPEED / ACCELERATION
     duration = distance / SPEED + ramp
     t = np.minimum(np.maximum(time, 0.0), duration)
@@ -71,9 +72,10 @@ def duration_of(distance: float) -> float:
 def holder_path(time: ArrayLike) -> Floats:
     """Return the displacement (x, z) of the holders [m]: ([T,] 2).
 
-    They go down, then to and fro [thesis, 4.2.3].
+    The holders go down, then to and fro [thesis, 4.2.3].
     """
     legs = np.arange(LEGS)
+    # The time since the start of the drop, and of each leg: a leg begins as the one before ends.
     since = np.asarray(time, float)[..., None] - np.append(0.0, LEGS * [duration_of(DROP)])
     ways = travel(since - np.append(0.0, legs * duration_of(DRAG)), np.append(DROP, LEGS * [DRAG]))
     return np.stack([(ways[..., 1:] * (-1.0) ** legs).sum(axis=-1), -ways[..., 0]], axis=-1)
@@ -85,12 +87,14 @@ FRAMES = 300
 
 def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
     """Return the vertices under the holders, at the two corners of the upper edge."""
+    # The slack catches vertices on the edge of a holder in spite of rounding.
     inner = SIDE / 2 - HOLDER - 1e-9
     return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
 
 
 def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
     """Return the shape in which the cloth hangs at rest under its holders, over the floor."""
+    # The flat cloth hangs upright in the plane x = 0, so that it faces the direction of the drag.
     flat = np.zeros((len(mesh.rest), 3))
     flat[:, 1] = mesh.rest[:, 0]
     flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
@@ -112,17 +116,21 @@ def scene(
 ) -> Scene:
     """Return the scene of a cloth that is lowered onto a plane and dragged to and fro.
 
-    The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A drop without
-    imperfection would buckle to neither side: gravity is tilted along x by `bias`, a little more on
-    one side of the cloth than on the other, both drawn from `seed`, until the drop ends, and set
-    upright within the second after.
+    The cloth hangs at rest, 1 cm over the floor, when the holders start to move. A perfect drop
+    would buckle to neither side. Gravity is therefore tilted along x by `bias`, a little more on
+    one side of the cloth than on the other. Both the bias and this difference are drawn from
+    `seed`. Gravity turns upright within the second after the drop.
 
-    Args: material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge. mu:
-        Coefficient of friction between cloth and floor, 0 ... 10. self_friction: Coefficient of
-        friction of the cloth with itself, 0 ... 10; None turns self-contact off. preset: Solver
-        settings, or their name. mesh: Vertices a side of a grid, at least 5; or a mesh of the
-        square of side `SIDE`. frames: Frames, 2.4 a second from 0 on; 300 are the whole motion.
-        seed: Of the bias. kernel: Level of the kernels, see `Cloth`.
+    Args:
+        material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge.
+        mu: Coefficient of friction between cloth and floor, 0 ... 10.
+        self_friction: Coefficient of friction of the cloth with itself, 0 ... 10. None turns
+            self-contact off.
+        preset: Solver settings, or their name.
+        mesh: Vertices along a side of a grid, at least 5; or a mesh of the square of side `SIDE`.
+        frames: Number of frames, 2.4 a second from 0 on. 300 frames cover the whole motion.
+        seed: Seed of the bias.
+        kernel: Level of the kernels, see `Cloth`.
 
     Raises:
         ValueError: An argument breaks its rule.
@@ -130,6 +138,7 @@ def scene(
     check_range("frames", frames, 1, FRAMES)
     if not isinstance(mesh, meshes.Mesh):
         check_range("mesh", mesh, 5, np.inf)
+        # `mesh` counts vertices, and a grid takes cells.
         mesh = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
     made = fabric(material) if isinstance(material, str) else material
     cloth = hang(mesh, made, seed=seed, kernel=kernel)
@@ -158,11 +167,12 @@ KIND = cloth_kind(scene)
 def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
     """Return the motion over a floor of friction mu.
 
-    Gravity is upright one second after the drop.
+    Gravity is upright from one second after the drop on.
     """
     floor = [plane(mu)]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
+        # The tilt fades out, since a jump of gravity would shake the cloth.
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
         return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), floor
 
@@ -176,6 +186,7 @@ def holder_pose(time: ArrayLike) -> Floats:
     """
     pose = np.zeros((*np.shape(time), 3, 4))
     pose[..., :3] = np.eye(3)
+    # The holders move along x and z only.
     pose[..., ::2, 3] = holder_path(time)
     return pose
 
@@ -185,18 +196,17 @@ def _forces(cloth: Cloth, hung: Hung) -> Record:
 
     Before the first step the holders bear the weight.
     """
+    # The solver has reactions only after a step.
     weight = cloth.masses.sum() * np.array([0.0, 0.0, -GRAVITY])
     holders = cloth.reactions[hung.held].sum(axis=0) if cloth.total.steps else -weight
     return {"contact_force": cloth.contact_force(), "holder_force": holders}
 
 
 def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
-    """Return the labels of a drop.
+    """Return the labels of a drop: the fabric, the bias, and the side on which the cloth landed.
 
-    They are those of the fabric, the bias, and the side of the holders on which the cloth lay.
-
-    `landed_side` is the sign of its mean x less that of the holders in the first frame after the
-    drop; 0 without one.
+    `landed_side` is the sign of the mean x of the cloth minus the mean x of the holders, in the
+    first frame after the drop. It is 0 if the scene has no such frame.
     """
     frame = int(np.ceil(duration_of(DROP) * FRAME_RATE))
     landed = 0

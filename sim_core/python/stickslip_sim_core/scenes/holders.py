@@ -1,6 +1,6 @@
 """Holders: vertices of the cloth that move as rigid bodies.
 
-Cloth starts in the shape in which it hangs at rest under them.
+`hung` returns the shape in which a cloth hangs at rest under its holders.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,23 +23,24 @@ ALWAYS = (0.0, np.inf)
 class Holder:
     """Vertices that move as one rigid body from a grasp to a release.
 
-    At the time t0 of the grasp the holder takes each vertex where it is: x(t) = M(t) M(t0)^-1
-    x(t0), M being its pose.
+    At the time t0 of the grasp the holder takes each vertex at its present position. From then on
+    x(t) = M(t) M(t0)^-1 x(t0), with the pose M of the holder.
 
     Raises:
         ValueError: An argument breaks its rule.
     """
 
     vertices: NDArray[np.intp]
-    """(K,)"""
+    """Vertices that the holder holds: (K,)."""
 
     pose: Callable[[ArrayLike], Floats]
-    """From the time [s] to a rigid motion (3, 4): x -> A x + b [m]; in a scene with `poses`, from
-    times (T,), too.
+    """Function from a time [s] to a rigid motion x -> A x + b [m]: (3, 4).
+
+    In a scene with `poses` it takes times (T,), too.
     """
 
     grasp: tuple[float, float] = ALWAYS
-    """When it takes hold, and when it lets go [s]."""
+    """Times of the grasp and of the release [s]."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.grasp[0] < self.grasp[1]:
@@ -48,7 +49,7 @@ class Holder:
             raise ValueError("vertices: a holder must hold a vertex, got none")
 
     def holds(self, time: float) -> bool:
-        """Return whether it holds its vertices from this time [s] on."""
+        """Return whether the holder holds its vertices from this time [s] on."""
         return self.grasp[0] <= time < self.grasp[1]
 
 
@@ -57,41 +58,45 @@ class Hands:
 
     No two holders may hold the same vertex at a time.
 
-    `positions` are those of all vertices at 0 s, (V, 3) [m].
+    `positions` are the positions of all vertices at 0 s: (V, 3) [m].
     """
 
     def __init__(self, holders: Sequence[Holder], positions: Floats) -> None:
         self.holders = tuple(holders)
         self.events = sorted({t for holder in holders for t in holder.grasp if 0.0 < t < np.inf})
         """Times of all grasps and releases after 0 s [s], ascending."""
+        # By the number of a holder: places of its vertices in the axes of the holder, (K, 3) [m].
         self._taken: dict[int, Floats] = {}
         self.take(0.0, positions)
 
     def take(self, time: float, positions: Floats) -> NDArray[np.int32]:
-        """Grasp and release what this time [s] asks for, and return the held vertices (K,)."""
+        """Grasp and release the vertices due at this time [s], and return the held ones (K,)."""
         taken: dict[int, Floats] = {}
         for number, holder in enumerate(self.holders):
             if holder.holds(time):
                 pose = holder.pose(time)
                 place = (positions[holder.vertices] - pose[:, 3]) @ pose[:, :3]
+                # A holder keeps the places from its grasp: new ones at each event would drift.
                 taken[number] = self._taken.get(number, place)
         self._taken = taken
         return self.vertices
 
     @property
     def vertices(self) -> NDArray[np.int32]:
-        """(K,): held vertices, holder by holder."""
+        """Held vertices, holder by holder: (K,)."""
         held = [self.holders[number].vertices for number in self._taken]
         return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
     def at(self, time: ArrayLike) -> Floats:
         """Return the positions of the held vertices at a time or times [s]: ([T,] K, 3) [m].
 
-        Times are (T,).
+        Several times are (T,).
         """
+        # Empty arrays keep the shape if no holder holds a vertex.
         shape = np.shape(time)
         found = [np.empty((*shape, 0, 3))]
         for number, points in self._taken.items():
+            # A holder at rest may return one pose for all times.
             pose = np.broadcast_to(self.holders[number].pose(time), (*shape, 3, 4))
             found.append(points @ np.swapaxes(pose[..., :3], -1, -2) + pose[..., None, :, 3])
         return np.concatenate(found, axis=-2)
@@ -107,28 +112,31 @@ class Hands:
 
 
 HANGING = SolverSettings("hanging", 0.05, tolerance=1e-5, step_error=None, halvings_max=1)
-"""Solver settings of the hung shape, so that all presets start from the same. The way there does
-not matter, so hard steps are not pursued far."""
+"""Solver settings of the hung shape. All presets start from this shape.
+
+The path to rest does not matter, so the solver does not pursue hard steps far.
+"""
 
 HANGING_TILTS = (30.0, 10.0, 3.0, 1.0)
-"""Factors of the bias, in turn: with a large bias the cloth has one shape, which is followed as the
-bias falls.
+"""Factors of the bias, in turn.
+
+With a large bias the cloth has one shape, and it follows this shape as the bias falls.
 """
 
 SETTLING_STEPS = 25
-"""Steps with each factor."""
+"""Number of steps with each factor."""
 
 SETTLING_DAMPING = 5.0
-"""Damping of these steps [1/s]."""
+"""Damping until the cloth is at rest [1/s]."""
 
 FIRST_STEP = 0.002
-"""First step [s]: the flat cloth buckles when it is released."""
+"""Length of the first step [s]. It is short because the flat cloth buckles at its release."""
 
 GROWTH = 1.3
 """Growth of the next steps, up to 50 ms."""
 
 LONGEST = 1.0
-"""Steps of the settled cloth grow to this length [s]."""
+"""Length to which steps of the settled cloth grow [s]."""
 
 AT_REST = 1e-8
 """Cloth is at rest when no vertex moves further than this in a step [m]."""
@@ -142,24 +150,25 @@ class Hung:
     """The shape of a cloth at rest under its holders."""
 
     positions: Floats
-    """(V, 3) [m]"""
+    """Positions of the vertices: (V, 3) [m]."""
 
     held: NDArray[np.intp]
     """Vertices under the holders."""
 
     side: int
-    """Side that the tilt is to, 1 or -1."""
+    """Side of the tilt, 1 or -1."""
 
     bias: float
     """Size of the tilt."""
 
     tilt: Floats
-    """(V, 3): gravity along the normal, over that along -z, which breaks the symmetry of what
-    follows.
+    """Gravity along the normal over gravity along -z: (V, 3).
+
+    It breaks the symmetry of the motion that follows.
     """
 
     reason: str
-    """Reason why it is no stable equilibrium, or empty."""
+    """Reason why the shape is no stable equilibrium, or empty."""
 
 
 def hung(
@@ -176,23 +185,24 @@ def hung(
 
     The cloth is flat at first.
 
-    A cloth that is held at two corners has many shapes at rest. This one is reached as a tilt of
-    gravity falls from 30 times a bias to the bias, which is drawn from the seed. It is settled
-    until nothing moves, and its stability is checked.
+    A cloth that hangs from two corners has many shapes at rest. The search picks one of them: it
+    tilts gravity by 30 times a bias, and then lowers the tilt to the bias, which is drawn from the
+    seed. The cloth settles until nothing moves, and its stability is checked.
 
     Args:
-        mesh: Of a single sheet.
-        fabric: Of the sheet.
-        flat: (V, 3): positions of the flat sheet [m].
-        held: (K,): vertices under the holders.
-        normal: (3,): of the flat sheet, the direction of the tilt.
-        seed: Of the bias.
+        mesh: Mesh of a single sheet.
+        fabric: Fabric of the sheet.
+        flat: Positions of the flat sheet: (V, 3) [m].
+        held: Vertices under the holders: (K,).
+        normal: Normal of the flat sheet, which is the direction of the tilt: (3,).
+        seed: Seed of the bias.
         kernel: Level of the kernels, see `Cloth`.
     """
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
     rng = np.random.default_rng(seed)
     side = 1 if rng.random() < 0.5 else -1
     bias = float(rng.uniform(1e-3, 3e-3))
+    # The tilt differs from left to right by up to 30 %, so that no mirror symmetry remains either.
     twist = float(rng.uniform(-0.3, 0.3))
     tilt = side * bias * (1.0 + twist * mesh.rest[:, 0] / np.abs(mesh.rest[:, 0]).max())
     tilts = tilt[:, None] * np.asarray(normal, float)
@@ -204,6 +214,7 @@ def hung(
         for _ in range(SETTLING_STEPS):
             cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
             dt = min(GROWTH * dt, HANGING.time_step)
+    # Rest counts only in a long step: in a short one, a slow cloth hardly moves either.
     moved = np.inf
     steps = 0
     while (dt < LONGEST or moved > AT_REST) and steps < HANGING_STEPS_MAX:
@@ -212,6 +223,7 @@ def hung(
         cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
         moved = float(np.abs(cloth.positions - before).max())
         steps = steps + 1
+    # A cloth may also be at rest on a saddle, and leave it at the first disturbance.
     softest = cloth.softest()
     reason = ""
     if not moved <= AT_REST:

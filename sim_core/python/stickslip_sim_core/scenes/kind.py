@@ -10,10 +10,10 @@ Array = NDArray[Any]
 Record = Mapping[str, Array]
 
 IMPOSSIBLE_START = "impossible_start"
-"""Code of the reason of a simulation that could not begin: nothing ran."""
+"""Code of the reason if a simulation could not begin, so that nothing ran."""
 
 OnFrame = Callable[[int, int], None]
-"""Takes (frames done, frames) after every frame."""
+"""Function that a simulation calls with (finished frames, all frames) after every frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,34 +21,37 @@ class Outcome:
     """The outcome of one simulation."""
 
     record: Record = field(default_factory=dict)
-    """Arrays to store, floating ones in single precision."""
+    """Arrays to store, with floating numbers in single precision."""
 
     labels: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers and texts to store beside them."""
+    """Numbers and texts to store beside the arrays."""
 
     reason: str = ""
-    """Reason for a rejection; empty if the simulation is valid."""
+    """Reason for a rejection, or empty if the simulation is valid."""
 
     code: str = "solver_diverged"
-    """Code of that reason: for cloth, the name of the check that failed."""
+    """Code of the reason. For cloth it is the name of the failed check, for example."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of simulations: `KIND` of the module of its name in `scenes`."""
+    """A kind of simulation: `KIND` in the module of its name in `scenes`."""
 
     simulate: Callable[[Sequence[Mapping[str, Any]], OnFrame | None], list[Outcome]]
-    """From the physics of simulations, by name, to their outcomes in the same order.
+    """Function from the physics of simulations, by name, to their outcomes in the same order.
 
     Raises:
         ValueError: A value breaks its rule.
     """
 
     solver: str
-    """The module of the solver that a certificate is of."""
+    """Module of the solver that a certificate vouches for."""
 
     batch: int = 1
-    """Simulations a call at most, which are stored together."""
+    """Most simulations in a call. Their samples are stored together."""
 
     kernel: Callable[[], str] = str
-    """Return the level of the kernels that run here, if levels differ in the last digits."""
+    """Function that returns the level of the kernels that run here.
+
+    It returns an empty text if the kind has no levels that differ in the last digits.
+    """

@@ -18,10 +18,11 @@ _settings = itemgetter("poisson", "elements", "points")
 def simulate(
     simulations: Sequence[Mapping[str, Any]], _on_frame: OnFrame | None = None
 ) -> list[Outcome]:
-    """Solve rods (gamma, phi0, phi1, poisson, elements, points), all of the same settings together.
+    """Solve rods (gamma, phi0, phi1, poisson, elements, points), grouped by their settings.
 
-    The numbers of a rod do not depend on the others.
+    The numbers of a rod do not depend on the other rods.
     """
+    # The solver takes many rods in one call, but only with the same settings.
     alike: dict[tuple[Any, ...], list[int]] = {}
     for i, rod in enumerate(simulations):
         alike.setdefault(_settings(rod), []).append(i)
@@ -32,16 +33,18 @@ def simulate(
 
 
 def _solved(rods: Sequence[Mapping[str, Any]]) -> Iterable[Outcome]:
-    """Yield the outcomes of rods of the same settings."""
+    """Yield the outcomes of rods with the same settings."""
     settings = dict(zip(("poisson", "elements", "points"), _settings(rods[0]), strict=True))
     parameters = np.array([[rod[name] for rod in rods] for name in ("gamma", "phi0", "phi1")])
     solution = solve_rods(*parameters, **settings)
     good = solution.converged & solution.stable
+    # A rod without an equilibrium has NaN for a centreline, and no labels.
     if good.any():
         other = other_minima(*parameters, **settings, solution=solution)
         distance, far = (
             label(solution.centerline[good]) for label in (self_contact_distance, reach)
         )
+    # From the number of a rod to its row among the good ones.
     row = np.cumsum(good) - 1
     for i in range(len(rods)):
         if not good[i]:
@@ -61,5 +64,6 @@ def _solved(rods: Sequence[Mapping[str, Any]]) -> Iterable[Outcome]:
 KIND = Kind(
     simulate,
     solver="stickslip_sim_core.rods",
-    batch=512,  # below a second of work: a lost batch costs little
+    # Less than a second of work, so that a lost batch costs little.
+    batch=512,
 )
