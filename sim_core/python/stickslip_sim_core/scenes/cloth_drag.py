@@ -172,7 +172,7 @@ def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence
     floor = [plane(mu)]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
-        # The tilt fades out, since a jump of gravity would shake the cloth.
+        # The tilt fades out within a second, so that gravity does not jump.
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
         return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), floor
 

@@ -1,4 +1,4 @@
-"""Scenes of data: sheets, holders, bodies and their friction, as a document says."""
+"""Scenes from a document of sheets, holders, bodies and their friction."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,31 +19,32 @@ from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
 
 UPRIGHT = 1.0
-"""Time in which gravity is set upright over a hung sheet once its bias ends [s]."""
+"""Time in which gravity turns upright over a hung sheet after its bias ends [s]."""
 
 
 def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
     """Return the scene of a document.
 
-    The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays for files.
+    The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in place of files.
 
-    Its run records, besides what all scenes record, sheets, holders and bodies being in the order
-    of their names:
+    A run records these arrays besides the arrays of all scenes. Sheets, holders and bodies are in
+    the order of their names.
 
     - `SHEET.positions`, `SHEET.rest`, `SHEET.triangles`, and `SHEET.contact` (frame, vertex): 0
       open, 1 stick, 2 slip
-    - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, of each body and then of each
+    - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, by each body and then by each
       sheet
     - `holder_force` (frame, holder, 3) [N], `holder_pose` (frame, holder, 3, 4), `grasped` (frame,
-      holder), and `holder_box` (holder, 3) [m], where there are holders
-    - `body_pose` (frame, body, 3, 4), where there are bodies: x -> A x + b from its own axes
-    - `BODY.rest`, `BODY.triangles`, and `BODY.vertices` (frame, vertex, 3) [m] if it deforms, of
-      bodies of triangles
+      holder), and `holder_box` (holder, 3) [m], if the scene has holders
+    - `body_pose` (frame, body, 3, 4), if the scene has bodies: x -> A x + b from the body's own
+      axes
+    - `BODY.rest` and `BODY.triangles` of a body of triangles, and `BODY.vertices` (frame, vertex,
+      3) [m] if it deforms
 
-    `seed` is of what breaks its symmetry; on `kernel`, see `Cloth`.
+    `seed` draws the biases that break the symmetry of the scene. For `kernel`, see `Cloth`.
 
     Raises:
-        ValueError: A value breaks its rule; the message begins with its place.
+        ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     names = sorted(document["sheets"])
     mu = _friction(document)
@@ -52,6 +53,8 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         part = sheet(
             name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel
         )
+        # The solver counts every connected piece as a sheet. Two pieces under one name would shift
+        # the numbers of all later sheets.
         if sheet_count(part.mesh.rest, part.mesh.triangles) != 1:
             raise ValueError(f"sheets.{name}.mesh: must hang together in one piece")
         sheets.append(part)
@@ -69,6 +72,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         poses += part.tracks.values()
         boxes += part.boxes.values()
     gravity = _Gravity(document, sheets, seed)
+    # Surfaces move as `Surface` objects, so `motion` and `poses` have rigid bodies only.
     rigid = [body.rigid for body in things if body.rigid is not None]
     placed = [body.pose for body in things if body.rigid is not None]
 
@@ -78,6 +82,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     length = document["duration"]
     end = document["end"]
     calm = document["calm"]
+    # Cloth that is still before this time may yet be moved, so the scene must not end there.
     last = max(
         [0.0, gravity.last, *(part.last for part in sheets), *(body.last for body in things)]
     )
@@ -106,6 +111,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         self_contact=_touch(document, sheets, mu),
         surfaces=[body.surface for body in things if body.surface is not None],
         damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
+        # The factor keeps the last frame if rounding puts it just after the end of the scene.
         frames=int(
             (length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)
         )
@@ -123,7 +129,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
 
 
 def _hanging_fault(sheets: Sequence[Sheet]) -> str:
-    """Return why a hung sheet does not start in a stable equilibrium; empty if all do."""
+    """Return why a hung sheet has no stable start, or an empty text if all have one."""
     for part in sheets:
         if part.hung is not None and part.hung.reason:
             return part.hung.reason
@@ -136,7 +142,7 @@ def _friction(document: Document) -> dict[tuple[str, str], float]:
     default: float = document["default_friction"] or 0.0
     mu = {}
     for names in product(document["sheets"], (*document["sheets"], *document["bodies"])):
-        # A pair has no order; that of a sheet with itself is a set of a single name.
+        # A pair has no order. A sheet with itself is a set of a single name.
         mu[names] = float(pairs.get(frozenset(names), default))
     return mu
 
@@ -144,8 +150,9 @@ def _friction(document: Document) -> dict[tuple[str, str], float]:
 def _touch(
     document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
 ) -> SelfContact | None:
-    """Return the contact of cloth with cloth."""
+    """Return the contact of cloth with cloth, or None if the only sheet has no self-contact."""
     names = [part.name for part in sheets]
+    # `SelfContact` is on or off for all sheets together.
     without = [name for name in names if not document["sheets"][name]["self_contact"]]
     if without and len(sheets) > 1:
         raise ValueError(
@@ -161,7 +168,7 @@ def _touch(
 
 
 class _Gravity:
-    """Gravity with what leans it, over time: the bias of the scene, and those of hung sheets."""
+    """Gravity over time, tilted by the bias of the scene and the biases of hung sheets."""
 
     def __init__(self, document: Document, sheets: Sequence[Sheet], seed: int) -> None:
         self._down = np.tile(
@@ -171,6 +178,7 @@ class _Gravity:
         self._tilted = self._down
         self._until = -np.inf
         self.bias = np.zeros(2)
+        # Perfect symmetry would leave the choice of a side to rounding.
         if document["bias"] is not None:
             size = document["bias"]["size"]
             self._until = document["bias"]["until"]
@@ -186,11 +194,12 @@ class _Gravity:
                 self._hung.append((slice(begin, end), part.hung.tilt, until))
             begin = end
         self.last = max([0.0, self._until, *(until + UPRIGHT for _, _, until in self._hung)])
-        """When it stops to change [s]."""
+        """Time of the last change of gravity [s]."""
 
     def at(self, time: float) -> Floats:
         """Return the acceleration of each vertex at a time [s]: (V, 3) [m/s^2]."""
         acceleration = self._tilted if time < self._until else self._down
+        # The loop below adds to the array, which must not change for later times.
         if self._hung:
             acceleration = acceleration.copy()
         for vertices, tilt, until in self._hung:
@@ -210,7 +219,10 @@ class _Forces:
         self._sheets, self._things, self._holders = len(sheets), len(things), holders
         rigid = [number for number, one in enumerate(things) if one.rigid is not None]
         surfaces = [number for number, one in enumerate(things) if one.surface is not None]
-        self._others = np.array([*rigid, *surfaces], dtype=np.intp)  # in the solver's order
+        # The solver counts surfaces after rigid bodies, and a scene has both in order of names.
+        self._others = np.array([*rigid, *surfaces], dtype=np.intp)
+        # The owner of a vertex is a number along the axis of `force`: bodies first, then sheets.
+        # The solver's vertices are those of all sheets, and then those of all surfaces.
         sizes = [len(one.surface.at(0.0)) for one in things if one.surface is not None]
         owners = [
             self._things + np.repeat(np.arange(self._sheets), [len(one.start) for one in sheets])
@@ -223,6 +235,8 @@ class _Forces:
 
         Nothing touches before the first step.
         """
+        # `force` is square so that one loop adds both forces of a pair. The rows of bodies are cut
+        # off at the end.
         vertices = len(cloth.masses)
         force = np.zeros((self._things + self._sheets,) * 2 + (3,))
         state = np.zeros(vertices, np.uint8)
@@ -231,31 +245,38 @@ class _Forces:
             reactions = cloth.reactions
             contacts = cloth.contacts
             pairs = cloth.pair_forces
+            # The reaction of a held vertex is the force of its holder, and no contact.
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)
+            # Several vertices add to the same entry, which `force[...] +=` would count once.
             np.add.at(
                 force,
                 (self._owner[touching], self._others[contacts[touching]]),
                 reactions[touching],
             )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
+            # Vertices of skeletons come after all others. Their owner is the body of the pair, and
+            # -1 stands for no owner.
             owner = np.append(self._owner, -1)[np.minimum(pairs.vertices, len(self._owner))]
             of_body = np.append(self._others, -1)[pairs.body]
-            owner = np.where(
-                owner < 0, of_body[:, None], owner
-            )  # skeletons of bodies have vertices of their own
+            owner = np.where(owner < 0, of_body[:, None], owner)
+            # The four nodes of a pair belong to its two sides: the first node is on one side, and
+            # the last node on the other.
             first = owner[:, 0]
             last = owner[:, 3]
             for corner in range(4):
                 own = owner[:, corner]
                 pull = pairs.weights[:, corner, None] * pairs.forces
                 np.add.at(force, (own, np.where(own == first, last, first)), pull)
+                # Only vertices of cloth have a state, and a node without a weight does not touch.
+                # Slip (2) in one pair outweighs sticking (1) in another.
                 here = (pairs.vertices[:, corner] < vertices) & (pairs.weights[:, corner] != 0.0)
                 np.maximum.at(
                     state,
                     pairs.vertices[here, corner],
                     np.where(pairs.sliding[here], 2, 1).astype(np.uint8),
                 )
+            # A holder that has let go exerts no force.
             for number, holder in enumerate(self._holders):
                 if held[holder.vertices].all():
                     pulls[number] = reactions[holder.vertices].sum(axis=0)
@@ -300,8 +321,8 @@ def _labels(
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
     """Return the outcome of a simulation.
 
-    Values that do not fit together are a reason to reject it before it starts. An error later on is
-    a bug, and is raised.
+    Values that do not fit together are a reason to reject the simulation before it starts. A later
+    error is a bug, and the caller gets it.
     """
     try:
         made = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])

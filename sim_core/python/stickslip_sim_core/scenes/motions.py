@@ -1,7 +1,4 @@
-"""Prescribed motions: keyframes, and the frames of an animated mesh.
-
-All are smooth in time, and begin and end at rest.
-"""
+"""Prescribed motions: keyframes, spins, and the frames of an animated mesh."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core.arrays import Floats
 
 RIGHT_ANGLE = 1e-12
-"""Entries of a matrix that are all as near to -1, 0 and 1 are meant to be right angles: radians
-have no exact ones.
+"""Tolerance within which the entries of a rotation matrix are rounded to -1, 0 and 1.
+
+A user who turns a body by a right angle cannot write it exactly in radians.
 """
 
 
@@ -37,12 +35,12 @@ def _times(times: ArrayLike) -> Floats:
 def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLike], Floats]:
     """Return the cubic Hermite interpolant of values (K, ...).
 
-    Constant before the first and after the last.
+    It is constant before the first and after the last time.
     """
-    from scipy.interpolate import (
-        CubicHermiteSpline,
-    )  # here, so that importing the package stays quick
+    # Imported here, so that importing the package stays quick.
+    from scipy.interpolate import CubicHermiteSpline
 
+    # A spline needs two times. The copy keeps callers from writing into `values`.
     if len(times) == 1:
         return lambda time: np.array(np.broadcast_to(values[0], np.shape(time) + values.shape[1:]))
     path = CubicHermiteSpline(times, values, slopes)
@@ -51,34 +49,36 @@ def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLi
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
-    """A rigid motion through keyframes. Nothing moves before the first and after the last one.
+    """A rigid motion through keyframes.
 
-    It is smooth by default, without overshoot: monotone cubics [Fritsch & Carlson 1980]. A linear
-    motion has an even speed between keyframes; from each on, its speed changes evenly for `ramp`
-    seconds, which ends later by as much.
+    Nothing moves before the first and after the last keyframe. By default the motion follows
+    monotone cubics, which are smooth and do not overshoot [Fritsch & Carlson 1980]. A linear motion
+    has an even speed between keyframes. From each keyframe on, its speed changes evenly for `ramp`
+    seconds, so the motion ends later by `ramp`.
 
     Raises:
         ValueError: An argument breaks its rule.
     """
 
     times: ArrayLike
-    """(K,) [s], ascending, from 0 on."""
+    """Times of the keyframes, ascending, from 0 on: (K,) [s]."""
 
     moves: ArrayLike
-    """(K, 3): displacements since the start [m]."""
+    """Displacements since the start: (K, 3) [m]."""
 
     turns: ArrayLike
-    """(K, 3): rotations since the start, as rotation vectors [rad], whose components are
-    interpolated.
+    """Rotations since the start, as rotation vectors: (K, 3) [rad].
+
+    Their components are interpolated.
     """
 
     about: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,): the point at the start that rotations are about [m]."""
+    """Centre of the rotations, as a point at the start: (3,) [m]."""
 
     linear: bool = False
 
     ramp: float = 0.0
-    """Of a linear motion [s], 0 or more."""
+    """Time of a change of speed in a linear motion [s], 0 or more."""
 
     _path: Callable[[ArrayLike], Floats] = field(init=False, repr=False)
 
@@ -91,7 +91,9 @@ class Keyframes:
                 raise ValueError(
                     f"{name}: must be finite, of shape {expected}, got {value.tolist()}"
                 )
+            # A frozen dataclass allows no plain assignment.
             object.__setattr__(self, name, value)
+        # One path interpolates all six components.
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
         times = np.asarray(self.times)
         path = (
@@ -103,7 +105,7 @@ class Keyframes:
 
     @property
     def last(self) -> float:
-        """When the motion ends [s]; 0 if nothing moves."""
+        """Time at which the motion ends [s], or 0 if nothing moves."""
         values = np.concatenate([np.asarray(self.moves), np.asarray(self.turns)], axis=1)
         return 0.0 if (values == values[0]).all() else float(np.asarray(self.times)[-1]) + self.ramp
 
@@ -111,6 +113,7 @@ class Keyframes:
         """Return the motion x -> R x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
         found = self._path(time)
         R = rotation(found[..., 3:])
+        # R (x - about) + about + move, as a matrix and a shift.
         about = np.asarray(self.about)
         return np.concatenate([R, (about + found[..., :3] - R @ about)[..., None]], axis=-1)
 
@@ -120,28 +123,29 @@ class Spin:
     """A rotation that begins at a time, gains its speed evenly, and keeps it."""
 
     axis: ArrayLike
-    """(3,), of any length above 0."""
+    """Direction of the axis, of any length above 0: (3,)."""
 
     speed: float
-    """[rad/s]"""
+    """Speed of the rotation [rad/s]."""
 
     begin: float
-    """[s]"""
+    """Time at which the rotation begins [s]."""
 
     ramp: float
-    """Time in which it gains its speed [s]."""
+    """Time in which the rotation gains its speed [s]."""
 
     about: ArrayLike
-    """(3,): a point of the axis [m]."""
+    """A point of the axis: (3,) [m]."""
 
     @property
     def last(self) -> float:
-        """When the motion ends [s]: never, unless nothing moves."""
+        """Time at which the motion ends [s]: inf, or 0 if nothing moves."""
         return float("inf") if self.speed else 0.0
 
     def pose(self, time: ArrayLike) -> Floats:
         """Return the motion x -> A x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
         t = np.maximum(np.asarray(time, float) - self.begin, 0.0)
+        # `np.where` computes both cases, so a ramp of 0 must not divide by it.
         angle = self.speed * np.where(
             t < self.ramp, 0.5 * t * t / (self.ramp or 1.0), t - 0.5 * self.ramp
         )
@@ -155,10 +159,11 @@ RigidMotion = Keyframes | Spin
 
 
 def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike], Floats]:
-    """Return v0 + sum over k of (s_k - s_(k-1)) r(t - t_k), s_k being the slope after t_k.
+    """Return v0 + sum over k of (s_k - s_(k-1)) r(t - t_k), with the slope s_k after t_k.
 
-    r(u) = u^2/(2 ramp) up to the ramp, and u - ramp/2 from there on; 0 before 0.
+    r(u) is 0 before 0, u^2/(2 ramp) up to the ramp, and u - ramp/2 after it.
     """
+    # The motion is at rest before the first keyframe and after the last.
     slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
     still = np.zeros((1, values.shape[1]))
     changes = np.diff(np.concatenate([still, slopes, still]), axis=0)
@@ -174,10 +179,11 @@ def _evenly(times: Floats, values: Floats, ramp: float) -> Callable[[ArrayLike],
 def _monotone(times: Floats, values: Floats) -> Floats:
     """Return the slopes of monotone cubics (K, n) at keyframes.
 
-    They are 0 at both ends and where a value turns back.
+    A slope is 0 at both ends, and at a keyframe from which a value turns back.
     """
     from scipy.interpolate import PchipInterpolator
 
+    # scipy's own slopes at the ends are not 0, and the motion would start with a jump of speed.
     slopes = np.zeros_like(values)
     if len(times) > 2:
         slopes[1:-1] = PchipInterpolator(times, values).derivative()(times[1:-1])
@@ -191,8 +197,11 @@ def rotation(turn: ArrayLike) -> Floats:
     """
     from scipy.spatial.transform import Rotation
 
+    # scipy takes a single list of rotation vectors.
     vectors = np.asarray(turn, float)
     found = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    # A matrix with one oblique entry stays as it is: rounding a part of it would leave no rotation.
+    # Adding 0.0 turns -0.0 into 0.0.
     whole = np.rint(found)
     oblique = (np.abs(found - whole) > RIGHT_ANGLE).any(axis=(-2, -1), keepdims=True)
     return np.where(oblique, found, whole + 0.0)
@@ -202,28 +211,27 @@ def rotation(turn: ArrayLike) -> Floats:
 class MovingMesh:
     """Triangles that move smoothly through given frames.
 
-    Slopes are those of parabolas through three frames.
-
-    Before the first and after the last frame nothing moves.
+    The slope at a frame is the slope of the parabola through this frame and its two neighbours.
+    Nothing moves before the first and after the last frame.
 
     Raises:
         ValueError: An argument breaks its rule.
     """
 
     triangles: NDArray[np.int32]
-    """(T, 3)"""
+    """Vertices of each triangle: (T, 3)."""
 
     times: ArrayLike
-    """(F,) [s], ascending, from 0 on."""
+    """Times of the frames, ascending, from 0 on: (F,) [s]."""
 
     frames: ArrayLike
-    """(F, N, 3): vertices [m]; of a skin, (F, B, 3, 4): motions of bones, x -> A x + b."""
+    """Vertices (F, N, 3) [m], or for a skin the motions x -> A x + b of bones (F, B, 3, 4)."""
 
     rest: ArrayLike | None = None
-    """Of a skin (N, 3): vertices where bones do not move [m]."""
+    """Vertices of a skin before any bone moves: (N, 3) [m]."""
 
     weights: ArrayLike | None = None
-    """Of a skin (N, B): how much each vertex follows each bone."""
+    """Weights of a skin, with which each vertex follows each bone: (N, B)."""
 
     strength: float = 1.0
     """Factor of all displacements since the first frame."""
@@ -266,6 +274,7 @@ class MovingMesh:
         if len(path) != len(times):
             raise ValueError(f"frames: must be {len(times)}, one for each instant, got {len(path)}")
         object.__setattr__(self, "triangles", np.asarray(self.triangles, dtype=np.int32))
+        # The slopes at both ends stay 0, so that the mesh begins and ends at rest.
         slopes = np.zeros_like(path)
         h = np.diff(times).reshape(-1, *[1] * (path.ndim - 1))
         rate = np.diff(path, axis=0) / h
@@ -274,25 +283,27 @@ class MovingMesh:
 
     @property
     def last(self) -> float:
-        """When the motion ends [s]; 0 if nothing moves."""
+        """Time at which the motion ends [s], or 0 with a single frame."""
         return float(np.asarray(self.times)[-1]) if len(np.asarray(self.times)) > 1 else 0.0
 
     def at(self, time: float) -> Floats:
         """Return the vertices at a time [s]: (N, 3) [m]."""
         now = self._placed(time)
+        # The sum below would change the given vertices by rounding.
         if self.strength == 1.0:
             return now
         start = self._placed(0.0)
         return np.asarray(start + self.strength * (now - start))
 
     def _placed(self, time: float) -> Floats:
-        """Return the vertices of the frames.
+        """Return the vertices at a time [s], without the factor `strength`.
 
-        A skin has the sum over bones of w (A x + b) [linear blend skinning].
+        A vertex of a skin is the sum over bones of w (A x + b) [linear blend skinning].
         """
         path = self._path(time)
         if self.rest is None:
             return path
+        # Bone by bone: all products at once would need memory for every vertex and bone.
         x, y, z = np.asarray(self.rest, float).T[..., None]
         found = np.zeros((len(x), 3))
         for weight, bone in zip(np.asarray(self.weights, float).T, path, strict=True):

@@ -1,7 +1,6 @@
-"""Parts of a scene, from its document: meshes and starts of sheets, motions, holders and bodies.
+"""Parts of a scene, from its document: sheets and their starts, motions, holders and bodies.
 
-The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in the place of each
-file.
+The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in place of files.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,40 +22,46 @@ Document = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """One piece of cloth, where it starts."""
+    """One piece of cloth at its start."""
 
     name: str
     mesh: meshes.Mesh
     fabric: Fabric
     thickness: float
     start: Floats
-    """(V, 3) [m]"""
+    """Positions of the vertices at the start: (V, 3) [m]."""
 
     hung: Hung | None
-    """Its start, if it hangs."""
+    """Hung shape, if the sheet hangs at the start."""
 
     holders: Mapping[str, Holder]
-    """By name; their vertices are those of the sheet."""
+    """Holders by name. They count the vertices of this sheet alone."""
 
     tracks: Mapping[str, Callable[[ArrayLike], Floats]]
-    """By holder: its pose (3, 4), from its own axes, that are warp, weft and normal of the flat
-    sheet, to the world.
+    """Poses of the holders by name, from the holder's axes to the world: (3, 4).
+
+    The axes of a holder are the warp, the weft and the normal of the flat sheet.
     """
 
     boxes: Mapping[str, Floats]
-    """By holder: sides of the box about what it holds, in its own axes (3,) [m]; NaN for a rim."""
+    """Sides of the box around the held vertices, by holder and in its axes: (3,) [m].
+
+    They are NaN for the holder of a rim.
+    """
 
     last: float
-    """When the last motion of a holder ends, and the last of them lets go or takes hold [s]."""
+    """Time after which no holder moves, takes hold or lets go any more [s]."""
 
 
 def sheet(
     name: str, given: Document, materials: Document, *, seed: int, kernel: str | None
 ) -> Sheet:
-    """Return a sheet of a document with custom fabrics; `seed` is of the tilt of hung cloth.
+    """Return a sheet of a document. `materials` are its custom fabrics.
+
+    `seed` draws the tilt of hung cloth.
 
     Raises:
-        ValueError: A value breaks its rule; the message begins with its place.
+        ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     place = f"sheets.{name}"
     mesh, positions = _mesh(given["mesh"])
@@ -68,10 +73,12 @@ def sheet(
     turn = rotation(given["turn"])
     origin = np.array(given["origin"], float)
     begin = given["start"]
+    # The flat sheet in its own axes, before the document turns and moves it.
     local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
     if begin["type"] == "stretched":
         local[:, :2] = (1.0 + np.array(begin["strain"])) * mesh.rest
     elif begin["type"] == "file":
+        # Positions come from the file of the start, or else from the file of the mesh.
         if begin["file"] is not None:
             positions = begin["file"]["positions"]
         if positions is None or positions.shape != local.shape:
@@ -85,11 +92,13 @@ def sheet(
     boxes: dict[str, Floats] = {}
     last = 0.0
     taken = np.zeros(len(start), dtype=bool)
+    # In the order of names, so that results do not depend on the order in the document.
     for key, holder in sorted(given["holders"].items()):
         held = _held(mesh, holder, f"{place}.holders.{key}")
         if (held & taken).any():
             raise ValueError(f"{place}.holders.{key}: must not hold what another holder holds")
         taken |= held
+        # A holder turns about the middle of its vertices, unless the document names a point.
         middle = start[held].mean(axis=0)
         motion = rigid_motion(holder["motion"], middle)
         grasp = ALWAYS if holder["grasp"] is None else (holder["grasp"][0], holder["grasp"][1])
@@ -99,6 +108,7 @@ def sheet(
             np.full(3, np.nan) if holder["rim"] else np.ptp((start[held] - middle) @ turn, axis=0)
         )
         last = max([last, motion.last, *(instant for instant in grasp if np.isfinite(instant))])
+    # Holders take the hung cloth at its flat positions: `hung` does not move held vertices.
     hanging = None
     if begin["type"] == "hung":
         hanging = hung(
@@ -109,7 +119,7 @@ def sheet(
 
 
 def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
-    """Return the mesh of a sheet and, of a file, its positions."""
+    """Return the mesh of a sheet, and its positions if a file has them."""
     if given["type"] == "grid":
         return meshes.grid(*given["size"], *given["cells"]), None
     if given["type"] == "unstructured":
@@ -121,7 +131,8 @@ def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
 
 
 def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
-    """Return which vertices a holder holds: (V,)."""
+    """Return for each vertex whether a holder holds it: (V,)."""
+    # The slack catches vertices on an edge in spite of rounding.
     rest = mesh.rest
     low = rest.min(axis=0)
     high = rest.max(axis=0)
@@ -155,8 +166,9 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
 def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
     """Return a motion of a document.
 
-    Turns are about `middle` (3,) [m] where it does not say about what.
+    Turns are about `middle` (3,) [m] if the document names no point.
     """
+    # A part without a motion stays in place.
     if given is None:
         return Keyframes([0.0], np.zeros((1, 3)), np.zeros((1, 3)))
     about = middle if given["about"] is None else np.array(given["about"], float)
@@ -175,9 +187,9 @@ def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
 
 
 def _carried(motion: RigidMotion, turn: Floats, origin: Floats) -> Callable[[ArrayLike], Floats]:
-    """Return the pose ([T,] 3, 4) at times [s] of a part that moves.
+    """Return a function of times [s] for the pose ([T,] 3, 4) of a part that moves.
 
-    It starts with axes `turn` (3, 3) at `origin` (3,) [m].
+    The part starts with axes `turn` (3, 3) at `origin` (3,) [m].
     """
 
     def at(time: ArrayLike) -> Floats:
@@ -193,26 +205,26 @@ class Thing:
 
     name: str
     pose: Callable[[ArrayLike], Floats]
-    """From its own axes to the world, at a time or times [s]: ([T,] 3, 4)."""
+    """Function of a time or times [s] for the pose ([T,] 3, 4), from the body to the world."""
 
     last: float
-    """When its motion ends [s]."""
+    """Time at which its motion ends [s]."""
 
     rigid: Callable[[float], Body] | None = None
     surface: Surface | None = None
 
     rest: Floats | None = None
-    """Of a surface: vertices at the first frame of its file (N, 3) [m]."""
+    """Vertices of a surface at the first frame of its file: (N, 3) [m]."""
 
     deforms: bool = False
-    """Whether a surface moves other than by its pose."""
+    """Whether the vertices of a surface move relative to its axes."""
 
 
 def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
-    """Return a body of a document; `mu` is its coefficient of friction with each sheet.
+    """Return a body of a document. `mu` has its coefficients of friction with each sheet.
 
     Raises:
-        ValueError: A value breaks its rule; the message begins with its place.
+        ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     if given["type"] == "plane":
         still = plane(mu, normal=given["normal"], origin=given["origin"])
@@ -228,6 +240,7 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     motion = rigid_motion(given["motion"], origin)
     pose = _carried(motion, rotation(given["turn"]), origin)
 
+    # Only the pose changes with time, so each shape takes it when the solver needs the body.
     made: Callable[..., Body] = {
         "sphere": lambda **placed: sphere(mu, given["radius"], **placed),
         "cylinder": lambda **placed: cylinder(mu, given["radius"], **placed),
@@ -243,8 +256,10 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
 
 
 def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
+    # Errors of the mesh and of the surface do not have the name of the body, so add it.
     try:
         file = given["file"]
+        # A file has the vertices of every frame, or the bones and weights of a skin.
         skin = {name: file[name] for name in ("rest", "weights") if name in file}
         frames = file["bones" if skin else "positions"]
         mesh = MovingMesh(
@@ -252,6 +267,7 @@ def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
         )
         motion = rigid_motion(given["motion"], mesh.at(0.0).mean(axis=0))
 
+        # The motion of the document adds to the motion of the file.
         def at(time: float) -> Floats:
             if given["motion"] is None:
                 return mesh.at(time)

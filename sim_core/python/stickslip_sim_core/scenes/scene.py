@@ -1,4 +1,4 @@
-"""Scenes of cloth: their parts, the driver that runs all of them, and the run that it returns."""
+"""Scenes of cloth: their parts, the driver that runs them, and the run that it returns."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,48 +22,53 @@ REST_SPEED = 1e-3
 """Largest mean speed of a vertex between two frames at which cloth is at rest [m/s]."""
 
 REST_TIME = 0.25
-"""How long it is [s], so that a swing that turns back is not at rest."""
+"""Time that cloth must stay this slow [s]. A swing is slow as well when it turns back."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClothRun:
-    """The run of a scene. World axes: z up."""
+    """The run of a scene. The z axis of the world points up."""
 
     positions: Floats
-    """(frames, V, 3) [m]"""
+    """Positions of the vertices: (frames, V, 3) [m]."""
 
     rest: Floats
-    """(V, 2) [m]"""
+    """Vertices in the rest plane: (V, 2) [m]."""
 
     triangles: NDArray[np.int32]
-    """(T, 3)"""
+    """Vertices of each triangle: (T, 3)."""
 
     times: Floats
-    """(frames,) [s]"""
+    """Times of the frames: (frames,) [s]."""
 
     record: Record
-    """Other arrays by name. All scenes have `contact_force`, of bodies and other cloth on it [N].
+    """Other arrays by name.
+
+    All scenes have `contact_force`, the force of bodies and other cloth on the cloth [N].
     """
 
     labels: Mapping[str, Any]
-    """Numbers by name: those of the solver, the checks, and of the scene, such as the bias that
-    breaks its symmetry.
+    """Numbers of the solver, the checks and the scene, by name.
+
+    The bias that breaks the symmetry of a scene is an example.
     """
 
     self_intersections: NDArray[np.int32]
-    """(frames,): pairs of triangles that cross."""
+    """Number of pairs of triangles that cross: (frames,)."""
 
     least_distance: float
-    """Least distance of vertices and edges in contact, over the ends of all steps [m]; inf without
-    contact.
+    """Least distance of vertices and edges in contact, over the ends of all steps [m].
+
+    It is inf without contact.
     """
 
     rest_time: float
-    """When all came to rest, if the scene ends then [s]; NaN if it did not."""
+    """Time at which everything came to rest and ended the scene [s], or NaN."""
 
     code: str
-    """Code of the reason why the run is not valid: the name of the first check that failed; or
-    empty.
+    """Code of the reason why the run is not valid, or empty.
+
+    It is the name of the first check that failed.
     """
 
     reason: str
@@ -83,52 +88,55 @@ class Begun(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A scene of cloth: its start, its motion, and what its run reports."""
+    """A scene of cloth: its start, its motion, and the report of its run."""
 
     mesh: Mesh
-    """Of all sheets."""
+    """Mesh of all sheets."""
 
     fabrics: Sequence[Fabric]
-    """One, or one for each sheet."""
+    """One fabric, or one for each sheet."""
 
     preset: SolverSettings
 
     start: Floats
-    """(V, 3) [m]: positions of the vertices, at rest."""
+    """Positions of the vertices at the start, at rest: (V, 3) [m]."""
 
     motion: Callable[[float], tuple[Floats, Sequence[Body]]]
-    """From a time [s] to gravity (V, 3) [m/s^2] and bodies."""
+    """Function from a time [s] to gravity (V, 3) [m/s^2] and bodies."""
 
     poses: Callable[[Floats], Floats] | None = None
-    """From times (T,) [s] to the poses of bodies (T, B, 3, 4); holders take times, too. None:
-    `motion` is asked.
+    """Function from times (T,) [s] to the poses of bodies (T, B, 3, 4).
+
+    With it, holders must take times (T,), too. None: the solver calls `motion` for each time.
     """
 
     frames: int
     frame_rate: float
-    """[1/s]; the first frame is at 0 s."""
+    """Frames in a second [1/s]. The first frame is at 0 s."""
 
     holders: Sequence[Holder] = ()
-    """What moves vertices as prescribed."""
+    """Holders that move vertices along prescribed paths."""
 
     self_contact: SelfContact | None = None
     surfaces: Sequence[Surface] = ()
 
     damping: Callable[[float], float] = lambda _time: 0.0
-    """From a time [s] to a damping [1/s]."""
+    """Function from a time [s] to a damping [1/s]."""
 
     forces: Callable[[Cloth], Record] = lambda cloth: {"contact_force": cloth.contact_force()}
-    """Arrays recorded at each frame, of the step in which it lies; the first frame is before the
-    first step.
+    """Function that returns the arrays to record at each frame, for the step around the frame.
+
+    The first frame is before the first step.
     """
 
     tracks: Mapping[str, Callable[[float], ArrayLike]] = field(default_factory=dict)
-    """Poses and other functions of the time, recorded at each frame. A pose is (3, 4): x -> A x +
-    b.
+    """Poses and other functions of the time to record at each frame.
+
+    A pose is x -> A x + b: (3, 4).
     """
 
     record: Record = field(default_factory=dict)
-    """Arrays recorded once."""
+    """Arrays to record once."""
 
     labels: Callable[[ClothRun], Mapping[str, Any]] = lambda _run: {}
 
@@ -137,11 +145,12 @@ class Scene:
         "rest": run.rest,
         "triangles": run.triangles,
     }
-    """Arrays of the run to store besides its record."""
+    """Function that returns the arrays of the run to store besides its record."""
 
     still_from: float | None = None
-    """From this time on [s] the scene ends once all is at rest, and further frames repeat the last;
-    None: never.
+    """Time from which on the scene ends as soon as everything is at rest [s].
+
+    Further frames then repeat the last. None: the scene does not end early.
     """
 
     kernel: str | None = None
@@ -151,10 +160,11 @@ class Scene:
     """Reason why no run of the scene is valid, or empty."""
 
     def begin(self) -> Begun:
-        """Return the cloth where the scene starts, and its holders.
+        """Return the cloth at the start of the scene, and its holders.
 
         Raises:
-            ValueError: A sheet starts across itself, another or a surface, or in a body.
+            ValueError: A sheet crosses itself, another sheet or a surface at the start, or is
+                inside a body.
         """
         hands = Hands(self.holders, self.start)
         cloth = Cloth(
@@ -170,10 +180,10 @@ class Scene:
         return Begun(hands, cloth)
 
     def run(self, on_frame: OnFrame | None = None, begun: Begun | None = None) -> ClothRun:
-        """Simulate the scene, until it ends or a position is not finite.
+        """Simulate the scene until it ends, its budget is spent or a position is not finite.
 
-        The solver's steps do not depend on the frames, whose positions are interpolated within
-        steps. `begun` is what `begin` returned, for callers that tell its errors from others.
+        The solver's steps do not depend on the frames: positions at a frame are interpolated within
+        a step. `begun` is the result of `begin`, for callers that treat its errors separately.
 
         Raises:
             ValueError: The scene cannot begin.
@@ -187,24 +197,28 @@ class Scene:
         for frame in range(1, self.frames):
             time = frame / self.frame_rate
             self._advance(cloth, hands, time)
+            # The budget of iterations is spent, and the cloth has not reached the frame.
             if cloth.spent > 1.0:
                 break
             paths.append(cloth.positions_at(time))
             crossed.append(self._crossings(paths[-1]))
+            # A cubic continues the velocity before an impact, and may reach through the obstacle.
             if crossed[-1] and self.self_contact is not None:
                 paths[-1] = cloth.positions_at(time, straight=True)
                 crossed[-1] = self._crossings(paths[-1])
             forces.append(self.forces(cloth))
             if on_frame is not None:
                 on_frame(frame + 1, self.frames)
+            # The frame stays in the path, where the check `not_finite` counts it.
             if not np.isfinite(paths[-1]).all():
                 break
             calm = calm + 1 if self._is_still(time, paths[-2], paths[-1]) else 0
             if calm >= REST_TIME * self.frame_rate:
                 rest_time = time
                 break
+        # A scene that has come to rest repeats its last frame. Every sample of the scene then has
+        # the same number of frames.
         missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
-        # A scene that has come to rest repeats its last frame.
         for frames in (paths, forces, crossed):
             frames += missing * frames[-1:]  # type: ignore[operator]
         path = np.stack(paths)
@@ -214,7 +228,9 @@ class Scene:
             record[name] = np.stack([of_frame[name] for of_frame in forces])
         for name, at in self.tracks.items():
             record[name] = np.stack([np.asarray(at(float(time))) for time in times])
+        # Without self-contact cloth may pass through itself, so crossings are no fault.
         worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
+        # A start that is no equilibrium spoils the run even if all checks pass.
         code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
         run = ClothRun(
             positions=path,
@@ -235,10 +251,14 @@ class Scene:
             code=code,
             reason=reason,
         )
+        # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
 
     def _crossings(self, positions: Floats) -> int:
-        """Return how many pairs of triangles cross; 0 if positions (V, 3) [m] are not finite."""
+        """Return the number of pairs of triangles that cross, or 0 without finite positions.
+
+        `positions` are (V, 3) [m].
+        """
         return (
             self_intersections(positions, self.mesh.triangles)
             if np.isfinite(positions).all()
@@ -246,7 +266,7 @@ class Scene:
         )
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
-        """Return whether nothing moved between two frames, (V, 3) [m], and nothing will move."""
+        """Return whether nothing moved between two frames (V, 3) [m], and nothing will move."""
         if self.still_from is None or time <= self.still_from:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
@@ -256,6 +276,7 @@ class Scene:
         poses = self.poses
         path = None if poses is None else lambda times: (hands.at(times), poses(times))
         while cloth.time < end and cloth.spent <= 1.0:
+            # A step ends exactly at each event, so equal times are a safe test.
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
@@ -270,18 +291,21 @@ class Scene:
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
         """Run the scene and return the arrays and labels to store.
 
-        A scene that cannot begin is rejected. Errors of the run itself are bugs, and are raised.
+        A scene that cannot begin is rejected. Errors of the run itself are bugs, and the caller
+        gets them.
         """
         try:
             begun = self.begin()
         except ValueError as error:
             return Outcome(reason=str(error), code=IMPOSSIBLE_START)
         run = self.run(on_frame, begun)
+        # All worst values help to tell a cause from its consequences.
         if not run.valid:
             worst = ", ".join(
                 f"{check.name} {run.labels[check.name]:.4g}" for check in checks.CHECKS
             )
             return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
+        # Cut off rather than wrapped around to negative numbers.
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
         arrays: Record = {**self.arrays(run), **run.record}
         single = {
@@ -302,13 +326,13 @@ def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
 def cloth_kernel() -> str:
     """Return the default level of the kernels.
 
-    It is that of the environment variable, or the widest of this processor.
+    The environment variable sets it. Otherwise it is the widest level of this processor.
     """
     return build_info().cloth_kernel
 
 
 def cloth_kind(scene: Callable[..., Scene]) -> Kind:
-    """Return the kind whose simulations are the scenes that `scene` makes of their physics."""
+    """Return the kind of simulation that runs the scenes that `scene` makes from physics."""
 
     def simulate(
         simulations: Sequence[Mapping[str, Any]], on_frame: OnFrame | None
@@ -319,7 +343,7 @@ def cloth_kind(scene: Callable[..., Scene]) -> Kind:
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return physics with fabrics instead of their names, the user's own numbers, and factors."""
+    """Return physics with a fabric instead of its name, custom numbers and factors."""
     known = dict(physics)
     factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
     name = known.pop("material")
