@@ -180,7 +180,7 @@ def failed(worst: Mapping[str, float]) -> tuple[str, str]:
     """Return the code and the text of the first check that fails, or empty texts."""
     for check in CHECKS:
         value = worst[check.name]
-        # `not value <= limit` is also true for NaN; `value > limit` would let it pass.
+        # `not value <= limit` is also true for NaN, which `value > limit` would let pass.
         if check.limit is not None and not value <= check.limit:
             unit = "" if check.unit == "1" else f" {check.unit}"
             return (

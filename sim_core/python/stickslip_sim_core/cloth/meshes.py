@@ -81,7 +81,7 @@ def grid(
             raise ValueError(
                 f"diagonals: must be alternating, left, right or random, got {diagonals!r}"
             )
-    # Two triangles for either diagonal of every cell; `rising` then picks one diagonal each.
+    # Two triangles for either diagonal of every cell, from which `rising` picks a diagonal.
     up = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1)
     down = np.stack([np.stack([a, b, d], 1), np.stack([b, c, d], 1)], 1)
     triangles = np.where(rising[:, None, None], up, down).reshape(-1, 3)

@@ -1,6 +1,6 @@
-"""Physical protocols: measurements of a build of the core, against master curves.
+"""Physical protocols: measurements of a build of the core against master curves.
 
-See docs/protocols.md.
+docs/protocols.md describes them.
 """
 
 from collections.abc import Callable, Mapping
@@ -47,7 +47,7 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
 ROD_PROTOCOLS = frozenset(
     name for name, protocol in PROTOCOLS.items() if issubclass(protocol, RodProtocol)
 )
-"""Protocols of the rod solver, which has no presets."""
+"""Names of the protocols of the rod solver, which has no presets."""
 
 
 def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult:
@@ -55,8 +55,8 @@ def run(name: str, preset: str | None = None, **settings: Any) -> ProtocolResult
 
     Args:
         name: The protocol.
-        preset: The cloth solver's preset; None: "certified". Protocols of rods ignore it.
-        settings: The fields of the protocol.
+        preset: Preset of the cloth solver. None is "certified". Protocols of rods ignore it.
+        settings: Fields of the protocol.
 
     Raises:
         ValueError: `name` is unknown, or a setting breaks its rule.
@@ -88,23 +88,24 @@ class Certification:
     """Protocols and settings of the certificate of a preset."""
 
     protocols: tuple[str, ...]
-    """Names in PROTOCOLS, in the order in which they run: the quick ones first."""
+    """Names in PROTOCOLS, in the order of running. Quick protocols come first."""
 
     solver: str
-    """The module whose build the certificate is of."""
+    """Module whose build the certificate vouches for."""
 
     numbers: Callable[[], Mapping[str, Any]] = dict
-    """Returns the settings that the preset stands for, constants of the solver included, in JSON's
-    types.
+    """Function that returns the settings of the preset and constants of the solver.
+
+    The values have JSON's types.
     """
 
     quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
-    """Settings by protocol for a first look; a certificate made with them certifies nothing."""
+    """Settings by protocol for a first look. A certificate made with them certifies nothing."""
 
 
 _CLOTH = ("inclined-plane", "lateral-buckling", "stick-slip", "cantilever")
 SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-out")
-"""What a certificate has to have for a scene with self-contact."""
+"""Protocols that a certificate needs for a scene with self-contact."""
 
 
 def _of_cloth(preset: SolverSettings) -> Certification:
@@ -123,7 +124,7 @@ CERTIFICATION: Mapping[str, Certification] = MappingProxyType(
         **{name: _of_cloth(preset) for name, preset in PRESETS.items()},
     }
 )
-"""By preset; "rods" stands for the rod solver, which has none."""
+"""Certifications by preset. "rods" stands for the rod solver, which has no presets."""
 
 __all__ = [
     "CERTIFICATION",

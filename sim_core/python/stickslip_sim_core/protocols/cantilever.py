@@ -15,31 +15,35 @@ from stickslip_sim_core.reference import master_curves
 # Weights rho_A g L^3 / D [-].
 GAMMA = (0.01, 0.1, 1.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 FINER = {30.0: 4, 300.0: 5}
-"""Beyond these weights meshes are so many times as fine: the strip bends within a few cells."""
+"""Factors by which meshes are finer beyond these weights: the strip bends within a few cells."""
 
-CELLS_ACROSS = 2  # without Poisson's effect the width does not matter
+# Without Poisson's effect the width does not matter.
+CELLS_ACROSS = 2
 
 DENSITY = 0.2  # kg/m^2
 
-# Stiffness against stretching, over rho_A g L: the strip stretches by half of its inverse at most.
-# Ten times as much and an unstructured mesh of flat triangles begins to lock at the sharp bend of
-# heavy strips.
+# Stiffness against stretching, over rho_A g L. The strip stretches by at most half of its inverse.
+# With ten times this stiffness, an unstructured mesh of flat triangles begins to lock at the sharp
+# bend of heavy strips.
 STRETCHING = 3e3
 
 DAMPING = 3.0  # 1/s
-STEADY_STEPS = 60  # of the preset's length; then they grow
-GROWTH = 1.2  # ratio of a time step to the one before
+# Number of steps with the preset's length, before steps grow.
+STEADY_STEPS = 60
+GROWTH = 1.2  # ratio of a time step to the step before
 LONGEST = 1.0  # time step [s]
 STEPS_MAX = 600
-REST = 2e-5  # of the length: a long step in which nothing moves by more is the last
-FORCE_SHARE = 0.1  # of a node's weight: the force that residuals are measured in
+# Share of the length: the strip is at rest if no vertex moves further in a long step.
+REST = 2e-5
+# Share of a node's weight that is the unit of residuals.
+FORCE_SHARE = 0.1
 
 
 @dataclass(kw_only=True, eq=False)
 class Cantilever(RefinedProtocol):
     """H/W, drop of the tip over its horizontal reach, against `master_curves.cantilever`.
 
-    The preset's time step is the first one; steps grow to 1 s as the strip settles.
+    The preset's time step is the first one. Steps grow to 1 s as the strip settles.
     """
 
     name = "cantilever"
@@ -75,9 +79,9 @@ class Cantilever(RefinedProtocol):
 def hang(
     clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING
 ) -> tuple[float, Cloth]:
-    """Let a strip that was straight and horizontal settle.
+    """Let a strip that starts straight and horizontal settle, and return H/W and the cloth.
 
-    Return H/W, NaN if it did not, and the cloth.
+    H/W is NaN if the strip did not come to rest.
     """
     weight = DENSITY * GRAVITY * LENGTH  # N/m
     cloth = Cloth(
@@ -95,9 +99,11 @@ def hang(
     while cloth.total.steps < STEPS_MAX and not at_rest:
         before = cloth.positions
         cloth.step(dt, held=straight[held], damping=DAMPING)
+        # Rest counts only in a long step: in a short one, a slow strip hardly moves either.
         at_rest = (
             2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
         )
+        # Implicit Euler damps more in longer steps, which bring the strip to rest sooner.
         if cloth.total.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
     reach, _, drop = cloth.positions[clamped.tip].mean(axis=0)

@@ -1,6 +1,6 @@
-"""Capstan: a strip is drawn over a cylinder against a light pull.
+"""Capstan: a strip slides over a cylinder against a light pull.
 
-Friction makes the heavy pull grow with the wrap.
+Friction makes the heavy pull grow with the wrap angle.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,18 +25,19 @@ RADIUS = 0.05  # m
 WRAP = 2.0  # rad
 WIDTH = 2  # cells
 CELLS_PER_TURN = 72  # 5 degrees each
-FREE = (
-    2.0 * np.pi / 3.0
-)  # beyond the cylinder, on each side, over its radius: many times sqrt(D/T1)
+# Free length beyond the cylinder on each side, over its radius: many times sqrt(D/T1).
+FREE = 2.0 * np.pi / 3.0
 LIGHT = 2.0  # T1, N/m
 DENSITY = 0.1  # kg/m^2
 STRETCHING = 2e4  # N/m
 SPEED = 0.01  # m/s
 DAMPING = 2.0  # 1/s
-SLIDING = 1.2  # s: after which the heavy pull is measured
-MEASURED = 0.8  # s: over which its mean is taken, two cells of way
+# The measurement of the heavy pull begins after this time [s].
+SLIDING = 1.2
+# The mean covers this time [s], in which the strip slides by two cells.
+MEASURED = 0.8
 
-# Of T1 times a cell: the force that residuals are measured in.
+# Share of T1 times a cell that is the unit of residuals.
 FORCE_SHARE = 0.01
 
 
@@ -57,9 +58,9 @@ class Capstan(ClothProtocol):
     }
 
     friction: Sequence[float] = FRICTION
-    """Of strip and cylinder."""
+    """Coefficients of friction between strip and cylinder."""
     bending: Sequence[float] = BENDING
-    """B / T1, each > 0."""
+    """Values of B / T1, each > 0."""
     tolerance: float = 0.003
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
@@ -104,8 +105,10 @@ class Strip:
         material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT)
         self.cloth = self.over(mu, mesh, material, FORCE_SHARE * LIGHT * self.cell)
         self.breadth = WIDTH * self.cell
+        # Gravity on the vertices of the free end stands for the pull. The rest has no weight.
         self.cloth.gravity[:] = 0.0
         self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
+        # The strip starts wrapped around the cylinder, with both free ends tangential to it.
         clearance = RADIUS + self.apart * THICKNESS
         angle = np.clip(along / RADIUS, 0.0, WRAP)
         beyond = along - RADIUS * angle
@@ -119,10 +122,10 @@ class Strip:
         self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
         self.cloth.set_state(np.concatenate([self.start, self.below]))
         self.iterations = 0.0
-        """Of Newton's method in a measured step, in the mean."""
+        """Mean number of Newton's iterations in a measured step."""
 
     def over(self, mu: float, mesh: meshes.Mesh, material: Fabric, force_scale: float) -> Cloth:
-        """Return the cloth that is drawn over the cylinder: tests draw it over other ones, too."""
+        """Return the cloth that slides over the cylinder. Tests let it slide over other bodies."""
         self.bodies = [cylinder(mu, RADIUS, rotation=[[1, 0, 0], [0, 0, 1], [0, -1, 0]])]
         return Cloth(mesh, material, self.preset, held=self.held, force_scale=force_scale)
 
@@ -138,6 +141,7 @@ class Strip:
         for step in range(1, last + 1):
             ends = self.start[self.held] + SPEED * step * dt * self.ahead
             before = self.cloth.total.newton
+            # The held end moves on along its free part, so that the wrap angle does not change.
             self.cloth.step(
                 dt, held=np.concatenate([ends, self.below]), bodies=self.bodies, damping=DAMPING
             )

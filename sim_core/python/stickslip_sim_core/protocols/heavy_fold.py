@@ -1,8 +1,7 @@
 """Heavy fold: a strip folded onto itself lies on a floor.
 
-The shape of its loop does not depend on friction.
-
-The upper layer is then pulled away from the loop, until it slips.
+The shape of its loop does not depend on friction. The upper layer is then pulled away from the loop
+until it slips.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,12 +23,12 @@ BENDING_LENGTH = 0.02  # L_gb, m
 DENSITY = 0.2  # kg/m^2
 GAP = 1.0 / 16.0  # thickness over L_gb
 STRETCHING = 1.5e4  # over rho g L_gb
-LOWER = 4.0  # length of the lower layer that lies, over L_gb
-UPPER = 3.0  # the same of the upper layer
+LOWER = 4.0  # lying length of the lower layer, over L_gb
+UPPER = 3.0  # lying length of the upper layer, over L_gb
 FRICTION = (0.3, 1.0)
 
-# Settling: steps grow from the preset's tenth to this one [s], with a damping [1/s], until nothing
-# moves further [m].
+# The strip settles with a damping [1/s]. Steps grow from a tenth of the preset's to LONGEST [s],
+# until no vertex moves further than REST [m] in a step.
 FIRST_SHARE = 0.1
 GROWTH = 1.1
 LONGEST = 0.05
@@ -37,17 +36,19 @@ DAMPING = 8.0
 REST = 1e-9
 STEPS_MAX = 1500
 
-# The pull on the upper layer, over that of the master curve. It grows while the strip is damped,
-# and is held [s] while drift is measured; from the next share on it grows slowly [1/s].
+# The pull on the upper layer, over the pull of the master curve. It grows to HOLD_SHARE while the
+# strip is damped, and stays there for HOLD_TIME [s] for the measurement of drift. From FROM to
+# UP_TO it grows slowly, by RATE [1/s].
 HOLD_SHARE = 0.9
 HOLD_TIME = 10.0
 FROM = 0.98
 UP_TO = 1.02
 RATE = 0.004
 GROWING = 1.0  # s
-MOVED = 1e-6  # m: an upper layer whose vertices have all come so far slips
+# The upper layer slips if all of its vertices have moved this far [m].
+MOVED = 1e-6
 
-# Of a node's weight: the force that residuals are measured in.
+# Share of a node's weight that is the unit of residuals.
 FORCE_SHARE = 0.1
 
 
@@ -55,10 +56,10 @@ FORCE_SHARE = 0.1
 class HeavyFold(ClothProtocol):
     """The shape of a heavy loop, and the pull at which its upper layer slips.
 
-    The shape is the height of the loop and the distance of its nose from the landing.
+    The shape consists of the height of the loop and the distance of its nose from the landing.
 
-    Lengths are over L_gb, the pull is over rho g L_gb. The landing at rest gives the length of the
-    tail. Its weight and the force at the landing are the load on friction.
+    Lengths are over L_gb, and the pull is over rho g L_gb. The landing at rest gives the length of
+    the tail. The weight of the tail and the force at the landing are the load on friction.
     """
 
     name = "heavy-fold"
@@ -79,9 +80,12 @@ class HeavyFold(ClothProtocol):
     }
 
     friction: Sequence[float] = FRICTION
-    """Of the strip with itself and with the floor; the shape does not depend on it."""
+    """Coefficients of friction of the strip with itself and with the floor.
+
+    The shape does not depend on them.
+    """
     cells: int = 120
-    """Of the strip along its length, which is 11.7 L_gb."""
+    """Number of cells along the strip, whose length is 11.7 L_gb."""
     tolerance: float = 0.005
 
     folds: dict[float, tuple[tuple[float, float], ...]] = field(
@@ -89,12 +93,13 @@ class HeavyFold(ClothProtocol):
     )
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        # One simulation gives the points of all three curves.
         if mu not in self.folds:
             self.folds[mu] = self.fold(mu)
         return self.folds[mu][at["what"]]
 
     def fold(self, mu: float) -> tuple[tuple[float, float], ...]:
-        """Return height, nose to landing, and pull at slip: measured, and of the master curve."""
+        """Return (measured, master) of height, of nose to landing, and of pull at slip."""
         exact = master_curves.heavy_fold(GAP)
         fold = Fold(mu, self.solver, self.cells)
         height, nose_to_landing = fold.settle()
@@ -114,7 +119,7 @@ class HeavyFold(ClothProtocol):
 class Fold:
     """A strip on a floor, with its upper part folded back over the lower one.
 
-    `mu`: with itself and with the floor.
+    `mu` is the friction of the strip with itself and with the floor.
     """
 
     def __init__(self, mu: float, preset: SolverSettings, cells: int) -> None:
@@ -136,17 +141,18 @@ class Fold:
         self.middle = np.flatnonzero(np.abs(mesh.rest[:, 0]) < 1e-3 * cell)
         self.end = np.flatnonzero(self.along > length - 0.1 * cell)
         self.unit = weight * 2.0 * np.sqrt(0.75) * cell  # N: rho g L_gb times the width
-        self.straight_end = (
-            length - 0.25 * cell
-        )  # of a strip as heavy: the ends of this one are notched
+        # The ends of the mesh are notched. A strip of the same weight with straight ends would end
+        # here.
+        self.straight_end = length - 0.25 * cell
         self.expected = self.tail = np.nan
-        """Pull at which the upper layer slips by the master curve, and its length, once it has come
-        to rest.
+        """Pull at which the upper layer slips by the master curve, and length of its tail.
+
+        Both are NaN until the strip has come to rest.
         """
         self.landing_from = (LOWER + 0.7 * loop) * BENDING_LENGTH
         self.floor = [plane(mu)]
         self.step = FIRST_SHARE * preset.time_step
-        # It begins as a straight part, a half circle and a straight part back.
+        # The strip begins as a straight part, a half circle and a straight part back.
         radius = 0.45 * BENDING_LENGTH
         bend = LOWER * BENDING_LENGTH + 0.5 * (loop * BENDING_LENGTH - np.pi * radius)
         angle = np.clip((self.along - bend) / radius, 0.0, np.pi)
@@ -155,9 +161,9 @@ class Fold:
         self.cloth.set_state(np.column_stack([x, mesh.rest[:, 0], radius * (1.0 - np.cos(angle))]))
 
     def settle(self) -> tuple[float, float]:
-        """Return height and distance of nose and landing over L_gb.
+        """Return the height, and the distance between nose and landing, over L_gb.
 
-        NaN if it does not come to rest.
+        Both are NaN if the strip does not come to rest.
         """
         if not self.rests():
             return np.nan, np.nan
@@ -166,18 +172,19 @@ class Fold:
         return height, nose_to_landing
 
     def rests(self) -> bool:
-        """Step until nothing moves; return False if it does not come to rest."""
+        """Step until nothing moves, and return False if the strip does not come to rest."""
         for _ in range(STEPS_MAX):
             before = self.cloth.positions
             self.cloth.step(self.step, bodies=self.floor, damping=DAMPING)
             moved = np.abs(self.cloth.positions - before).max()
+            # Rest counts only in a long step: in a short one, a slow strip hardly moves either.
             if self.step == LONGEST and moved < REST:
                 return True
             self.step = min(GROWTH * self.step, LONGEST)
         return False
 
     def pulled(self, share: float) -> None:
-        """Pull at the end of the upper layer by a share of the master's pull."""
+        """Pull at the end of the upper layer by a share of the pull of the master curve."""
         self.cloth.gravity[self.end, 0] = (
             -share * self.expected * self.unit / self.cloth.masses[self.end].sum()
         )
@@ -203,7 +210,7 @@ class Fold:
     def slip_pull(self) -> float:
         """Return the pull over rho g L_gb at which all of the upper layer slips, or NaN.
 
-        `drift` comes before.
+        Call `drift` first, whose pull is the start of this one.
         """
         if np.isnan(self.expected):
             return np.nan
@@ -212,6 +219,7 @@ class Fold:
         for step in range(1, growing + 1):
             self.pulled(HOLD_SHARE + (FROM - HOLD_SHARE) * step / growing)
             self.cloth.step(dt, bodies=self.floor, damping=DAMPING)
+        # Only the tail rubs on the layer below, so only its vertices must move.
         start = self.cloth.positions
         upper = self.along > self.straight_end - self.tail * BENDING_LENGTH
         for step in range(1, round((UP_TO - FROM) / (RATE * dt)) + 1):
@@ -225,20 +233,22 @@ class Fold:
     def measure(self) -> tuple[float, float, float]:
         """Return height, nose to landing, and length beyond the landing, over L_gb.
 
-        Beyond the landing the layer below bears the weight of each vertex, and there a force
-        besides. It is where the surplus over the weights has its centre, since the layer bears no
-        moment.
+        Beyond the landing the layer below bears the weight of each vertex. At the landing it bears
+        a force besides. The landing is the centre of the surplus over the weights, because the
+        layer bears no moment.
         """
         at = self.cloth.positions
         line = at[self.middle][np.argsort(self.along[self.middle])]
         height = peak(line[:, 2])
         nose = peak(line[:, 0])
+        # Upward force of the layer below on each vertex.
         pairs = self.cloth.pair_forces
         lift = np.zeros(len(at))
         np.add.at(lift, pairs.vertices, pairs.weights * pairs.forces[:, None, 2])
         lies = (self.along > self.landing_from) & (lift > 0.0)
         surplus = lift[lies] - self.cloth.masses[lies] * GRAVITY
         landing = surplus @ at[lies, 0] / surplus.sum()
+        # `np.interp` needs ascending positions, and the upper layer runs backwards.
         inwards = np.argsort(at[lies, 0])
         landed = np.interp(landing, at[lies, 0][inwards], self.along[lies][inwards])
         lengths = (height, nose - landing, self.straight_end - landed)
@@ -248,7 +258,7 @@ class Fold:
 def strip_of(cell: float, cells: int) -> meshes.Mesh:
     """Return a strip of equilateral triangles from y = 0 on, two rows wide.
 
-    Such triangles leave most room for a thickness.
+    Such triangles leave the most room for a thickness.
     """
     rise = np.sqrt(0.75) * cell
     side = cell * np.arange(cells + 1)
@@ -270,7 +280,7 @@ def strip_of(cell: float, cells: int) -> meshes.Mesh:
 
 
 def peak(values: np.ndarray) -> float:
-    """Return the maximum of the parabola through the largest value and its neighbours."""
+    """Return the maximum of the parabola through the largest value and its two neighbours."""
     i = int(np.argmax(values))
     before, top, after = values[i - 1 : i + 2]
     return float(top + (after - before) ** 2 / (8.0 * (2.0 * top - before - after)))

@@ -1,4 +1,4 @@
-"""Inclined plane: the slope at which cloth begins to slide, and its creep below that slope.
+"""Inclined plane: the slope at which cloth begins to slide, and its creep below this slope.
 
 The cloth is a patch on the plane, or the upper sheets of a stack.
 """
@@ -33,25 +33,25 @@ DRIFT_MAX = 1e-5  # m
 class OnSlope:
     """Cloth at rest on a slope.
 
-    What lies above an interface of friction mu is to slip as the slope grows, alone.
+    As the slope grows, only the cloth above an interface of friction mu should slip.
 
     Args:
-        cloth: Without a state.
-        start: (V, 3): where it lies [m].
+        cloth: Cloth without a state.
+        start: Positions of its vertices: (V, 3) [m].
         mu: Friction of the interface.
         floor: Friction of the plane.
-        upper: (V,): which vertices are above the interface.
+        upper: Whether each vertex is above the interface: (V,).
     """
 
     share_from: ClassVar[float] = 0.95
     share_to: ClassVar[float] = 1.05
-    """Tan(alpha) over mu, at first and at last."""
+    """First and last value of tan(alpha) over mu."""
 
     rate: ClassVar[float] = 0.01
-    """By which it grows [1/s]."""
+    """Growth of tan(alpha) over mu [1/s]."""
 
     slid: ClassVar[float] = 1e-9
-    """What slides has come so far with all of its vertices [m]."""
+    """Cloth slides if all of its vertices have moved this far [m]."""
 
     def __init__(
         self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]
@@ -76,9 +76,9 @@ class OnSlope:
         return float(self.moved().max())
 
     def slip_slope(self) -> float:
-        """Return tan(alpha) of the slope at which all that is above slides, or NaN.
+        """Return tan(alpha) of the slope at which all cloth above the interface slides, or NaN.
 
-        NaN, too, where what is below has moved.
+        It is NaN, too, if cloth below the interface has moved.
         """
         dt = self.cloth.preset.time_step
         for step in range(1, round((self.share_to - self.share_from) / (self.rate * dt)) + 1):
@@ -86,6 +86,7 @@ class OnSlope:
             self.cloth.gravity[:] = tilted(np.arctan(slope))
             self.cloth.step(dt, bodies=self.floor)
             moved = self.moved()
+            # The cloth slides as a whole only when its last vertex does.
             if moved[self.upper].min() > self.slid:
                 return float(slope) if moved[~self.upper].max(initial=0.0) <= DRIFT_MAX else np.nan
         return np.nan
@@ -93,6 +94,7 @@ class OnSlope:
 
 def tilted(angle: float) -> Floats:
     """Return gravity [m/s^2] in axes whose third is normal to a plane of this slope [rad]."""
+    # Tilting gravity is the same as tilting the plane, and keeps the mesh in the plane z = 0.
     return GRAVITY * np.append(np.sin(angle) * DIRECTION, -np.cos(angle))
 
 
@@ -100,7 +102,7 @@ def tilted(angle: float) -> Floats:
 class SlopeProtocol(MeshedProtocol):
     """Tan(alpha) of the slope at which cloth slips, against mu.
 
-    What comes further than `DRIFT_MAX` in 10 s at 90 % of the angle atan(mu) creeps: its
+    Cloth that moves further than `DRIFT_MAX` in 10 s, at 90 % of the angle atan(mu), creeps. Its
     measurement is NaN.
     """
 
@@ -110,16 +112,17 @@ class SlopeProtocol(MeshedProtocol):
     constants: ClassVar = {"drift_seconds": HOLD_TIME, "drift_share_of_slip_angle": HOLD_SHARE}
 
     force_share: ClassVar[float]
-    """Of a node's weight: the force that residuals are measured in."""
+    """Share of a node's weight that is the unit of residuals."""
 
     friction: Sequence[float]
-    """mu."""
+    """Coefficients of friction mu."""
 
     @abstractmethod
     def lay(self, mu: float, at: Mapping[str, Any]) -> OnSlope:
         """Return cloth at rest on a slope."""
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        # Two simulations, since a cloth that has crept for 10 s is no clean start for the slip.
         creeping = self.lay(mu, at)
         slipping = self.lay(mu, at)
         moved = creeping.drift()
@@ -141,8 +144,8 @@ class SlopeProtocol(MeshedProtocol):
 class InclinedPlane(SlopeProtocol):
     """A patch on a plane.
 
-    A resting node may bear a force beyond friction by the preset's tolerance times the force that
-    residuals are measured in, and slides late by as much over mu.
+    A resting node may bear a force beyond friction, up to the preset's tolerance times the unit of
+    residuals. It slides late by as much over mu.
     """
 
     name = "inclined-plane"
@@ -172,18 +175,17 @@ def patch(mesh: meshes.Mesh, mu: float, preset: SolverSettings) -> OnSlope:
 STACK_FRICTION = (0.1, 0.3, 0.8, 1.5)
 SHEETS = (2, 4)
 TOP = 0.1  # side of the sheet on top [m]
-WIDER = 0.01  # by which each sheet below is wider on each side [m]
+WIDER = 0.01  # extra width of each sheet below, on each side [m]
 THICKNESS = 5e-4  # m
 ROUGHER = 1.5  # friction of all other interfaces, over the least
 
 
 @dataclass(kw_only=True, eq=False)
 class StackedIncline(SlopeProtocol):
-    """The upper sheets of a stack, over the middle interface.
+    """The upper sheets of a stack, which slide over the middle interface.
 
-    The other interfaces are rougher than mu.
-
-    A stack in which another interface slides has no slip angle either.
+    The other interfaces are rougher than mu. A stack in which another interface slides has no slip
+    angle either.
     """
 
     name = "stacked-incline"
@@ -195,7 +197,10 @@ class StackedIncline(SlopeProtocol):
     sheets: Sequence[int] = SHEETS
     """Numbers of sheets, at least 2 each."""
     cells: int = 4
-    """Of the sheet on top along a side; the others have cells of about that size."""
+    """Number of cells along a side of the sheet on top.
+
+    The other sheets have cells of about the same size.
+    """
     tolerance: float = 0.002
 
     def lay(self, mu: float, at: Mapping[str, Any]) -> "Stack":
@@ -207,7 +212,7 @@ class Stack(OnSlope):
 
     The least friction, mu, is below sheet `sheets // 2`.
 
-    `cells` are those of the sheet on top along a side.
+    The sheet on top has `cells` cells along a side.
     """
 
     share_from = 0.99
@@ -226,6 +231,7 @@ class Stack(OnSlope):
         if sheets < 2:
             raise ValueError(f"sheets: must be at least 2, got {sheets}")
         loose = sheets // 2
+        # The sheet on top is the smallest, so no sheet hangs over the edge of the sheet below.
         parts = []
         for level in range(sheets):
             side = TOP + 2.0 * WIDER * (sheets - 1 - level)

@@ -1,12 +1,10 @@
 """Lateral buckling: the weight at which a strip on edge turns sideways [Romero et al. 2021].
 
-The strip is clamped with its width vertical.
-
-The strip takes up its weight in its plane, by steps of the solver. What its stress then adds to the
-stiffness against moving out of the plane goes with the weight, what bending adds with the rigidity:
-the flat state loses stability where the smallest eigenvalue of their sum is zero, which is an
-eigenvalue problem for the weight. Both matrices are central differences of the solver's own
-gradient.
+The strip is clamped with its width vertical. It takes up its weight in its plane, by steps of the
+solver. The stiffness against motion out of the plane then has two parts: stress adds a part that is
+proportional to the weight, and bending adds a part that is proportional to the rigidity. The flat
+state loses stability at the weight for which the smallest eigenvalue of the sum is zero. This is an
+eigenvalue problem for the weight. Both matrices are central differences of the solver's gradient.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,12 +29,16 @@ POISSON = (0.0, 0.3)
 
 DENSITY = 0.2  # kg/m^2
 RIGIDITY = 1e-5  # N m
-STRETCHING = 1e5  # over rho_A g L: the strip sags by 1e-3 L at most
-FORCE_SHARE = 0.01  # of a node's weight: the force that residuals are measured in
-STEPS = 30  # until inertia is nothing beside stiffness
-GROWTH = 1.5  # ratio of a time step to the one before
-DIFFERENCE = 1e-7  # of the length
-REACH = 6.0  # cells: no force of bending acts between vertices that are further apart
+# Stiffness against stretching over rho_A g L: the strip sags by 1e-3 L at most.
+STRETCHING = 1e5
+# Share of a node's weight that is the unit of residuals.
+FORCE_SHARE = 0.01
+# Number of steps, after which inertia is negligible beside stiffness.
+STEPS = 30
+GROWTH = 1.5  # ratio of a time step to the step before
+DIFFERENCE = 1e-7  # share of the length
+# No force of bending acts between vertices that are further apart than this number of cells.
+REACH = 6.0
 
 
 @dataclass(kw_only=True, eq=False)
@@ -45,7 +47,7 @@ class LateralBuckling(RefinedProtocol):
 
     The master curve is `master_curves.lateral_buckling`.
 
-    The preset's time step is the first one; the others grow.
+    The preset's time step is the first one, and later steps grow.
     """
 
     name = "lateral-buckling"
@@ -74,6 +76,7 @@ class LateralBuckling(RefinedProtocol):
 
 def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
+    # Before the first step no stress acts, so the first matrix has bending alone.
     cloth, flat = loaded(clamped, poisson, RIGIDITY, preset)
     held = clamped.held
     free = np.setdiff1d(np.arange(len(flat)), held)
@@ -86,7 +89,8 @@ def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
     # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of -stress over
     # bending.
     inverse = LinearOperator(bending.shape, splu(bending).solve)
-    start = np.ones(len(free))  # a start at random would not give the same bits twice
+    # A random start would not give the same bits twice.
+    start = np.ones(len(free))
     largest = float(
         eigsh(-stress, 1, M=bending, Minv=inverse, which="LA", v0=start, return_eigenvectors=False)[
             0
@@ -115,14 +119,16 @@ def loaded(
 def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matrix:
     """Return the out-of-plane stiffness (F, F) of the free vertices of a flat cloth.
 
-    Vertices that are more than twice `REACH` cells apart have no neighbour in common, so they are
-    moved together.
+    Vertices that are more than twice `REACH` cells apart have no neighbour in common, so one
+    difference moves all of them together.
     """
     rest = cloth.mesh.rest[free]
     cell = cloth.mesh.spacing
     period = int(np.ceil(2.0 * REACH)) + 1
     boxes = np.floor((rest - rest.min(axis=0)) / cell + 1e-6).astype(int)
-    crowd = np.zeros(len(free), dtype=int)  # number of a vertex within its box
+    # Number of each vertex within its box. An unstructured mesh may have several in a box, which
+    # must not move together.
+    crowd = np.zeros(len(free), dtype=int)
     for box in np.unique(boxes, axis=0):
         inside = np.flatnonzero((boxes == box).all(axis=1))
         crowd[inside] = np.arange(len(inside))
@@ -138,6 +144,7 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
             moved = at.copy()
             moved[free[members], 2] += sign * DIFFERENCE * LENGTH
             ends.append(cloth._solver.energies(moved)[2][free, 2])
+        # Each change of a force belongs to the nearest moved vertex, within its reach.
         distance, nearest = cKDTree(rest[members]).query(rest)
         near = np.flatnonzero(distance <= REACH * cell)
         rows.append(near)
@@ -147,4 +154,5 @@ def out_of_plane(cloth: Cloth, at: Floats, free: NDArray[np.int64]) -> csc_matri
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         (len(free), len(free)),
     )
+    # A stiffness is symmetric, and differences are so up to rounding only.
     return csc_matrix(0.5 * (whole + whole.T))

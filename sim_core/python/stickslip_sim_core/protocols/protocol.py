@@ -1,6 +1,6 @@
-"""What all protocols share: meshes that they vary, clamped strips, and `run`.
+"""The common base of all protocols: meshes that they vary, clamped strips, and `run`.
 
-A protocol states its points, its measurement and its master curve.
+Each protocol defines its points, its measurement and its master curve.
 """
 
 from abc import ABC, abstractmethod
@@ -22,13 +22,14 @@ from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.protocols.result import Curve, Numbers, ProtocolResult, Refinement, Setting
 
 LENGTH = 0.1
-"""Of every strip [m]."""
+"""Length of every strip [m]."""
 
 DIAGONALS: tuple[Diagonals, ...] = ("alternating", "random", "left", "right")
 
 ALIGNED = 3
-"""Rows of square cells at the clamp of an unstructured strip. With one, the tip of a cantilever is
-off by 2.4 %.
+"""Rows of square cells at the clamp of an unstructured strip.
+
+With a single row, the tip of a cantilever is off by 2.4 %.
 """
 
 MeshKind = Diagonals | int
@@ -48,8 +49,8 @@ def rectangle(
 
     The mesh is a grid of `cells`, or triangles with sides of about `spacing` [m].
 
-    `seed` draws the diagonals of a grid, and is added to the seed of an unstructured mesh, of which
-    `aligned` rows of cells at the lower end are those of a grid.
+    `seed` draws the diagonals of a grid, and adds to the seed of an unstructured mesh. `aligned`
+    rows of cells at the lower end of an unstructured mesh are the rows of a grid.
     """
     if isinstance(kind, int):
         return meshes.unstructured(width, length, spacing, kind + seed, aligned=aligned)
@@ -60,10 +61,9 @@ def rectangle(
 class Strip:
     """A strip along the second axis of its rest plane, clamped at its lower end.
 
-    Two rows of vertices are clamped.
-
-    The rows lie half a cell before and behind the clamp, so that a strip that is straight between
-    them is level at the clamp itself. The mesh is longer than the strip by half a cell.
+    Two rows of vertices are clamped: half a cell before the clamp, and half a cell behind it. A
+    strip that is straight between the rows is thus level at the clamp itself. The mesh is longer
+    than the strip by half a cell.
     """
 
     mesh: Mesh
@@ -72,17 +72,17 @@ class Strip:
 
     @property
     def across(self) -> Floats:
-        """(V,): distance from the long middle line [m]."""
+        """Distance of each vertex from the long middle line, with a sign: (V,) [m]."""
         return self.mesh.rest[:, 0]
 
     @property
     def along(self) -> Floats:
-        """(V,): distance from the clamp [m], negative in the first row."""
+        """Distance of each vertex from the clamp, negative in the first row: (V,) [m]."""
         return self.mesh.rest[:, 1] + 0.5 * (LENGTH - 0.5 * self.cell)
 
     @property
     def held(self) -> NDArray[np.int64]:
-        """Vertices of the two rows."""
+        """Vertices of the two clamped rows."""
         return np.flatnonzero(self.along < 0.75 * self.cell)
 
     @property
@@ -94,7 +94,7 @@ class Strip:
 def cell_of(cells: int) -> float:
     """Return the length of a cell [m] of a strip with `cells` cells along it.
 
-    Half of a cell is before the clamp.
+    Half a cell is before the clamp.
     """
     return LENGTH / (cells - 0.5)
 
@@ -104,6 +104,7 @@ def strip(width: float, cells: int, kind: MeshKind) -> Strip:
     """Return a strip of `width` [m] with `cells` cells along it."""
     cell = cell_of(cells)
     shape = max(1, round(width / cell)), cells
+    # The seed of an unstructured mesh is its kind already.
     seed = 0 if isinstance(kind, int) else 1
     return Strip(rectangle(width, LENGTH + 0.5 * cell, shape, cell, kind, seed, ALIGNED), cell)
 
@@ -114,10 +115,10 @@ class Tally:
 
     total: StepReport = field(default_factory=StepReport)
     largest: float = 0.0
-    """Of a quantity of the protocol's own, such as drift."""
+    """Largest value of a quantity that the protocol chooses, for example drift."""
 
     def count(self, cloth: Cloth) -> None:
-        """Add a cloth that was simulated."""
+        """Add the steps of a simulated cloth."""
         self.total.add(cloth.total)
 
     def note(self, value: float) -> None:
@@ -134,24 +135,25 @@ class Protocol(ABC):
     y_name: ClassVar[str]
 
     points: ClassVar[str]
-    """The field that holds the abscissae, which all curves share."""
+    """Name of the field with the abscissae, which all curves share."""
 
     parameters: ClassVar[Mapping[str, str]] = {}
-    """Parameters of a curve, and the fields that hold their values. There is a curve for each
-    combination.
+    """Parameters of a curve, and the names of the fields with their values.
+
+    Each combination of the values has a curve.
     """
 
     tolerance: float
     """Largest |relative error| that passes."""
 
     limit_tolerance: float | None = field(default=None, init=False)
-    """The same of the limit, in protocols that are run on three meshes."""
+    """Largest |relative error| of the limit that passes, in protocols that use three meshes."""
 
     tally: Tally = field(default_factory=Tally, init=False, repr=False)
 
     @abstractmethod
     def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        """Return the measured value at a point of the curve `at`, and the master curve's value."""
+        """Return the measured value at a point of the curve `at`, and the value of the master."""
 
     def curve(self, x: Numbers, at: Mapping[str, Any]) -> Curve:
         """Measure the points x of the curve with the parameters `at`."""
@@ -161,23 +163,24 @@ class Protocol(ABC):
         return Curve({name: float(value) for name, value in at.items()}, x, measured, master)
 
     constants: ClassVar[Mapping[str, Setting]] = {}
-    """Numbers of the protocol that no setting changes, for the result."""
+    """Numbers for the result that no setting changes."""
 
     @abstractmethod
     def reported(self) -> dict[str, Setting]:
-        """Return settings and diagnostics for the result, once all is measured.
+        """Return settings and diagnostics for the result, after all measurements.
 
-        `constants` are added to them.
+        `run` adds `constants` to them.
         """
 
     def run(self) -> ProtocolResult:
         """Measure all points of all curves."""
         x = tuple(float(point) for point in getattr(self, self.points))
-        # There is a curve for each combination of the parameters' values.
+        # Each combination of the parameters' values has a curve.
         values_of = [getattr(self, field) for field in self.parameters.values()]
         curves = []
         for values in product(*values_of):
             curves.append(self.curve(x, dict(zip(self.parameters, values, strict=True))))
+        # `reported` comes after the measurements, whose diagnostics it returns.
         return ProtocolResult(
             self.name,
             self.x_name,
@@ -195,7 +198,7 @@ class ClothProtocol(Protocol):
     """A protocol of the cloth solver.
 
     Raises:
-        ValueError: There is no such preset.
+        ValueError: The preset is unknown.
     """
 
     preset: str | SolverSettings = "certified"
@@ -209,7 +212,7 @@ class ClothProtocol(Protocol):
         self.solver = preset_named(self.preset)
 
     thickness: ClassVar[float | None] = None
-    """Of cloth that touches cloth [m]."""
+    """Thickness of cloth that touches cloth [m]."""
 
     def reported(self) -> dict[str, Setting]:
         found: dict[str, Setting] = {
@@ -217,6 +220,7 @@ class ClothProtocol(Protocol):
             self.time_step_name: self.solver.time_step,
         }
         total = self.tally.total
+        # Not every protocol counts its steps.
         if total.steps:
             found |= {"steps": total.steps, "unconverged_steps": total.unconverged}
         if self.thickness is not None:
@@ -226,7 +230,7 @@ class ClothProtocol(Protocol):
 
 @dataclass(kw_only=True, eq=False)
 class MeshedProtocol(ClothProtocol):
-    """A protocol of the cloth solver that is run on several meshes.
+    """A protocol of the cloth solver that runs on several meshes.
 
     `mesh` is a parameter of its curves.
     """
@@ -235,7 +239,7 @@ class MeshedProtocol(ClothProtocol):
     grids_max: ClassVar[int] = 4
 
     cells: int | tuple[int, int, int]
-    """Of a mesh along a side."""
+    """Number of cells along a side of a mesh."""
 
     structured: int = 1
     """Number of grids, at most `grids_max`."""
@@ -268,8 +272,11 @@ class RefinedProtocol(MeshedProtocol):
     """
 
     cells: tuple[int, int, int] = (20, 40, 80)
-    """Cells along the strip of three meshes, each at least 1.5 times the one before: those of
-    sheets of 21, 41 and 81 vertices a side. `measured` is the value of the last."""
+    """Cells along the strip of three meshes, each at least 1.5 times the number before.
+
+    The defaults are the cells of sheets with 21, 41 and 81 vertices along a side. `measured` is the
+    value of the last mesh.
+    """
 
     tolerance: float = 4e-3
     limit_tolerance: float = 1e-3
@@ -277,6 +284,7 @@ class RefinedProtocol(MeshedProtocol):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Sizes that hardly differ would give no order of convergence.
         if len(self.cells) != 3 or not all(
             2 * fine >= 3 * coarse > 18 for coarse, fine in pairwise(self.cells)
         ):
@@ -286,12 +294,12 @@ class RefinedProtocol(MeshedProtocol):
             )
 
     def finer(self, x: float) -> int:
-        """Return by how much finer all three meshes are at a point that needs it."""
+        """Return the factor by which all three meshes are finer at a point."""
         return 1
 
     @abstractmethod
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
-        """Return the value at a point, measured with so many cells along the strip."""
+        """Return the value at a point, measured with `cells` cells along the strip."""
 
     @abstractmethod
     def master(self, x: float, at: Mapping[str, Any]) -> float:
@@ -304,7 +312,7 @@ class RefinedProtocol(MeshedProtocol):
         cells: list[tuple[int, ...]] = []
         sizes: list[tuple[float, ...]] = []
         measured: list[tuple[float, ...]] = []
-        # The whole curve on one mesh after the other, the coarsest first.
+        # Measure the whole curve on one mesh after the other, the coarsest first.
         for count in self.cells:
             counts = tuple(self.finer(point) * count for point in x)
             pairs = zip(counts, x, strict=True)

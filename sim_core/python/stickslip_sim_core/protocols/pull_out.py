@@ -1,6 +1,6 @@
-"""Pull-out: a sheet is drawn out from between two others that lie under a load.
+"""Pull-out: a sheet is drawn out from between two loaded sheets.
 
-Both of its sides rub.
+Both sides of the drawn sheet rub.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,15 +24,18 @@ SIDE = 0.1  # m
 THICKNESS = 5e-4  # m
 FABRIC = "gray-interlock"
 SPEED = 0.01  # m/s
-SLIDING = 1.0  # s: after which the force is measured
-MEASURED = 0.4  # s: over which its mean is taken
+# The measurement of the force begins after this time [s].
+SLIDING = 1.0
+# The mean covers this time [s].
+MEASURED = 0.4
 ROUGH = 10.0  # friction of the floor
-# thicknesses: by which held edges are lifted; held where they touch, they could be pressed by any
-# force
+# Height by which held edges are lifted, in thicknesses. An edge that is held in contact could be
+# pressed by any force.
 LIFTED = 0.2
-LOWEST_MAX = 1e-5  # m: by which the lowest sheet may move
+# Largest displacement of the lowest sheet [m].
+LOWEST_MAX = 1e-5
 
-# Of a node's weight: the force that residuals are measured in.
+# Share of a node's weight that is the unit of residuals.
 FORCE_SHARE = 0.1
 
 
@@ -40,7 +43,7 @@ FORCE_SHARE = 0.1
 class PullOut(MeshedProtocol):
     """The force that draws the middle of three sheets out, over the load between the upper two.
 
-    Friction is mu between the upper two, and mu/2 between the lower two. The master curve is
+    Friction is mu between the upper two sheets, and mu/2 between the lower two. The master curve is
     mu + mu/2 (1 + weight of the middle sheet / load).
     """
 
@@ -58,11 +61,11 @@ class PullOut(MeshedProtocol):
     }
 
     friction: Sequence[float] = FRICTION
-    """mu."""
+    """Coefficients of friction mu."""
     loads: Sequence[float] = LOADS
     """Factors of the gravity on the upper sheet."""
     cells: int = 4
-    """Of the upper sheet along a side."""
+    """Number of cells along a side of the upper sheet."""
     tolerance: float = 0.005
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
@@ -75,10 +78,11 @@ class PullOut(MeshedProtocol):
 class Pulled:
     """Three sheets on a rough floor.
 
-    The upper one is held by its rear edge, the middle one drawn by its front edge.
+    A holder keeps the rear edge of the upper sheet in place. Another draws the front edge of the
+    middle sheet.
 
-    `mu` is the friction of the upper two, `load` a factor of the gravity on the upper one, which
-    has `cells` a side.
+    `mu` is the friction between the upper two sheets. `load` is a factor of the gravity on the
+    upper sheet, which has `cells` cells along a side.
     """
 
     def __init__(
@@ -86,11 +90,13 @@ class Pulled:
     ) -> None:
         self.mu = mu
         self.preset = preset
+        # From the lowest sheet upwards. No edge of a sheet lies over an edge of another, and the
+        # front edge of the middle sheet reaches out from under the upper sheet.
         sizes = (
             (1.5 * SIDE, 1.2 * SIDE),
             (1.25 * SIDE, SIDE),
             (SIDE, 0.9 * SIDE),
-        )  # from the lowest upwards
+        )
         centres = (0.0, 0.1 * SIDE, 0.0)
         cell = SIDE / cells
         parts = [
@@ -130,12 +136,12 @@ class Pulled:
         self.cloth.set_state(self.start)
 
     def force(self) -> tuple[float, float]:
-        """Return the force that draws the middle sheet over the load, and the master curve's.
+        """Return the force on the middle sheet over the load, measured and of the master curve.
 
-        The force is NaN if the lowest sheet moves.
+        The measured value is NaN if the lowest sheet moves.
 
-        The load is what the holders of the upper sheet leave of its weight, and likewise for the
-        middle one.
+        The load is the weight of the upper sheet minus the share that its holder bears. The weight
+        of the middle sheet is reduced in the same way.
         """
         cloth = self.cloth
         dt = self.preset.time_step
@@ -147,6 +153,7 @@ class Pulled:
         for step in range(1, round((SLIDING + MEASURED) / dt) + 1):
             ends[: len(self.drawn), 0] = self.start[self.drawn, 0] + SPEED * step * dt
             cloth.step(dt, held=ends, bodies=[plane(ROUGH)])
+            # The sheet has only begun to slide.
             if step * dt <= SLIDING:
                 continue
             reactions = cloth.reactions

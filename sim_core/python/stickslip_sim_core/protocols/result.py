@@ -1,6 +1,6 @@
 """Results of protocols: measured curves beside their master curves.
 
-They say whether the curves agree, and have points for pictures.
+A result states whether the curves agree. `dense_master` returns points for pictures.
 """
 
 import math
@@ -22,29 +22,31 @@ Setting = float | int | str | Numbers
 
 @dataclass(frozen=True)
 class Refinement:
-    """What three meshes say about the points of a curve."""
+    """Limits of the points of a curve, from measurements on three meshes."""
 
     cells: tuple[Numbers, ...]
-    """By mesh, the coarsest first, and point: cells along the sheet. The last mesh is that of
-    `Curve.measured`.
+    """Cells along the sheet, by mesh, the coarsest first, and by point.
+
+    `Curve.measured` belongs to the last mesh.
     """
 
     measured: tuple[Numbers, ...]
-    """By mesh and point."""
+    """Measured values, by mesh and point."""
 
     limit: Numbers
-    """Values extrapolated to cells of no size [Richardson 1911]."""
+    """Values extrapolated to cells of size zero [Richardson 1911]."""
 
     order: Numbers
-    """Power of the cell's size with which errors fall; NaN where the meshes show none, and 2 was
-    taken.
+    """Power of the size of a cell with which errors fall.
+
+    It is NaN if the meshes show no order. The limit then assumes an order of 2.
     """
 
     @classmethod
     def of(
         cls, cells: tuple[Numbers, ...], sizes: tuple[Numbers, ...], measured: tuple[Numbers, ...]
     ) -> "Refinement":
-        """Extrapolate what was measured with cells of three `sizes`, by mesh and point."""
+        """Extrapolate values that were measured with cells of three `sizes`, by mesh and point."""
         points = zip(zip(*sizes, strict=True), zip(*measured, strict=True), strict=True)
         limits = [_extrapolated(at, values) for at, values in points]
         limit, order = zip(*limits, strict=True) if limits else ((), ())
@@ -52,14 +54,17 @@ class Refinement:
 
 
 ORDERS = (1.0, 4.0)
-"""Orders that three meshes are believed to show. Others are those of values that differ by rounding
-or chance.
+"""Range of orders that three meshes can show.
+
+Values that differ by rounding or chance show other orders.
 """
 
 
 def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
     """Return limit and order p of y(h) = limit + c h^p through three values, coarsest first."""
 
+    # Zero if the ratio of both differences fits the order. Products in place of a quotient allow
+    # equal values.
     def missed(p: float) -> float:
         a, b, c = (size**p for size in sizes)
         return float((values[0] - values[1]) * (b - c) - (values[1] - values[2]) * (a - b))
@@ -76,30 +81,36 @@ def _extrapolated(sizes: Numbers, values: Numbers) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Curve:
-    """One measured curve beside its master curve. NaN: nothing to measure, such as no boundary."""
+    """One measured curve beside its master curve.
+
+    NaN means that a point has no value, for example because it has no boundary.
+    """
 
     parameters: Mapping[str, float]
-    """What is fixed along the curve, such as Poisson's ratio."""
+    """Parameters that are fixed along the curve, for example Poisson's ratio."""
 
     x: Numbers
     measured: Numbers
     master: Numbers
     refinement: Refinement | None = None
-    """Of a protocol that is run on three meshes."""
+    """Limits, if the protocol uses three meshes."""
 
     @property
     def errors(self) -> Numbers:
-        """Measured over master less one; zero where both are NaN, infinite where one is."""
+        """Measured value over master value, minus one, at each point.
+
+        The error is zero if both values are NaN, and infinite if one value is NaN.
+        """
         return self._errors_of(self.measured)
 
     @property
     def limit_errors(self) -> Numbers:
-        """The same of the limit, if the curve has one."""
+        """Errors of the limit, if the curve has one."""
         return self._errors_of(self.refinement.limit) if self.refinement else ()
 
     @property
     def errors_by_mesh(self) -> tuple[Numbers, ...]:
-        """The same by mesh, the coarsest first, if there are several."""
+        """Errors by mesh, the coarsest first, if the protocol uses three meshes."""
         return (
             tuple(self._errors_of(measured) for measured in self.refinement.measured)
             if self.refinement
@@ -107,7 +118,7 @@ class Curve:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return parameters, points and errors; for three meshes also limits and orders."""
+        """Return parameters, points and errors, and for three meshes also limits and orders."""
         found = {
             name: getattr(self, name)
             for name in ("parameters", "x", "measured", "master", "errors")
@@ -123,7 +134,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class ProtocolResult:
-    """The result of a protocol: see docs/protocols.md for the definitions."""
+    """The result of a protocol. docs/protocols.md has the definitions."""
 
     protocol: str
     x_name: str
@@ -134,21 +145,20 @@ class ProtocolResult:
 
     settings: Mapping[str, Setting]
     build_hash: str
-    """`build_info().build_hash` of the core that was measured."""
+    """`build_info().build_hash` of the measured core."""
 
     limit_tolerance: float | None = None
-    """Largest |relative error| of a limit that passes, of a protocol that is run on three meshes.
-    """
+    """Largest |relative error| of a limit that passes, if the protocol uses three meshes."""
 
     @property
     def error(self) -> float:
-        """Largest |relative error| over all curves; infinite if nothing was measured."""
+        """Largest |relative error| over all curves, or infinity without a measurement."""
         errors = chain.from_iterable(curve.errors for curve in self.curves)
         return max(map(abs, errors), default=math.inf)
 
     @property
     def limit_error(self) -> float | None:
-        """Largest |relative error| of a limit; None without three meshes."""
+        """Largest |relative error| of a limit, or None without three meshes."""
         if self.limit_tolerance is None:
             return None
         errors = chain.from_iterable(curve.limit_errors for curve in self.curves)
@@ -162,7 +172,7 @@ class ProtocolResult:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result in JSON's types; NaN and infinity become None."""
+        """Return the result in JSON's types. NaN and infinity become None."""
         numbers = (
             "protocol",
             "tolerance",
@@ -186,6 +196,7 @@ class ProtocolResult:
 
 
 def _relative_error(measured: float, master: float) -> float:
+    # Both sides agree that there is no value.
     if math.isnan(measured) and math.isnan(master):
         return 0.0
     if math.isnan(measured) or math.isnan(master):
@@ -201,7 +212,8 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-POINTS = 200  # of a master curve
+# Number of points of a drawn master curve.
+POINTS = 200
 
 _EXACT: Mapping[str, Callable[[Floats], Floats]] = {
     "cantilever": master_curves.cantilever,
@@ -218,9 +230,9 @@ _EXACT: Mapping[str, Callable[[Floats], Floats]] = {
 def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
     """Return 200 abscissae between the measured ones, and the master curve there.
 
-    It is exact where the master curve has a formula or a quick solver. Elsewhere it is the monotone
-    cubic [Fritsch, Carlson 1980] through the exact values: for pictures only. A single point
-    without a formula has no curve.
+    The curve is exact if the master curve has a formula or a quick solver. Otherwise it is the
+    monotone cubic [Fritsch, Carlson 1980] through the exact values, for pictures only. A single
+    point without a formula has no curve.
     """
     x = np.array(curve.x)
     y = np.array(curve.master)
@@ -235,6 +247,7 @@ def dense_master(protocol: str, curve: Curve) -> tuple[Floats, Floats]:
             np.geomspace(first, last, POINTS) if first > 0.0 else np.linspace(first, last, POINTS)
         )
         return dense, np.asarray(_EXACT[protocol](dense), dtype=np.float64)
+    # Points that span several decades are interpolated in logarithms.
     if first > 0.0 and np.all(y > 0.0):
         dense = np.geomspace(first, last, POINTS)
         return dense, np.exp(PchipInterpolator(np.log(x), np.log(y))(np.log(dense)))

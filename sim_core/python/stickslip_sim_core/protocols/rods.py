@@ -30,10 +30,10 @@ class Equilibrium:
     """Quaternions, shape (N + 1, 4), rows (w, x, y, z); the clamp first."""
 
     stable: bool
-    """In equilibrium, with a positive definite Hessian."""
+    """Whether the chain is in equilibrium with a positive definite Hessian."""
 
 
-# From a weight and frames to the equilibrium next to them.
+# Function from a weight and frames to the nearest equilibrium.
 Relax = Callable[[float, Floats], Equilibrium]
 
 
@@ -51,18 +51,18 @@ def round_rod(phi: float, poisson: float) -> Relax:
 def planar_frames(angles: Floats) -> Floats:
     """Return frames in the plane y = 0 with d3 = -y, shape (N + 1, 4).
 
-    Their tangents make the given angles [rad] with gravity.
+    The tangents of the frames make the given angles [rad] with gravity.
     """
     c = np.cos(0.5 * angles)
     s = np.sin(0.5 * angles)
-    # (1, 1, 1, -1) / 2, the clamp of solve_rods, times (c, 0, 0, s).
+    # The quaternion (1, 1, 1, -1) / 2 of the clamp of solve_rods, times (c, 0, 0, s).
     return 0.5 * np.stack([c + s, c + s, c - s, s - c], axis=1)
 
 
 def tip(frames: Floats) -> Floats:
     """Return the position of the free end [L], shape (3,).
 
-    It integrates r' = d1 by the trapezoidal rule, whose error is even in h.
+    The trapezoidal rule integrates r' = d1. Its error is even in h, which `extrapolated` needs.
     """
     w, x, y, z = frames.T
     tangents = np.stack(
@@ -74,19 +74,20 @@ def tip(frames: Floats) -> Floats:
 
 
 def extrapolated(measure: Callable[[int], float], elements: int) -> float:
-    """Measure with 1/4, 1/2 and all of `elements` and go to the limit: error O(h^6).
+    """Measure with 1/4, 1/2 and all of `elements`, and return the limit with an error O(h^6).
 
-    The solver does the same.
+    The rod solver extrapolates in the same way.
     """
     coarse, middle, fine = (measure(elements // k) for k in (4, 2, 1))
     return float(64.0 * fine - 20.0 * middle + coarse) / 45.0
 
 
 def loss_of_stability(relax: Relax, start: Equilibrium, gammas: Iterable[float]) -> float:
-    """Follow a stable equilibrium through `gammas` and bisect where it ceases to be stable.
+    """Return the weight at which an equilibrium, followed through `gammas`, ceases to be stable.
 
-    NaN where it does not.
+    It is NaN if the equilibrium stays stable.
     """
+    # Each search starts from the last equilibrium, so that it stays on the same branch.
     stable = start
     for gamma in gammas:
         after = relax(float(gamma), stable.frames)
@@ -97,7 +98,7 @@ def loss_of_stability(relax: Relax, start: Equilibrium, gammas: Iterable[float])
 
 
 def _bisected(relax: Relax, stable: Equilibrium, unstable: float) -> float:
-    """Bisect between a stable equilibrium and a weight at which it is not."""
+    """Bisect between a stable equilibrium and a weight at which it is unstable."""
     while abs(unstable - stable.gamma) > BISECTION * unstable:
         middle = relax(0.5 * (stable.gamma + unstable), stable.frames)
         if middle.stable:
@@ -116,9 +117,10 @@ class RodProtocol(Protocol):
     """
 
     elements: int
-    """Of the finest chain, a multiple of 4, at least 16."""
+    """Number of elements of the finest chain, a multiple of 4, at least 16."""
 
     def __post_init__(self) -> None:
+        # The coarsest chain has a quarter of the elements.
         count = self.elements
         if isinstance(count, bool) or not isinstance(count, int) or count < 16 or count % 4:
             raise ValueError(f"elements: must be a multiple of 4 and at least 16, got {count!r}")
@@ -130,9 +132,10 @@ class RodProtocol(Protocol):
 # Natural curvature times L [rad]: 6 ... 25 pi.
 PHI = (6.0, 6.5, 7.0, 8.0, 10.0, 12.5, 16.0, 20.0, 27.0, 36.0, 48.0, 62.0, 25.0 * np.pi)
 
-# Branches are followed in these steps of gamma; close to the onset the three-dimensional window may
-# be narrower than one of them. From above they start at gamma = phi^3, where every such rod hangs
-# almost straight and stable, and end at gamma = 1e-4 phi^3, where all of it has curled up again.
+# Factor between the weights of a branch. Close to the onset the three-dimensional window may be
+# narrower than a single step. A branch starts at gamma = phi^3, at which every such rod hangs
+# almost straight and stable. It ends at gamma = 1e-4 phi^3, at which all of the rod has curled up
+# again.
 DOWN = 0.9
 DOWN_TO = 1e-4
 
@@ -141,8 +144,8 @@ DOWN_TO = 1e-4
 class BendTwist(RodProtocol):
     """The weight at which a curly rod leaves its plane [Miller et al. 2014; Romero et al. 2021].
 
-    Measured is the weight at which the Hessian along a branch of planar equilibria ceases to be
-    positive definite. An exactly planar rod stays planar. The master curve is
+    The protocol follows a branch of planar equilibria to the weight at which the Hessian ceases to
+    be positive definite. An exactly planar rod stays planar. The master curve is
     `master_curves.bend_twist`.
     """
 
@@ -168,7 +171,7 @@ class BendTwist(RodProtocol):
 def upper_boundary(phi: float, poisson: float, elements: int) -> float:
     """Return the weight at which the planar chain loses stability, or NaN.
 
-    The chain is followed from large weights downwards.
+    The search follows the chain from large weights downwards.
     """
     relax = round_rod(phi, poisson)
     start = relax(phi**3, planar_frames(np.zeros(elements + 1)))
@@ -203,7 +206,7 @@ class RodCantilever(RodProtocol):
 
 
 def drop_over_reach(gamma: float, elements: int) -> float:
-    """Return H/W of a straight chain clamped horizontally, NaN without a stable equilibrium."""
+    """Return H/W of a straight chain clamped horizontally, or NaN if it is not stable."""
     straight = planar_frames(np.full(elements + 1, 0.5 * np.pi))
     hanging = round_rod(0.0, 0.5)(gamma, straight)
     if not hanging.stable:
@@ -212,11 +215,11 @@ def drop_over_reach(gamma: float, elements: int) -> float:
     return float(-z / np.hypot(x, y))
 
 
-# Bending stiffness in the strip's plane over that across it; the buckling weight is a power series
-# in its inverse.
+# Bending stiffness in the strip's plane over the stiffness across it. The buckling weight is a
+# power series in the inverse of this ratio.
 STIFFNESS_RATIOS = (1000.0, 2000.0, 4000.0)
 
-# The weight over sqrt(EI GJ) grows from half of what buckles a strip, in these steps.
+# The weight over sqrt(EI GJ) grows from half of the buckling weight, by this factor in each step.
 UP_FROM = 6.0
 UP = 1.1
 UP_TO = 60.0
@@ -226,11 +229,9 @@ UP_TO = 60.0
 class RodLateralBuckling(RodProtocol):
     """The weight at which a strip that is clamped edge-on buckles sideways.
 
-    The master curve is `master_curves.lateral_buckling_rod`.
-
-    Measured is the loss of a positive definite Hessian as the weight of a strip grows that stays in
-    its vertical plane. The limit of a strip that does not bend in its own plane is reached by
-    extrapolation.
+    The weight of a strip grows while the strip stays in its vertical plane, until the Hessian
+    ceases to be positive definite. Extrapolation then gives the limit of a strip that does not bend
+    in its plane. The master curve is `master_curves.lateral_buckling_rod`.
     """
 
     name = "rod-lateral-buckling"
@@ -255,7 +256,8 @@ def buckling_weight(poisson: float, stiffness_ratio: float, elements: int) -> fl
     """Return rho A g L^3 / sqrt(EI GJ) at which a chain loses stability, or NaN."""
     # A thin strip: EI = Y w t^3 / 12 across its plane, GJ = Y w t^3 / (6 (1 + poisson)).
     twist = 2.0 / (1.0 + poisson)
-    stiffness = np.array([twist, 1.0, stiffness_ratio])  # d3 = -y is the axis it hardly bends about
+    # The strip hardly bends about d3 = -y.
+    stiffness = np.array([twist, 1.0, stiffness_ratio])
     straight = np.zeros((elements, 3))
 
     def relax(gamma: float, frames: Floats) -> Equilibrium:

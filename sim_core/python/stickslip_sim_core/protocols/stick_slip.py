@@ -1,11 +1,11 @@
 """Stick-Slip: the friction at which the tip of a buckled strip slips on a wall.
 
-Sources are [Sano et al. 2017; Romero et al. 2021].
+The sources are [Sano et al. 2017; Romero et al. 2021].
 
 A clamped strip without weight is pressed end-on against a wall. The clamp comes down by (rate t)^2
-times its length, so that Q/P, which goes with the square root of that strain, grows at an even
-pace, and the strain at which the tip leaves its place is the friction that the solver has, by
-`master_curves.stick_slip`.
+times the length of the strip. Q/P is proportional to the square root of this strain, so it grows at
+an even pace. At some strain the tip leaves its place. `master_curves.stick_slip` converts this
+strain to the friction of the solver.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,22 +28,25 @@ CELLS_ACROSS = 2
 DENSITY = 0.05  # kg/m^2
 RIGIDITY = 1e-4  # N m
 STRETCHING = 3e4  # N/m
-# 1/s: root of the strain; less where the tip slips below this root, so that steps resolve it as
-# well
+# Growth of the root of the strain [1/s]. It is slower if the tip slips below ROOT, so that steps
+# resolve such a slip as well.
 RATE = 5e-3
 ROOT = 0.25
-DAMPING = 20.0  # 1/s: the bounce of a buckling strip must not tear its tip off
+# Damping [1/s]: the bounce of a buckling strip must not tear its tip off.
+DAMPING = 20.0
 
-# Of the load, sideways, until the strip has decided for a side: without it a straight strip stays
-# straight.
+# Share of the load that acts sideways until the strip has buckled to a side. Without it a straight
+# strip stays straight.
 BIAS = 2e-4
 BIAS_UNTIL = 2e-3  # strain
 
-# Force in which a node's residual is measured, over its share of the buckling load.
+# Unit of residuals, over a node's share of the buckling load.
 FORCE_SHARE = 0.03
 
-MOVED = 2e-4  # of the length: a tip that has come so far has slipped
-LET_GO = 1e-6  # of the length: the slip began with the step after the last that moved it by less
+# Share of the length: a tip that has moved this far has slipped.
+MOVED = 2e-4
+# Share of the length: the slip begins after the last step that moves the tip by at most this.
+LET_GO = 1e-6
 
 # Strains of the phase diagram, and frictions beyond the triple point.
 PHASE_STRAIN = tuple(round(0.02 * i, 2) for i in range(1, 23))
@@ -55,18 +58,18 @@ EXTENDED = 2.0
 
 @dataclass(frozen=True)
 class Press:
-    """A strip that was pressed until its tip slipped, or to the end."""
+    """The result of pressing a strip until its tip slips, or to the largest strain."""
 
     slip: float
     """Strain at which the tip slipped, or NaN."""
 
     extended: float
-    """Strain at which more than the tip's vertices first touched the wall, or NaN."""
+    """Strain at which vertices besides the tip's first touched the wall, or NaN."""
 
     static_error: float
-    """Largest |relative error| of Q/P while the tip stuck, over the second half of its range.
+    """Largest |relative error| of Q/P while the tip stuck, or NaN without such a strain.
 
-    NaN if there is none.
+    It covers strains above a quarter of the last one, which is the second half of the range of Q/P.
     """
 
     cloth: Cloth
@@ -86,16 +89,17 @@ class StickSlip(RefinedProtocol):
     points = "friction"
 
     friction: Sequence[float] = FRICTION
-    """Of the wall, between 0 and the triple point's 0.356370."""
+    """Coefficients of friction of the wall, between 0 and 0.356370 at the triple point."""
     phases: bool = True
-    """Whether the finest grid is pressed beyond the triple point, too, for the phase diagram."""
+    """Whether to press the finest grid beyond the triple point, too, for the phase diagram."""
 
     diagram: list[tuple[float, float, float]] = field(default_factory=list, init=False, repr=False)
     """(mu, strain, regime) of the first mesh."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        master_curves.stick_slip_strain(self.friction)  # refuses what is not on it
+        # It refuses a friction that is not on the master curve, before anything runs.
+        master_curves.stick_slip_strain(self.friction)
 
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
         strain = self.press(cells, at["mesh"], x, master_curves.stick_slip_triple_point()[0]).slip
@@ -107,6 +111,7 @@ class StickSlip(RefinedProtocol):
     def press(self, cells: int, mesh: int, mu: float, end: float) -> "Press":
         """Press the strip of a mesh up to the strain `end`."""
         pressed = strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[mesh])
+        # Frictions beyond the triple point have no strain on the master curve.
         onset = np.sqrt(master_curves.stick_slip_strain(mu)) if mu in self.friction else ROOT
         found = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
         if mesh == 0 and cells == self.cells[-1]:
@@ -117,6 +122,7 @@ class StickSlip(RefinedProtocol):
         return found
 
     def reported(self) -> dict[str, Setting]:
+        # The measured curve ends at the triple point, and the diagram does not.
         for mu in PHASE_FRICTION if self.phases and self.kinds else ():
             self.press(self.cells[-1], 0, mu, PHASE_STRAIN[-1])
         columns = list(zip(*self.diagram, strict=True)) or [(), (), ()]
@@ -145,7 +151,7 @@ def press(
         held=held,
         force_scale=FORCE_SHARE * buckling / len(tip),
     )
-    # The wall is the floor, the clamp above it.
+    # The wall is the floor, and the clamp is above it.
     upright = np.stack(
         [np.zeros_like(clamped.along), clamped.across, LENGTH - clamped.along], axis=1
     )
@@ -158,6 +164,8 @@ def press(
     slip = extended = np.nan
     for step in range(1, int(np.sqrt(strain_end) / (rate * dt)) + 1):
         strain = (rate * step * dt) ** 2
+        # Compression gives the load of a straight strip. A buckled one bears about the buckling
+        # load.
         load = min(STRETCHING * width * strain, buckling)
         cloth.gravity[:] = [BIAS * load / mass * max(0.0, 1.0 - strain / BIAS_UNTIL), 0.0, 0.0]
         cloth.step(dt, held=clamp - [0.0, 0.0, strain * LENGTH], bodies=wall, damping=DAMPING)
@@ -169,17 +177,18 @@ def press(
         touching = np.flatnonzero(cloth.contacts >= 0)
         if np.isnan(extended) and not np.isin(touching, tip).all():
             extended = strain
+        # A position that is not a number ends the run as well.
         if not moved <= MOVED:
             break
     strain_at, ratio, moved_at = np.array(history).T
     if not moved_at[-1] <= MOVED:
         stuck = np.flatnonzero(np.abs(np.diff(moved_at, prepend=0.0)) <= LET_GO)
         last = int(stuck[-1]) if len(stuck) else 0
-        slip = (
-            rate * (last + 1.5) * dt
-        ) ** 2  # in the middle of the step in which it began to move
+        # The strain in the middle of the step in which the tip began to move.
+        slip = (rate * (last + 1.5) * dt) ** 2
         strain_at = strain_at[:last]
         ratio = ratio[:last]
+    # Compare Q/P at some 20 strains only, since each needs a solution of the master curve.
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
     )
@@ -189,9 +198,9 @@ def press(
 
 
 def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:
-    """Return (mu, strain, what the strip does there).
+    """Return (mu, strain, regime) at the strains of the phase diagram.
 
-    A tip that has slipped once is called slipping from then on.
+    A tip that has slipped once counts as slipping from then on.
     """
     points = []
     for strain in PHASE_STRAIN:

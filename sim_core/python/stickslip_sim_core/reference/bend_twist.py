@@ -22,14 +22,14 @@ def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
 
     Below it the rod turns three-dimensional.
 
-    The rod has natural curvature phi / L about d3 and no natural twist, GJ/EI = C = 1/(1 +
-    poisson), and is clamped with its tangent along gravity. The boundary is the Gamma at which the
-    planar equilibrium, followed from large Gamma downwards, ceases to be a strict minimum over all
-    rotations. NaN where phi is below `bend_twist_onset`: there the planar equilibrium is stable for
-    every weight.
+    The rod has natural curvature phi / L about d3 and no natural twist. Its stiffness is GJ/EI = C
+    = 1/(1 + poisson), and it is clamped with its tangent along gravity. The boundary is the Gamma
+    at which the planar equilibrium, followed from large Gamma downwards, ceases to be a strict
+    minimum over all rotations. The result is NaN for phi below `bend_twist_onset`, because the
+    planar equilibrium is then stable for every weight.
 
-    With Lambda = Gamma^{1/3}, k = phi / Lambda, sigma = (1 - s) Lambda from the free end and a dot
-    for d/dsigma, the planar rod [theta: angle from gravity to tangent; q: moment about d3] is
+    Let Lambda = Gamma^{1/3}, k = phi / Lambda, and sigma = (1 - s) Lambda from the free end, with a
+    dot for d/dsigma. The planar rod [theta: angle from gravity to tangent; q: moment about d3] is
 
         theta. = -(k + q),   q. = -sigma sin theta,   q(0) = 0,   theta(Lambda) = 0.
 
@@ -39,9 +39,9 @@ def bend_twist(phi: ArrayLike, poisson: float) -> Floats:
         mu0. = -k mu1,   mu1. = (k + q) mu0 - q mu0 / C - sigma eta,
         eta. = -cos(theta) mu1 - sin(theta) mu0 / C
 
-    from mu0 = mu1 = 0, eta = 1 at the free end: the rotation about gravity being the other
-    solution, the determinant of Jacobi's fields is eta. The planar rod is a minimum while eta has
-    no zero; on the boundary the first zero, coming from infinity, is at the clamp: eta(Lambda) = 0.
+    from mu0 = mu1 = 0, eta = 1 at the free end. The rotation about gravity is the other solution,
+    so the determinant of Jacobi's fields is eta. The planar rod is a minimum while eta has no zero.
+    On the boundary the first zero, coming from infinity, is at the clamp: eta(Lambda) = 0.
 
     Args:
         phi: Natural curvature times L [rad], > 0, any shape.
@@ -66,7 +66,7 @@ class _BoundaryPoint:
     """A planar rod on the Bend-Twist boundary."""
 
     Lambda: float
-    """Gamma^{1/3}."""
+    """Cube root of the weight Gamma."""
 
     phi: float
     fields: Callable[[Floats], Floats]
@@ -76,17 +76,17 @@ class _BoundaryPoint:
 class _Boundary:
     """The boundary curve of a Poisson's ratio, (Lambda, phi(Lambda)).
 
-    It is followed from an anchor along a ladder.
-
-    The ladder of Lambda is climbed from the anchor always, so that no point depends on earlier
-    calls.
+    The curve starts from an anchor and follows a ladder of values of Lambda. Every climb starts at
+    the anchor, so no point depends on earlier calls.
     """
 
-    UP = 1.1  # ratio of neighbours on the ladder above the anchor
-    DOWN = 0.97  # the same below it, where rods differ more
-    TOLERANCE = 1e-12  # on Lambda, relative
-    # phi from which rods are alike: their fields fall as exp(-(2/3) sigma^1.5), to 1e-30 at the
-    # clamp
+    # Ratio of neighbours on the ladder above the anchor.
+    UP = 1.1
+    # Ratio of neighbours below the anchor. Rods differ more there.
+    DOWN = 0.97
+    TOLERANCE = 1e-12  # relative, on Lambda
+    # From this phi on rods are alike: their fields fall as exp(-(2/3) sigma^1.5), to 1e-30 at the
+    # clamp.
     LONG = 40.0
 
     def __init__(self, poisson: float) -> None:
@@ -97,7 +97,7 @@ class _Boundary:
     @cached_property
     def onset(self) -> _BoundaryPoint:
         """The point of least phi, by parabolas through three points ever closer."""
-        # Down the ladder to the least phi; then parabolas, each through closer points.
+        # Go down the ladder to the least phi. Then fit parabolas, each through closer points.
         rung = 0
         while self._rung(-rung - 1).phi < self._rung(-rung).phi:
             rung += 1
@@ -112,13 +112,14 @@ class _Boundary:
         return best
 
     def gamma_at(self, phi: float) -> float:
-        """Gamma on the upper side of the curve, NaN if there is none."""
+        """Gamma on the upper side of the curve, or NaN for phi below the onset."""
         if phi < self.onset.phi:
             return np.nan
+        # Lambda is proportional to phi for long rods.
         if phi > self.LONG:
             return self.gamma_at(self.LONG) * (phi / self.LONG) ** 3
 
-        # Two rungs bracket the weight. Each trial starts at the last one.
+        # Two rungs bracket the weight. Each trial starts at the last trial, which is near.
         rung = 0
         while self._rung(rung).phi < phi:
             rung += 1
@@ -133,18 +134,19 @@ class _Boundary:
         return float(brentq(missed, min(known), max(known), xtol=1e-15, rtol=self.TOLERANCE)) ** 3
 
     def _rung(self, rung: int) -> _BoundaryPoint:
-        """Rung of the ladder: 0 is the anchor, positive ones are above."""
+        """Rung of the ladder. Rung 0 is the anchor, and positive rungs are above it."""
         ladder, ratio = (self._up, self.UP) if rung >= 0 else (self._down, self.DOWN)
         while len(ladder) <= abs(rung):
             ladder.append(self._solve(ladder[0].Lambda * ratio ** len(ladder), ladder[-1]))
         return ladder[abs(rung)]
 
     def _solve(self, Lambda: float, near: _BoundaryPoint) -> _BoundaryPoint:
-        """Find phi for this Lambda, from a point near by."""
+        """Find phi for this Lambda, starting from a point nearby."""
         mesh = place = _mesh(Lambda)
-        # Rods of more than a few units of sigma look alike in sigma, shorter ones in s.
+        # Rods of more than a few units of sigma look alike in sigma, and shorter rods in s. Beyond
+        # the clamp of the near rod the guess takes the values at this clamp.
         if not 0.95 < Lambda / near.Lambda < 1.05:
-            place = np.minimum(mesh * Lambda / near.Lambda, 1.0)  # beyond its clamp as at its clamp
+            place = np.minimum(mesh * Lambda / near.Lambda, 1.0)
 
         def change(x: Floats, y: Floats, p: Floats) -> Floats:
             return Lambda * _rates(Lambda * x, y, p[0] / Lambda, self.C)
@@ -154,6 +156,7 @@ class _Boundary:
 
         phi = near.phi * max(Lambda / near.Lambda, 1.0)
         found = solve_boundary_values(change, ends, mesh, near.fields(place), np.array([phi]))
+        # A zero of eta before the clamp means that the rod was unstable already.
         if found.y[4].min() < -1e-9:
             raise NotSolvedError(
                 f"bend_twist: at Lambda = {Lambda} another mode becomes unstable first"
@@ -163,11 +166,12 @@ class _Boundary:
     def _anchor(self) -> _BoundaryPoint:
         """Follow the planar rod from large weights down until eta has passed zero at the clamp.
 
-        Above the boundary eta grows as exp(2/3 Lambda^{3/2}) from the free end to the clamp; scaled
-        to one at the clamp the problem is a good one, and the sign to watch is that at the free
-        end.
+        Above the boundary eta grows as exp(2/3 Lambda^{3/2}) from the free end to the clamp. With
+        eta scaled to one at the clamp the problem is well conditioned, and the sign of eta at the
+        free end shows the boundary.
         """
-        phi = 7.0  # a little more than the onset, which is at 5.56 (C = 2/3) ... 6.39 (C = 1)
+        # A little more than the onset, which is at 5.56 (C = 2/3) ... 6.39 (C = 1).
+        phi = 7.0
         mesh = _mesh(phi)
         fields = np.zeros((5, len(mesh)))
         for ratio in np.arange(1.2, 0.3, -0.03):
@@ -186,12 +190,13 @@ class _Boundary:
                 break
         else:
             raise NotSolvedError("bend_twist: the planar rod of phi = 7 stays stable")
+        # `_solve` has eta = 1 at the free end, so scale the linear fields to it.
         scale = np.array([1.0, 1.0, tip, tip, tip])[:, None]
         return self._solve(Lambda, _BoundaryPoint(Lambda, phi, lambda x: found.sol(x) / scale))
 
 
 def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:
-    """d/dsigma of (theta, q, mu0, mu1, eta): see bend_twist."""
+    """Return d/dsigma of (theta, q, mu0, mu1, eta), as in the equations of `bend_twist`."""
     theta, q, mu0, mu1, eta = y
     sine = np.sin(theta)
     cosine = np.cos(theta)
@@ -209,7 +214,8 @@ def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:
 def _mesh(Lambda: float) -> Floats:
     """Return the mesh over sigma / Lambda.
 
-    It is fine where the rod curls, and wide where it hangs straight to rounding (sigma > 16).
+    The mesh is fine in the curled part of the rod. It is wide for sigma > 16, because the rod hangs
+    straight there up to rounding.
     """
     if Lambda <= 16.0:
         return np.linspace(0.0, 1.0, 33)

@@ -1,7 +1,7 @@
 """Boundary value problems of the master curves, and the rules of their arguments.
 
 Every curve of a rod, or of a strip that bends in one direction, comes from the differential
-equations of the continuous rod, solved by scipy's collocation to `TOLERANCE`.
+equations of the continuous rod. scipy's collocation solves them to `TOLERANCE`.
 """
 
 from typing import Any
@@ -13,11 +13,11 @@ from scipy.integrate import solve_bvp
 from stickslip_sim_core.arrays import Floats
 
 TOLERANCE = 1e-9
-"""Residual of the differential equations, relative."""
+"""Largest relative residual of the differential equations."""
 
 
 class NotSolvedError(RuntimeError):
-    """A boundary value problem has no solution near the guess, or not the one that is meant."""
+    """A boundary value problem has no solution near the guess, or another than the wanted one."""
 
 
 def solve_boundary_values(
@@ -25,7 +25,7 @@ def solve_boundary_values(
 ) -> Any:
     """Solve y' = rate(x, y, p) with ends(y(first), y(last), p) = 0, from a guess.
 
-    P where there are parameters.
+    Without `parameters`, `rate` and `ends` take no p.
     """
     found = solve_bvp(rate, ends, mesh, y, parameters, tol=TOLERANCE, max_nodes=100_000)
     if not found.success:
@@ -34,7 +34,11 @@ def solve_boundary_values(
 
 
 def positive(name: str, values: ArrayLike) -> Floats:
-    """Return `values` as float64 of their own shape."""
+    """Return `values` as float64 in the same shape.
+
+    Raises:
+        ValueError: A value is not finite and > 0.
+    """
     array = _real(name, values)
     wrong = array[~(np.isfinite(array) & (array > 0.0))]
     if wrong.size:
@@ -45,7 +49,11 @@ def positive(name: str, values: ArrayLike) -> Floats:
 def within(
     name: str, values: ArrayLike, low: float, high: float, *, open_below: bool = False
 ) -> Floats:
-    """Return `values` as float64 of their own shape."""
+    """Return `values` as float64 in the same shape.
+
+    Raises:
+        ValueError: A value is outside [low, high], or (low, high] with `open_below`.
+    """
     array = _real(name, values)
     above = array > low if open_below else array >= low
     wrong = array[~(above & (array <= high))]

@@ -21,8 +21,8 @@ def cantilever(gamma: ArrayLike) -> Floats:
         psi'' = gamma (1 - s) sin psi,   psi(0) = pi/2,   psi'(1) = 0,
         H = int cos psi ds,   W = int sin psi ds.
 
-    Of the solutions the one with 0 < psi <= pi/2 is meant; there the energy is convex, so there is
-    no other such.
+    The curve takes the solution with 0 < psi <= pi/2. The energy is convex in this range, so the
+    solution is unique.
 
     Args:
         gamma: Weight against bending, rho A g L^3 / EI [-], > 0, any shape.
@@ -35,8 +35,8 @@ def cantilever(gamma: ArrayLike) -> Floats:
 
 
 def _cantilever(gamma: float) -> float:
-    # Widths of the layers at the clamp and at the free end; the fields are psi, psi' / rate, and H
-    # and W, both scaled.
+    # Heavy strips bend in thin layers at the clamp and at the free end, so the mesh is fine there.
+    # The fields are psi, psi' / rate, and H and W, both scaled.
     rate = max(1.0, np.sqrt(gamma))
     clamp = 1.0 / rate
     tip = min(1.0, gamma ** (-1.0 / 3.0))
@@ -46,7 +46,7 @@ def _cantilever(gamma: float) -> float:
         )
     )
 
-    # A light strip drops in proportion to gamma: scale the drop, so that it keeps its digits.
+    # A light strip drops in proportion to gamma. Scaling keeps the digits of the drop.
     light = min(1.0, gamma)
 
     def change(s: Floats, y: Floats) -> Floats:

@@ -9,18 +9,17 @@ from stickslip_sim_core.reference.boundary_values import positive, within
 
 
 def capstan(mu: ArrayLike, wrap: float, bending: float = 0.0) -> Floats:
-    """Return T2/T1, the ratio of a heavy pull and a light one, of a strip over a cylinder.
+    """Return T2/T1, the ratio of the heavy pull to the light pull on a strip over a cylinder.
 
-    The strip slides.
-
-    A strip without weight, of stiffness D against bending, goes over a cylinder of radius R. With B
-    = D / (2 R^2) each free end meets the cylinder where 1 - cos(phi_i) = B / T_i, and presses on it
-    there with sqrt(2 T_i B - B^2), which rubs, too:
+    The strip slides. It has no weight and the bending stiffness D, and the cylinder has the radius
+    R. Let B = D / (2 R^2). Each free end meets the cylinder at an angle phi_i, for which
+    1 - cos(phi_i) = B / T_i. There it presses on the cylinder with sqrt(2 T_i B - B^2), and this
+    force rubs, too:
 
         N1 = T1 - B + mu sqrt(2 T1 B - B^2),
         T2 - B - mu sqrt(2 T2 B - B^2) = N1 exp(mu (wrap - phi_1 - phi_2)).
 
-    Without bending it is Euler's exp(mu wrap) [Euler 1769; Stuart 1961].
+    Without bending the ratio is Euler's exp(mu wrap) [Euler 1769; Stuart 1961].
 
     Args:
         mu: Coefficient of friction, >= 0, any shape.
@@ -39,6 +38,7 @@ def capstan(mu: ArrayLike, wrap: float, bending: float = 0.0) -> Floats:
 
 
 def _capstan(mu: float, wrap: float, bending: float) -> float:
+    # A stiff strip needs some angle at either end to bend onto the cylinder.
     first = np.arccos(1.0 - bending)
     if not wrap > 2.0 * first:
         raise ValueError(
@@ -51,7 +51,8 @@ def _capstan(mu: float, wrap: float, bending: float) -> float:
         lying = wrap - first - np.arccos(1.0 - bending / heavy)
         return float((heavy - bending - tail) / (light * np.exp(mu * lying)) - 1.0)
 
-    # The heavy pull is at least the light one, 1, and has no bound: double a bracket until it fits.
+    # The heavy pull is at least the light pull, 1, and has no upper bound. Double the bracket until
+    # it contains the heavy pull.
     high = 2.0
     while missed(high) < 0.0:
         high *= 2.0

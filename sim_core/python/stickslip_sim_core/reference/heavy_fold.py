@@ -20,27 +20,28 @@ class HeavyFold:
     """A fold at rest, in units of the gravito-bending length L_gb = (D / (rho g))^(1/3)."""
 
     height: float
-    """Of its highest point over the layer below."""
+    """Height of the highest point over the layer below."""
 
     loop_length: float
-    """Of the strip between where it lifts off and where it lands."""
+    """Length of the strip between its lift-off and its landing."""
 
     nose_to_landing: float
-    """Horizontal distance."""
+    """Horizontal distance between the nose of the loop and the landing."""
 
     landing_force: float
-    """Of the layer below on the strip where it lands, over rho g L_gb."""
+    """Force of the layer below on the strip at the landing, over rho g L_gb."""
 
     tension: float
-    """Of the strip where it lands, likewise: what holds the upper layer back besides friction."""
+    """Tension of the strip at the landing, over rho g L_gb.
+
+    It holds the upper layer back besides friction.
+    """
 
     def pull(self, mu: ArrayLike, tail: ArrayLike) -> Floats:
         """Return the force over rho g L_gb, away from the loop, at which the upper layer slips.
 
-        The force is horizontal.
-
-        Friction bears mu (weight of the tail + landing force), and the loop holds back by its
-        tension.
+        The force is horizontal. Friction bears mu (weight of the tail + landing force), and the
+        tension of the loop holds the layer back.
 
         Args:
             mu: Friction of the strip with itself.
@@ -53,16 +54,16 @@ class HeavyFold:
 def heavy_fold(gap: float) -> HeavyFold:
     """Return the shape of a strip that is folded onto itself on a floor under its own weight.
 
-    With theta the angle of the tangent, which lifts off at s = 0 and lands on the layer below at
-    the height `gap`, kappa = theta', and the force (H, V + s) in the strip,
+    The strip lifts off at s = 0, and lands on the layer below at the height `gap`. With the angle
+    theta of its tangent, kappa = theta', and the force (H, V + s) in the strip,
 
         kappa' = H sin(theta) - (V + s) cos(theta),   x' = cos(theta),   y' = sin(theta),
         theta = kappa = y = 0 at s = 0,   theta = pi, kappa = 0, y = gap at the end.
 
-    kappa^2/2 + n . t - y is constant, so that H = -gap/2: friction changes nothing.
+    kappa^2/2 + n . t - y is constant, so H = -gap/2. Friction thus changes nothing.
 
     Args:
-        gap: Height of the upper layer over the lower one where it lands, over L_gb, in (0, 0.5].
+        gap: Height of the upper layer over the lower layer at the landing, over L_gb, in (0, 0.5].
 
     Raises:
         ValueError: The gap breaks its rule.
@@ -78,7 +79,7 @@ def heavy_fold(gap: float) -> HeavyFold:
     def ends(first: Floats, last: Floats, _: Floats) -> Floats:
         return np.array([*first, last[0] - np.pi, last[1], last[3] - gap])
 
-    # A guess that rises to 1.3 pi and comes back, by eye.
+    # A guess by eye, which rises to 1.3 pi and comes back.
     s = np.linspace(0.0, 1.0, 101)
     theta = np.where(
         s < 0.5, np.pi * 1.3 * np.sin(np.pi * s) ** 2, np.pi * (1.0 + 0.3 * np.sin(np.pi * s) ** 2)
@@ -92,7 +93,7 @@ def heavy_fold(gap: float) -> HeavyFold:
         np.array([0.0, -3.0, 5.0]),
     )
 
-    # The nose is where the tangent is upright, the top where it is level again.
+    # The tangent is upright at the nose, and level again at the top.
     H, V, length = found.p
     nose, top = (
         found.sol(
@@ -102,6 +103,7 @@ def heavy_fold(gap: float) -> HeavyFold:
         )
         for angle in (np.pi / 2.0, np.pi)
     )
+    # The equations have other solutions, which are no folds.
     if not (found.y[0].max() > np.pi and length > 0.0 and V < 0.0):
         raise NotSolvedError(f"heavy_fold: the solution at gap = {gap} is not the fold")
     return HeavyFold(

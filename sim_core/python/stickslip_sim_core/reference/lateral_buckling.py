@@ -15,15 +15,14 @@ from stickslip_sim_core.reference.boundary_values import within
 def lateral_buckling_rod() -> float:
     """Return the weight rho A g L^3 / sqrt(EI GJ) at which a strip buckles sideways.
 
-    The strip is clamped edge-on, in the limit w/L -> 0.
-
-    A strip that cannot bend in its own plane stays straight until then. With x from the free end,
-    EI its bending stiffness across the plane, GJ its twisting stiffness and eta the sideways slope,
+    The strip is clamped edge-on, in the limit w/L -> 0. It cannot bend in its plane, so it stays
+    straight until it buckles. With x from the free end, the bending stiffness EI across the plane,
+    the twisting stiffness GJ and the sideways slope eta,
 
         eta'' + (weight / 2)^2 x^4 eta = 0,   eta'(0) = 0,   eta(1) = 0,
         eta = sqrt(x) J_{-1/6}(weight x^3 / 6)
 
-    [Prandtl 1899]: six times the first zero of the Bessel function J_{-1/6}.
+    [Prandtl 1899]. The weight is six times the first zero of the Bessel function J_{-1/6}.
     """
     return 6.0 * float(brentq(partial(jv, -1.0 / 6.0), 1.5, 2.5, xtol=1e-15))
 
@@ -31,14 +30,14 @@ def lateral_buckling_rod() -> float:
 def lateral_buckling(aspect: ArrayLike, poisson: float) -> Floats:
     """Return the weight Gamma* = rho_A g L^3 / D at which a plate strip buckles, to 5e-5.
 
-    The strip is clamped edge-on and buckles sideways.
+    The strip has length L and width aspect * L, and buckles sideways. One of its short edges is
+    clamped in displacement and slope, with the width vertical. Its other edges are free. Its mass
+    per area is rho_A, and its bending rigidity is D = Y h^3 / (12 (1 - poisson^2)). In units of
+    rho_A g L^3 / (Y h^3 / 12) the answer is Gamma* / (1 - poisson^2).
 
-    The strip of length L and width aspect * L is clamped along one short edge, with its width
-    vertical, in displacement and slope; its other edges are free. rho_A is its mass per area, D = Y
-    h^3 / (12 (1 - poisson^2)) its bending rigidity, so that per unit of rho_A g L^3 / (Y h^3 / 12)
-    the answer is Gamma* / (1 - poisson^2). Plane stress under its weight and Kirchhoff's plate,
-    both linear until it buckles: a strip much thinner than wide. How they are solved:
-    plate_buckling.py. As aspect goes to zero,
+    The model is plane stress under the weight and Kirchhoff's plate, both linear until the strip
+    buckles. It holds for a strip that is much thinner than wide. plate_buckling.py solves it. As
+    aspect goes to zero,
 
         Gamma* = lateral_buckling_rod() sqrt(2 / (1 + poisson)) (1 - poisson^2) (1 + O(aspect)).
 

@@ -1,6 +1,6 @@
 """Master curves: the values that physics predicts for the protocols.
 
-They are computed here and never tabulated. Each has a module of its own:
+They are computed and never tabulated. Each curve has a module:
 
     cantilever            drop over reach of a strip that is clamped horizontally
     lateral_buckling      weight at which a strip that is clamped edge-on buckles
@@ -9,9 +9,9 @@ They are computed here and never tabulated. Each has a module of its own:
     capstan               ratio of the pulls on a strip over a cylinder
     heavy_fold            shape of a strip that is folded onto itself
 
-Curves of rods and strips are solved to 1e-9 (boundary_values.py); that of a plate to 5e-5
-(plate_buckling.py). They have nothing in common with the solvers that are measured, so that a
-protocol compares two independent computations. Symbols, definitions and figures: docs/protocols.md.
+Curves of rods and strips are solved to 1e-9 (boundary_values.py), and the curve of a plate to 5e-5
+(plate_buckling.py). They share no code with the measured solvers, so a protocol compares two
+independent computations. docs/protocols.md has symbols, definitions and figures.
 """
 
 from stickslip_sim_core.reference.bend_twist import bend_twist, bend_twist_onset

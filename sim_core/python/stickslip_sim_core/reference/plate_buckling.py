@@ -1,14 +1,12 @@
 """Lateral buckling of a plate strip under its own weight, by Ritz's method.
 
-Plane stress comes first, then Kirchhoff's plate.
-
 The strip fills 0 <= x <= 1, |y| <= w / 2 (lengths in units of L). It is clamped along x = 0, and
-its weight pulls it along -y, in its plane. Thickness h and Young's modulus Y enter the stiffnesses
-only, and the answer does not depend on them:
+its weight pulls it along -y, in its plane. Thickness h and Young's modulus Y enter only the
+stiffnesses, and the answer does not depend on them. The method has two steps:
 
 1. Plane stress. Displacements (u, v) with u = v = 0 at the clamp minimise 1/2 int N : eps - int
-   (rho_A g) (-v), where N = Y h / (1 - nu^2) [(1 - nu) eps + nu tr(eps) I]. Every other edge is
-   free. The membrane forces N are statically determined up to the clamp: in units of rho_A g L they
+   (rho_A g) (-v), with N = Y h / (1 - nu^2) [(1 - nu) eps + nu tr(eps) I]. Every other edge is
+   free. The membrane forces N are statically determined up to the clamp. In units of rho_A g L they
    depend on w and nu alone.
 2. Kirchhoff's plate. The strip leaves its plane at the least Gamma = rho_A g L^3 / D, D = Y h^3 /
    (12 (1 - nu^2)), at which with W = dW/dx = 0 at the clamp the second variation
@@ -16,15 +14,17 @@ only, and the answer does not depend on them:
        int (lap W)^2 - 2 (1 - nu) (W_xx W_yy - W_xy^2) + Gamma int N_xx W_x^2 + 2 N_xy W_x W_y +
        N_yy W_y^2
 
-   has a zero [Timoshenko and Gere 1961, Sec. 8.2]. The plate is thin, so that nothing turns before
-   it buckles.
+   has a zero [Timoshenko and Gere 1961, Sec. 8.2]. The plate is thin, so nothing turns before it
+   buckles.
 
-Both fields are products of piecewise polynomials on meshes graded towards the two corners at the
-clamp, where the stresses are singular. A basis whose highest derivative is orthonormal, integrated
-from zero, keeps the matrices well conditioned however small the elements. Turned over, the strip is
-pulled the other way: u is odd in y and v even, N_xx and N_yy are odd and N_xy even, so that N
-couples even W with odd W only. With stiffnesses A, B of the two and coupling C, Gamma is one over
-the largest singular value of A^{-1/2} C B^{-1/2}. Half the strip, y > 0, is enough.
+Both fields are products of piecewise polynomials. Stresses are singular at the two corners of the
+clamp, so the meshes are graded towards them. A basis whose highest derivative is orthonormal,
+integrated from zero, keeps the matrices well conditioned for elements of any size.
+
+A strip that is turned over is pulled the other way. Therefore u is odd in y and v is even, N_xx and
+N_yy are odd and N_xy is even, and N couples only even W with odd W. With their stiffnesses A, B and
+the coupling C, Gamma is one over the largest singular value of A^{-1/2} C B^{-1/2}. Half the strip,
+y > 0, is enough.
 """
 
 from dataclasses import dataclass
@@ -34,12 +34,13 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 
-# Degree of the highest derivatives, W_xx and u_x; elements between the clamp and x = w, and between
-# an edge and y = 0.
+# Degree of the highest derivatives, W_xx and u_x.
 DEGREE = 4
+# Number of elements between the clamp and x = w, and between an edge and y = 0.
 LAYERS = 4
 
-# Each layer is so many times as long as the one before; beyond x = w twice, up to the longest.
+# Ratio of a layer's end to the end of the layer before. Beyond x = w elements double the distance
+# from the clamp, up to the longest element.
 GRADING = 4.0
 LONGEST = 0.25
 
@@ -52,7 +53,7 @@ class _Axis:
     """Weights of the Gauss points, shape (p,)."""
 
     values: tuple[Floats, ...]
-    """Derivatives 0, 1 (and 2) of the functions, shape (p, n) each."""
+    """Derivatives 0, 1 and, for the plate, 2 of the functions, shape (p, n) each."""
 
     @property
     def size(self) -> int:
@@ -80,6 +81,7 @@ def buckling_weight(
             (N_xy, (0, 1), (1, 0)),
         )
     )
+    # Cholesky factors serve as the square roots of A and B: singular values are the same.
     scaled = np.linalg.solve(np.linalg.cholesky(stiff_even), coupling)
     scaled = np.linalg.solve(np.linalg.cholesky(stiff_odd), scaled.T)
     return float(1.0 / np.linalg.norm(scaled, 2))
@@ -91,6 +93,7 @@ def _breaks_along(aspect: float, layers: int) -> Floats:
     while breaks[-1] < 1.0:
         left = 1.0 - breaks[-1]
         step = min(breaks[-1], LONGEST)
+        # Stretch the last element rather than add a short one.
         breaks.append(1.0 if left < 1.5 * step else breaks[-1] + step)
     return np.array(breaks)
 
@@ -100,14 +103,14 @@ def _breaks_across(aspect: float, layers: int) -> Floats:
 
 
 def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _Axis:
-    """Return orthonormal functions whose derivative is a Legendre polynomial on an element.
+    """Return functions whose derivative is an orthonormal Legendre polynomial on an element.
 
-    `order` says which derivative.
-
-    They and their lower derivatives are zero at the first breakpoint. `start` adds the power of the
-    coordinate that makes them complete among even (0) or odd (1) functions.
+    `order` is the number of this derivative. The functions and their lower derivatives are zero at
+    the first breakpoint. `start` adds the power of the coordinate that makes them complete among
+    even (0) or odd (1) functions.
     """
-    count = (3 * (degree + 2) + 1) // 2  # points of a rule that is exact for three factors
+    # The number of points of a rule that is exact for three factors.
+    count = (3 * (degree + 2) + 1) // 2
     nodes, weights = np.polynomial.legendre.leggauss(count)
     half = np.diff(breaks) / 2.0
     # From the left end of an element of length 2: Legendre's polynomials and their repeated
@@ -122,17 +125,17 @@ def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _A
         norm = np.sqrt((np.arange(n) + 0.5) / half[e])
         columns = slice(e * n, (e + 1) * n)
         at_end = np.zeros((order + 1, n))
-        for k in range(order + 1):  # k integrals: derivative order - k
+        # k integrals give the derivative `order - k`.
+        for k in range(order + 1):
             scale = norm * half[e] ** k
             rows = slice(e * count, (e + 1) * count)
             values[order - k][rows, columns] = (
                 np.polynomial.legendre.legval(nodes, local[k].T).T * scale
             )
             at_end[k] = np.polynomial.legendre.legval(1.0, local[k].T) * scale
-        at_end[0] = (
-            # beyond its element the highest derivative is zero, and Taylor's polynomial goes on
-            0.0
-        )
+        # Beyond its element the highest derivative is zero. Taylor's polynomial at the end of the
+        # element gives the lower derivatives.
+        at_end[0] = 0.0
         beyond = (breaks[e + 1 : -1, None] + half[e + 1 :, None] * (nodes + 1.0)).ravel() - breaks[
             e + 1
         ]
@@ -170,7 +173,8 @@ def _product(
     orders_across: tuple[int, int],
     two: _Axis,
 ) -> Floats:
-    """The same with a weight of one."""
+    """Integrate derivatives of the products of two sets of functions, with a weight of one."""
+    # Without a weight the integral is the product of two integrals of one coordinate each.
     (a, b) = orders_along
     (c, d) = orders_across
     first = along.values[a].T @ (along.weights[:, None] * along.values[b])
@@ -183,7 +187,7 @@ def _membrane_forces(
 ) -> tuple[Floats, Floats, Floats]:
     """Return N_xx, N_yy, N_xy over rho_A g L at the Gauss points, shape (points in x, points in y).
 
-    In units of Y h / (1 - nu^2) = 1.
+    The computation has units in which Y h / (1 - nu^2) = 1.
     """
     shear = (1.0 - poisson) / 2.0
     along, even, odd = (
@@ -213,7 +217,7 @@ def _membrane_forces(
 
 
 def _bending_stiffness(along: _Axis, across: _Axis, poisson: float) -> Floats:
-    """Matrix of int W_xx^2 + W_yy^2 + 2 nu W_xx W_yy + 2 (1 - nu) W_xy^2."""
+    """Return the matrix of int W_xx^2 + W_yy^2 + 2 nu W_xx W_yy + 2 (1 - nu) W_xy^2."""
     cross = _product(along, (2, 0), across, (0, 2), across)
     return (
         _product(along, (2, 2), across, (0, 0), across)

@@ -17,23 +17,24 @@ from stickslip_sim_core.reference.boundary_values import (
 def stick_slip(strain: ArrayLike) -> Floats:
     """Return mu = Q/P of a strip pressed end-on against a wall: at less friction its tip slips.
 
-    The strip of length 1 is clamped at the origin, upright; the wall has come down from height 1 to
-    1 - strain, and acts on the tip with (Q, -P) in units of EI / L^2. With theta from the x axis to
-    the tangent and primes d/ds,
+    The strip of length 1 is clamped upright at the origin. The wall has come down from height 1 to
+    1 - strain, and acts on the tip with (Q, -P) in units of EI / L^2. With the angle theta from the
+    x axis to the tangent and primes d/ds,
 
         theta'' = P cos theta + Q sin theta,   x' = cos theta,   y' = sin theta,
         theta(0) = pi/2,   theta'(1) = 0,   x(0) = y(0) = x(1) = 0,   y(1) = 1 - strain
 
-    (the thesis's Eq. 3.1 with its sine and cosine the right way round) [Sano et al. 2017]. The tip,
-    on its line, sticks while mu >= Q/P. Of the two mirrored solutions that with theta(1) > pi/2, Q
-    > 0 is meant, of all the modes the first one: P = 20.1907 at buckling. For small strains Q/P =
+    [Sano et al. 2017]. The thesis's Eq. 3.1 exchanges sine and cosine. The tip, on its line, sticks
+    while mu >= Q/P. The curve takes the first mode, with P = 20.1907 at buckling. Of its two
+    mirrored solutions it takes the solution with theta(1) > pi/2, Q > 0. For small strains Q/P =
     0.44510 sqrt(strain).
 
-    Beyond `stick_slip_triple_point` there is no answer: the strip lies on the wall with more than
+    The curve ends at `stick_slip_triple_point`. Beyond it the strip lies on the wall with more than
     its tip.
 
-    Args: strain: Displacement of the wall over the length of the strip [-], > 0 and at most that of
-        the triple point (to 1e-9), any shape.
+    Args:
+        strain: Displacement of the wall over the length of the strip [-], any shape. It is > 0 and
+            at most the strain of the triple point (to 1e-9).
 
     Raises:
         ValueError: A strain is outside its range.
@@ -49,12 +50,13 @@ def stick_slip(strain: ArrayLike) -> Floats:
 
 
 def stick_slip_strain(friction: ArrayLike) -> Floats:
-    """Return the strain at which a strip slips that is pressed end-on against a wall.
+    """Return the strain at which a strip that is pressed end-on against a wall slips.
 
     It is the inverse of `stick_slip`.
 
-    Args: friction: Coefficient of friction mu [-], > 0 and at most that of the triple point (to
-        1e-9), any shape. At a higher one the strip never slips.
+    Args:
+        friction: Coefficient of friction mu [-], any shape. It is > 0 and at most the friction of
+            the triple point (to 1e-9). At a higher friction the strip never slips.
 
     Raises:
         ValueError: A friction is outside its range.
@@ -72,7 +74,7 @@ def stick_slip_strain(friction: ArrayLike) -> Floats:
 def stick_slip_triple_point() -> tuple[float, float]:
     """Return (strain, mu) at which sticking, slipping and lying on the wall meet.
 
-    There, theta(1) = pi.
+    At this point theta(1) = pi.
     """
     return _pressed(lambda w, p: p[2] * w - np.pi / 2.0, 0.33)
 
@@ -80,10 +82,10 @@ def stick_slip_triple_point() -> tuple[float, float]:
 def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple[float, float]:
     """Return (strain, Q/P) of the strip that fulfils a further condition.
 
-    The condition is on w(1) and (P, q, a); the search begins at a guessed strain.
+    The condition is on w(1) and (P, q, a). The search begins at a guessed strain.
 
     With a = sqrt(strain), theta = pi/2 + a w and Q = a q the problem has no bifurcation, and a may
-    be as small as it likes:
+    be arbitrarily small:
 
         w'' = -P sin(a w) / a + q cos(a w),   w(0) = w'(1) = 0,
         int sin(a w) / a = 0,   int (1 - cos(a w)) / a^2 = 1.
@@ -104,11 +106,13 @@ def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple
         at_clamp = [first[0], first[2], first[3]]
         return np.stack([*at_clamp, last[1], last[2], last[3] - 1.0, condition(last[0], p)])
 
+    # The guess is the solution for a = 0. k is the first root of tan k = k above zero.
     k = 4.493409457909064
     s = np.linspace(0.0, 1.0, 7)
     w = 1.0 - np.cos(k * s) - k * np.sin(k * s)
     bend = k * (np.sin(k * s) - k * np.cos(k * s))
-    scale = 0.44510  # q / P that makes int w^2 = 2
+    # The value of q / P for which int w^2 = 2.
+    scale = 0.44510
     y = np.stack([scale * w, scale * bend, 0.0 * s, s])
     found = solve_boundary_values(
         change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)])
