@@ -1,9 +1,7 @@
 """Fits of a hanging rod to a measured centreline.
 
-A fit has three parameters, or natural curvature along the rod.
-
-Both move the natural rod until the *hung* rod, as the forward solver finds it (`hung_rod`), meets
-the centreline.
+A fit determines three parameters, or natural curvature along the rod. Both fits move the natural
+rod until the *hung* rod of the forward model (`hung_rod`) meets the centreline.
 """
 
 from dataclasses import dataclass
@@ -29,28 +27,30 @@ from stickslip_sim_core.rods.solve import (
 )
 
 CANDIDATES = 4
-"""Rods of the library from which a fit starts."""
+"""Number of rods of the library from which a fit starts."""
 
 RANGES = ((60.0, 2000.0), (0.0, 14.0), (4.0, 22.0))
-"""Of gamma, phi0 and phi1 in the library."""
+"""Ranges of gamma, phi0 and phi1 in the library."""
 
 INTERVALS = 24
-"""Knot intervals of the splines of natural curvature."""
+"""Number of knot intervals in the splines of natural curvature."""
 
 STEP_TOLERANCE = 1e-7
 """A minimisation ends when a step moves the centreline by less than this [L, root mean square]."""
 
 PATH_TOLERANCE = 1e-5
-"""The same on the way through the weights of smoothness; what is chosen is then brought to
-STEP_TOLERANCE.
+"""Tolerance of the same kind for the search through the weights of smoothness.
+
+The chosen fit then goes on to STEP_TOLERANCE.
 """
 
 PENALTY_DECADES = np.arange(4.0, -8.5, -0.5)
-"""Decadic logarithms of the weights tried, relative to trace(J^T J) / trace(D^T D)."""
+"""Decadic logarithms of the weights to try, relative to trace(J^T J) / trace(D^T D)."""
 
 DEGREES_FACTOR = 1.4
-"""Each degree of freedom counts 1.4 times in cross validation, which then seldom undersmooths [Kim
-and Gu 2004].
+"""Factor of the degrees of freedom in cross validation.
+
+With it, cross validation seldom undersmooths [Kim and Gu 2004].
 """
 
 
@@ -68,8 +68,9 @@ class ParameterFit:
     """Natural bend about d3 times L [rad]."""
 
     standard_error: Floats
-    """Of gamma, phi0, phi1, shape (3,), for white noise as large as the residual; 0 for a given
-    gamma.
+    """Standard errors of gamma, phi0 and phi1, for white noise as large as the residual: (3,).
+
+    The error of a given gamma is 0.
     """
 
     residual: float
@@ -83,14 +84,14 @@ class ParameterFit:
 class NaturalFit:
     """The rod of smoothest natural curvature that hangs along a centreline.
 
-    It follows the centreline as nearly as the noise warrants.
+    The rod follows the centreline as closely as the noise warrants.
     """
 
     natural_curvature: Floats
     """(twist, bend about d2, bend about d3) at the P points [1/L], shape (P, 3)."""
 
     gamma: float
-    """Weight against bending [-]: given, or fitted."""
+    """Weight against bending [-], given or fitted."""
 
     residual: float
     """Root mean square distance per coordinate between the hung rod and the centreline [L]."""
@@ -102,7 +103,7 @@ class NaturalFit:
     """Effective number of parameters at the chosen weight of smoothness."""
 
     smoothness_weight: float
-    """The weight that was chosen, relative to trace(J^T J) / trace(D^T D)."""
+    """Chosen weight of smoothness, relative to trace(J^T J) / trace(D^T D)."""
 
     solution: RodSolution
     """The hung rod at the P points, n = 1."""
@@ -113,25 +114,27 @@ def fit_parameters(
 ) -> ParameterFit:
     """Fit (gamma, phi0, phi1) to a centreline.
 
-    The method is Levenberg's and Marquardt's, from several starts.
+    The method is Levenberg's and Marquardt's, from several starts. The starts are the rods nearest
+    to the centreline in a library over RANGES. The library has 640 rods without a known gamma, is
+    made once per setting, and stays in memory. The fit may leave the ranges.
 
-    The starts are the nearest of 640 rods over RANGES, hung once per setting and kept; the fit may
-    leave the ranges.
+    Args:
+        centerline: Positions [L] from the clamp (at the origin) to the free end, at uniform arc
+            length, z up, shape (P, 3), P >= 8.
+        gamma: Weight against bending, if it is known. None fits it.
+        stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
 
-    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
-        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
-        fitted. stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
-
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
-        equilibrium.
+    Raises:
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
+            value.
+        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
     model = HungRodModel.of(len(data), stiffness, intervals=None)
     state = _fit_constant(model, data, gamma, components=(0, 2))
 
-    # Standard errors of the parameters that were fitted, from the curvature of the squared error.
-    # The clamped point has no error: its three coordinates are no data.
+    # Standard errors of the fitted parameters follow from the curvature of the squared error. The
+    # clamped point has no error, so its three coordinates are no data.
     jacobian = model.jacobian(state)[:, [0, 1, 3]]
     used = np.array([gamma is None, True, True])
     variance = (state.residual(data) ** 2).sum() / (data.size - 3 - used.sum())
@@ -139,7 +142,8 @@ def fit_parameters(
     error[used] = np.sqrt(
         variance * np.diag(np.linalg.pinv(jacobian[:, used].T @ jacobian[:, used]))
     )
-    error[0] *= state.gamma  # from its logarithm's
+    # From the error of log gamma to the error of gamma.
+    error[0] *= state.gamma
     phi0, _, phi1 = state.coefficients[0]
     return ParameterFit(
         state.gamma,
@@ -160,29 +164,33 @@ def fit_natural_curvature(
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 
-    With c the coefficients of a cubic spline per component, and D their first differences
-    [P-splines, Eilers and Marx 1996], Gauss-Newton steps minimise
+    Each component is a cubic spline with coefficients c and their first differences D c [P-splines,
+    Eilers and Marx 1996]. Gauss-Newton steps minimise
 
         |r(c) - centerline|^2 + w |D c|^2.
 
-    The weight w falls from a uniform rod, which is `fit_parameters` with a clamp that may turn
-    about its axis. The weight with the least generalised cross validation is chosen [Golub, Heath
-    and Wahba 1979]. With `noise`, it is the first weight that brings the residual down to the
-    noise, but for one standard deviation of its chi-square [Morozov 1966].
+    The weight w falls. Its large limit is a uniform rod, which is `fit_parameters` with a clamp
+    that may turn about its axis. The fit chooses the weight with the least generalised cross
+    validation [Golub, Heath and Wahba 1979]. With `noise`, it chooses the first weight that brings
+    the residual down to the noise, plus one standard deviation of its chi-square [Morozov 1966].
 
-    A centreline does not tell how the frame turns about it: of all that hang along it the smoothest
-    natural curvature is returned. What two such rods share, the natural shape, does not depend on
-    that choice for a rod that bends equally about d2 and d3.
+    A centreline does not determine how the frame turns about it. Of all natural curvatures that
+    hang along the centreline, the fit returns the smoothest. For a rod that bends equally about d2
+    and d3, all of them have the same natural shape.
 
-    Args: centerline: Positions [L], from the clamp (at the origin) to the free end at uniform arc
-        length, z up, shape (P, 3), P >= 8. gamma: Weight against bending if it is known; None:
-        fitted. noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it
-        is known. Give it when the noise is correlated along the rod: cross validation takes it for
-        white. stiffness: As for `fit_parameters`.
+    Args:
+        centerline: Positions [L] from the clamp (at the origin) to the free end, at uniform arc
+            length, z up, shape (P, 3), P >= 8.
+        gamma: Weight against bending, if it is known. None fits it.
+        noise: Standard deviation of the centreline's noise per coordinate [L], > 0, if it is known.
+            Give it if the noise is correlated along the rod, because cross validation assumes white
+            noise.
+        stiffness: As for `fit_parameters`.
 
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value. RuntimeError: None of the rods from which the fit starts hangs in a stable
-        equilibrium.
+    Raises:
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
+            value.
+        RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
     if noise is not None and not noise > 0:
@@ -196,7 +204,7 @@ def fit_natural_curvature(
     state = model.relax(uniform.gamma, coefficients, uniform.frames)
     assert state is not None  # the same rod as before
 
-    # |D c|^2 as a matrix; the weight of smoothness is relative to the scale of the data.
+    # |D c|^2 as a matrix. The weight of smoothness is relative to the scale of the data.
     free = np.arange(0 if gamma is None else 1, 1 + 3 * (INTERVALS + 3))
     penalty = np.zeros((1 + 3 * (INTERVALS + 3),) * 2)
     differences = np.diff(np.eye(INTERVALS + 3), axis=0)
@@ -205,12 +213,12 @@ def fit_natural_curvature(
     scale = np.trace(jacobian.T @ jacobian) / np.trace(penalty)
     best: tuple[float, HungRod, float, float] | None = None
 
-    # From weight to weight the fit begins at the last one, which is near.
+    # The fit of each weight begins at the fit of the last weight, which is near.
     for decade in PENALTY_DECADES:
         weighted = 10.0**decade * scale * penalty
         state = minimise(model, state, data, free, weighted, PATH_TOLERANCE)
 
-        # Effective degrees of freedom: the trace of the matrix that maps data to the fit.
+        # The effective degrees of freedom are the trace of the matrix that maps data to the fit.
         jacobian = model.jacobian(state)[:, free]
         normal = jacobian.T @ jacobian
         used = float(
@@ -222,7 +230,7 @@ def fit_natural_curvature(
             break
         score = misfit / effective_size**2
 
-        # The residual is down at the noise: a smaller weight would fit the noise itself.
+        # With the residual down at the noise, a smaller weight would fit the noise itself.
         degrees_left = data.size - 3 - used
         is_at_noise = noise is not None and misfit <= noise**2 * (
             degrees_left + np.sqrt(2.0 * degrees_left)
@@ -261,7 +269,7 @@ def _fit_constant(
         len(data), tuple(model.stiffness), known_gamma
     )
 
-    # The squared error has several minima: start from the rods that hang nearest.
+    # The squared error has several minima, so start from the rods that hang nearest.
     distance = np.linalg.norm(centerlines - data, axis=(1, 2))
     free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
     best: HungRod | None = None
@@ -283,10 +291,10 @@ def _fit_constant(
 def _library(
     points: int, stiffness: tuple[float, ...], known_gamma: float | None
 ) -> tuple[Floats, ...]:
-    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 where gamma is known.
+    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 with a known gamma.
 
     Returns gamma (n,), natural curvature (n, 3), and centreline and curvature (n, P, 3) of the
-    stable ones.
+    stable rods.
     """
     per_axis = 8 if known_gamma is None else 16
     axes = (

@@ -1,8 +1,8 @@
 """The forward model of a fit: from gamma and natural curvature to the hung centreline.
 
-The model is exact in its derivatives: two chains whose nodes include the P points, extrapolated
-(4 r_h - r_2h) / 3 with an error O(h^4), each differentiated through its equilibrium
-(rods/chain.hpp).
+The model hangs two chains whose nodes include the P points. It extrapolates their centrelines by
+(4 r_h - r_2h) / 3, with an error O(h^4). Its derivatives are exact, because it differentiates each
+chain through its equilibrium (rods/chain.hpp).
 """
 
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ from stickslip_sim_core.rods.solve import (
 )
 
 ELEMENTS_MIN = 96
-"""Elements of the coarser chain are at least this many."""
+"""Least number of elements of the coarser chain."""
 
 ITERATIONS_MAX = 40
-"""Accepted and refused steps of one minimisation together."""
+"""Largest number of accepted and refused steps of a minimisation together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class HungRodModel:
 
     @staticmethod
     def of(points: int, stiffness: ArrayLike, intervals: int | None) -> "HungRodModel":
-        # Both chains have nodes at the P points; the second has elements of half the length.
+        # Both chains have nodes at the P points. The second has elements of half the length.
         stride = -(-ELEMENTS_MIN // (points - 1))
         strides = (stride, 2 * stride)
         bases = []
@@ -75,7 +75,7 @@ class HungRodModel:
     def relax(
         self, gamma: float, coefficients: Floats, frames: tuple[Floats, ...]
     ) -> HungRod | None:
-        """Hang the rod from `frames` on; None if there is no stable equilibrium nearby."""
+        """Hang the rod from `frames` on, or return None without a stable equilibrium nearby."""
         hung = []
         curves = []
         for k, basis, start in zip(self.strides, self.bases, frames, strict=True):
@@ -107,12 +107,14 @@ class HungRodModel:
             for k, basis, q in zip(self.strides, self.bases, state.frames, strict=True)
         ]
         jacobian = (4.0 * parts[1] - parts[0]) / 3.0
+        # From the derivative by gamma to the derivative by log gamma.
         jacobian[:, 0] *= state.gamma
         return jacobian
 
     def moved(self, state: HungRod, step: Floats) -> HungRod | None:
         """Hang the rod again after a step of (log gamma, coefficients)."""
-        if abs(step[0]) > 1.0:  # e-fold: such a step has left where the derivatives mean anything
+        # Derivatives say nothing about a rod whose weight differs by more than a factor of e.
+        if abs(step[0]) > 1.0:
             return None
         coefficients = state.coefficients + step[1:].reshape(3, -1).T
         return self.relax(state.gamma * float(np.exp(step[0])), coefficients, state.frames)
@@ -123,7 +125,7 @@ class HungRodModel:
         B = np.ones((points, 1)) if self.intervals is None else bspline_matrix(self.intervals, s)
         natural = B @ state.coefficients
         start = _chain_curvature(state.frames[0])
-        # Elements turn by less than the solver's limit, naturally and in the hung shape.
+        # Elements must turn by less than the solver's limit, both naturally and in the hung shape.
         largest = max(np.linalg.norm(f, axis=1).max() for f in (natural, start))
         elements = 4 * int(np.ceil(max(largest / (0.8 * ELEMENT_TURN_MAX), 32)))
         return solve_general_rods(
@@ -157,7 +159,7 @@ def minimise(
     damping = 0.0
     fresh = True
     for _ in range(ITERATIONS_MAX):
-        # After a refused step the derivatives at the state are still right.
+        # After a refused step the derivatives at the state are still valid.
         if fresh:
             J = model.jacobian(state)[:, free]
             normal = J.T @ J
@@ -169,7 +171,7 @@ def minimise(
         step = np.zeros(len(penalty))
         step[free] = -np.linalg.solve(hessian + diagonal + ridge(normal), gradient)
 
-        # A step may leave the equilibria; it counts as one that does not lower the cost.
+        # A step without an equilibrium counts as a step that does not lower the cost.
         trial = model.moved(state, step)
         fresh = trial is not None and (trial_value := cost(trial)) <= value
         if fresh:
@@ -181,8 +183,9 @@ def minimise(
             if change <= tolerance:
                 break
         else:
+            # Only rounding is left.
             if root_mean_square(J @ step[free]) <= tolerance:
-                break  # nothing left but rounding
+                break
             damping = max(1e-3, 10.0 * damping)
     return state
 
@@ -190,8 +193,10 @@ def minimise(
 def _chain_curvature(quaternions: Floats) -> Floats:
     """Return the curvature of a chain at its nodes, shape (N + 1, 3).
 
-    It averages the curvatures of the elements, and repeats those at the ends.
+    A node has the mean curvature of its two elements. A node at an end has the curvature of its
+    only element.
     """
+    # The quaternion (w, v) from one frame to the next holds half the turn of an element.
     p = quaternions[:-1]
     q = quaternions[1:]
     w = (p * q).sum(axis=1)
@@ -212,7 +217,7 @@ def parameters_of(state: HungRod) -> Floats:
 
 
 def ridge(normal: Floats) -> Floats:
-    """Keep rounding from making a normal matrix singular."""
+    """Return a small diagonal matrix that keeps a normal matrix from being singular."""
     return np.asarray(1e-13 * np.trace(normal) * np.eye(len(normal)))
 
 

@@ -1,4 +1,4 @@
-"""Inverse design: the natural curvature of a rod whose hanging shape is known, and its error."""
+"""Inverse design: the natural curvature of a rod with a known hanging shape, and its error."""
 
 from dataclasses import dataclass
 
@@ -19,30 +19,35 @@ from stickslip_sim_core.rods.solve import (
 GRAVITY = np.array([0.0, 0.0, -1.0])
 
 ERROR_MODES = 5
-"""Polynomials per component, of degree 0 ... 4, that make a smooth error of curvature."""
+"""Number of polynomials per component, of degree 0 ... 4, in a smooth error of curvature."""
 
 
 @dataclass(frozen=True, eq=False)
 class NaturalCurvature:
-    """Natural curvature of n rods, or of one: the leading shape (...) is that of the arguments."""
+    """Natural curvature of rods, with the leading shape (...) of the arguments."""
 
     curvature: Floats
-    """Natural curvature kappa_bar(s) = (twist, bend about d2, bend about d3) [1/L], shape (..., P,
-    3).
+    """Natural curvature kappa_bar(s) [1/L], shape (..., P, 3).
+
+    Its components are twist, bend about d2 and bend about d3.
     """
 
     moment: Floats
-    """Internal moment m(s) in the material frame [EI/L], shape (..., P, 3); zero at the free end.
+    """Internal moment m(s) in the material frame [EI/L], shape (..., P, 3).
+
+    It is zero at the free end.
     """
 
     amplification: Floats
-    """Relative error of kappa_bar per relative error of kappa, both as root mean squares along the
-    rod [-], shape (...): expected for a smooth random error of kappa from which the frames are
-    integrated too. Multiply the error that you believe your curvature has by it. First order: it
-    holds while the product stays below about 1/2."""
+    """Expected relative error of kappa_bar per relative error of kappa [-], shape (...).
+
+    Both errors are root mean squares along the rod. The error of kappa is smooth and random, and
+    the frames are integrated from it, too. Multiply the estimated error of your curvature by the
+    amplification. The estimate is of first order, and holds while the product is below about 1/2.
+    """
 
     amplification_max: Floats
-    """The same for the smooth error that harms most, shape (...)."""
+    """Amplification of the smooth error that harms most, shape (...)."""
 
 
 def natural_curvature(
@@ -56,21 +61,24 @@ def natural_curvature(
     """Compute the unique natural curvature for which a framed curve hangs in equilibrium.
 
     Eq. 5.1 of the thesis [Bertails-Descoubes et al. 2018, Sec. 4] integrates m' = m x kappa - gamma
-    (1 - s) e_x x g from m(1) = 0 and takes kappa_bar = kappa - K^{-1} m. In the world the moment M
-    = R m needs a quadrature only, M(s) = gamma (int_s^1 (1 - u) t(u) du) x e_g, e_g along gravity.
-    It is done interval by interval with t, t' and t'' (error (kappa h)^6 / 100800 of the
-    integrand).
+    (1 - s) e_x x g from m(1) = 0, and takes kappa_bar = kappa - K^{-1} m. In world axes the moment
+    M = R m needs only a quadrature: M(s) = gamma (int_s^1 (1 - u) t(u) du) x e_g, with e_g along
+    gravity. The quadrature goes interval by interval with t, t' and t''. Its error is (kappa h)^6 /
+    100800 of the integrand.
 
-    Args: curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4
-        points of uniform arc length, clamp and free end included, shape (..., P, 3). frame:
-        Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (..., P, 3,
-        3). None: integrated from `clamp_frame` by R' = R [kappa]x, with the error of the curvature
-        in them. gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0. stiffness:
-        K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3). clamp_frame: R(0), used without
-        `frame` only, shape (3, 3) or (..., 3, 3).
+    Args:
+        curvature: Deformed curvature kappa (twist, bend about d2, bend about d3) [1/L] at P >= 4
+            points of uniform arc length, clamp and free end included, shape (..., P, 3).
+        frame: Material frames R(s) in the world (z up), columns d1 (tangent), d2, d3, shape (...,
+            P, 3, 3). None integrates them from `clamp_frame` by R' = R [kappa]x. They then have the
+            error of the curvature.
+        gamma: Weight against bending, rho A g L^3 / EI [-], shape (...), >= 0.
+        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) or (..., 3).
+        clamp_frame: R(0), shape (3, 3) or (..., 3, 3). Only used without `frame`.
 
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value.
+    Raises:
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
+            value.
     """
     shape = np.shape(curvature)
     if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 4:
@@ -110,10 +118,8 @@ def natural_curvature(
 def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) -> Floats:
     """Return the frames (n, P, 3, 3) with R' = R [kappa]x from the clamp on.
 
-    kappa is (n, P, 3) [1/L].
-
-    Fourth-order Magnus steps, two per interval, on the cubic spline through the curvature [Iserles
-    and Norsett 1999].
+    kappa is (n, P, 3) [1/L]. The integration takes two fourth-order Magnus steps per interval, on
+    the cubic spline through the curvature [Iserles and Norsett 1999].
     """
     n, points, _ = curvature.shape
     steps = 2 * (points - 1)
@@ -125,21 +131,23 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
     # For R' = R [kappa]x: theta = h (a + b) / 2 + sqrt(3)/12 h^2 a x b.
     theta = 0.5 * h * (a + b) + np.sqrt(3.0) / 12.0 * h**2 * np.cross(a, b)
     clamps = clamp_quaternions(clamp_frame, n)
-    # A chain of these turns: its curvature is that of the turn of each element.
+    # A chain whose elements have these turns has the turn over h as its curvature.
     frames = [
         _sim_core.chain_frames(rod / h, clamp)[::2]
         for rod, clamp in zip(theta, clamps, strict=True)
     ]
-    from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
+    # Imported here, so that importing the package stays quick.
+    from scipy.spatial.transform import Rotation
 
+    # scipy has the scalar part last, and the core has it first.
     quaternions = np.roll(np.reshape(frames, (-1, 4)), -1, axis=1)
     return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(n, points, 3, 3)
 
 
 def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
-    """Return a field of shape (..., 3[, 3]) with its leading shape as one.
+    """Return a field of shape (..., 3[, 3]) with a single leading axis.
 
-    A field for all rods as it is.
+    A field that all rods share stays as it is.
     """
     array = np.asarray(field)
     tail = (3,) * rank
@@ -147,7 +155,7 @@ def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:
 
 
 def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
-    """int_s^1 (1 - u) t du, shape (n, P, 3)."""
+    """Return int_s^1 (1 - u) t du, shape (n, P, 3)."""
     points = kappa.shape[1]
     s = np.linspace(0.0, 1.0, points)
     slope = interpolation_matrix(points, s, derivative=1) @ kappa
@@ -158,6 +166,7 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
     dt = (R @ np.stack([zero, k2, -k1], axis=2)[..., None])[..., 0]
     ddt = np.stack([-(k1**2 + k2**2), k0 * k1 + slope[..., 2], k0 * k2 - slope[..., 1]], axis=2)
     ddt = (R @ ddt[..., None])[..., 0]
+    # The integrand and its first two derivatives.
     left = (1.0 - s)[:, None]
     f = left * t
     df = left * dt - t
@@ -168,6 +177,7 @@ def _weighted_tangent(kappa: Floats, R: Floats) -> Floats:
         + h**2 / 10 * (df[:, :-1] - df[:, 1:])
         + h**3 / 120 * (ddf[:, :-1] + ddf[:, 1:])
     )
+    # Add the intervals up from the free end, at which the integral is zero.
     sums = np.zeros_like(f)
     sums[:, :-1] = np.cumsum(parts[:, ::-1], axis=1)[:, ::-1]
     return sums
@@ -180,8 +190,8 @@ def _amplification(
 
     Both are relative errors per relative smooth error of kappa.
 
-    An error dk of kappa turns frames by dw = int_0^s R dk (world axes), so that dt = dw x t, dM =
-    gamma int_s^1 (1 - u) dt x e_g and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).
+    An error dk of kappa turns frames by dw = int_0^s R dk (world axes). It follows that dt = dw x
+    t, dM = gamma int_s^1 (1 - u) dt x e_g, and d(kappa_bar) = dk - K^{-1} R^T (dM - dw x M).
     """
     points = kappa.shape[1]
     s = np.linspace(0.0, 1.0, points)
@@ -191,7 +201,8 @@ def _amplification(
     weights = np.full(points, 1.0 / (points - 1))
     weights[[0, -1]] *= 0.5
     squares = np.empty((len(kappa), 3 * ERROR_MODES, 3 * ERROR_MODES))
-    for rod in range(len(kappa)):  # one rod at a time: the responses of all would be large
+    # One rod at a time, because the responses of all rods would need much memory.
+    for rod in range(len(kappa)):
         dk = np.einsum("pb,ci->bcpi", modes, np.eye(3)).reshape(-1, points, 3)
         dw = _running_integral(np.einsum("pij,apj->api", R[rod], dk))
         dt = (1.0 - s)[:, None] * np.cross(dw, R[rod, :, :, 0])
@@ -212,7 +223,7 @@ def _amplification(
 
 
 def _running_integral(f: Floats) -> Floats:
-    """int_0^s f by the trapezoidal rule over axis 1: enough for an estimate."""
+    """Return int_0^s f over axis 1 by the trapezoidal rule, which is enough for an estimate."""
     sums = np.zeros_like(f)
     np.cumsum(0.5 * (f[:, :-1] + f[:, 1:]) / (f.shape[1] - 1), axis=1, out=sums[:, 1:])
     return sums

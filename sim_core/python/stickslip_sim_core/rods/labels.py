@@ -20,10 +20,8 @@ from stickslip_sim_core.rods.solve import (
 def reach(centerline: ArrayLike) -> Floats:
     """Return the largest distance of each rod from the vertical through its clamp: (n,) [L].
 
-    The axis z points up.
-
-    `centerline` has positions (n, points, 3) [L] from the clamp on; where it is NaN, so is the
-    distance.
+    The axis z points up. `centerline` has positions (n, points, 3) [L] from the clamp on. The
+    distance of a rod with NaN positions is NaN.
     """
     r = _centerlines(centerline)
     return np.asarray(np.linalg.norm(r[..., :2] - r[:, :1, :2], axis=2).max(axis=1))
@@ -32,20 +30,21 @@ def reach(centerline: ArrayLike) -> Floats:
 def self_contact_distance(centerline: ArrayLike) -> Floats:
     """Return the least distance of each centreline from another part of itself.
 
-    Neighbouring parts are always close; what counts is a local minimum of the distance between two
-    points of the centreline, each free to slide along it: the doubly critical distance of the
-    theory of ideal knots [Gonzalez and Maddocks 1999], ends included. A rod of radius r touches
-    itself where it is below 2 r.
+    Neighbouring parts are always close, so only local minima count. Such a minimum is a minimum of
+    the distance between two points of the centreline that are free to slide along it, ends
+    included. It is the doubly critical distance in the theory of ideal knots [Gonzalez and Maddocks
+    1999]. A rod of radius r touches itself if this distance is below 2 r.
 
     `centerline` has positions (n, points, 3) [L], joined by straight segments. The distance (n,)
-    [L] is infinite where it has no such minimum, as on a straight rod, and NaN where the centreline
-    is.
+    [L] is infinite without such a minimum, for example on a straight rod. It is NaN for a rod with
+    NaN positions.
     """
     r = _centerlines(centerline)
     return np.array([_self_contact_distance(rod) for rod in r]).reshape(len(r))
 
 
 def _centerlines(centerline: ArrayLike) -> Floats:
+    # Rods that did not converge are NaN throughout, which the check of the shape must let pass.
     r = np.asarray(centerline)
     finite_array("centerline", np.nan_to_num(r) if r.dtype.kind == "f" else r, (None, None, 3))
     if r.shape[1] < 2:
@@ -54,14 +53,13 @@ def _centerlines(centerline: ArrayLike) -> Floats:
 
 
 def _self_contact_distance(r: Floats) -> float:
-    """Of one rod, shape (points, 3)."""
+    """Return the self-contact distance of a single rod, shape (points, 3)."""
     if np.isnan(r).any():
         return np.nan
     p = len(r)
     squared = (r**2).sum(axis=1)
     distance2 = squared[:, None] + squared - 2.0 * (r @ r.T)
-    # No point is farther from another than from those around it: local minima over the eight
-    # neighbours.
+    # A pair of points is a local minimum if no neighbour of the pair, among eight, is closer.
     padded = np.full((p + 2, p + 2), np.inf)
     padded[1:-1, 1:-1] = distance2
     around = [
@@ -76,7 +74,7 @@ def _self_contact_distance(r: Floats) -> float:
     # The minimum lies on one of the segments that meet at the two points.
     a, b = (np.stack([np.clip(x - 1, 0, p - 2), np.clip(x, 0, p - 2)]) for x in (first, second))
     i, j = (x.ravel() for x in np.broadcast_arrays(a[:, None], b[None, :]))
-    # Segments that have a point in common touch without being a contact.
+    # Segments with a common point touch without being a contact.
     apart = j - i >= 2
     return float(
         _segment_distance(r[i[apart]], r[i[apart] + 1], r[j[apart]], r[j[apart] + 1]).min(
@@ -86,12 +84,13 @@ def _self_contact_distance(r: Floats) -> float:
 
 
 def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
-    """Distances between segments a0-a1 and b0-b1, each shape (k, 3) [Ericson 2004, Sec. 5.1.9]."""
+    """Return distances between segments a0-a1 and b0-b1, (k, 3) each [Ericson 2004, Sec. 5.1.9]."""
     u = a1 - a0
     v = b1 - b0
     w = a0 - b0
     uu, uv, vv, uw, vw = ((x * y).sum(axis=1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     tiny = np.finfo(float).tiny
+    # Parallel segments have no single closest pair, so any s will do.
     determinant = uu * vv - uv**2
     s = np.where(
         determinant > 1e-14 * uu * vv,
@@ -104,12 +103,13 @@ def _segment_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
 
 
 DISTINCT = 1e-3
-"""Largest centreline distance [L] at which two equilibria count as one: 100 times the solver's
-error.
+"""Largest distance of centrelines [L] at which two equilibria count as one.
+
+It is 100 times the solver's error.
 """
 
 MIRROR = np.array([-1.0, -1.0, 1.0])
-"""What the mirror of world y does to (twist, bend about d2, bend about d3)."""
+"""Factors of (twist, bend about d2, bend about d3) under the mirror of world y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,15 +117,16 @@ class OtherMinima:
     """Other stable equilibria of n rods."""
 
     multistable: Bools
-    """A stable equilibrium other than that of `solve_rods` was found, shape (n,). False is no proof
-    that none is.
+    """Whether another stable equilibrium than that of `solve_rods` was found, shape (n,).
+
+    False is no proof that no other exists.
     """
 
     energy: Floats
-    """Lowest energy of another stable equilibrium [EI/L], shape (n,); NaN where none was found."""
+    """Energy of the other stable equilibrium [EI/L], shape (n,), or NaN."""
 
     centerline: Floats
-    """Centreline of that equilibrium [L], shape (n, points, 3); NaN where none was found."""
+    """Centreline of the other stable equilibrium [L], shape (n, points, 3), or NaN."""
 
 
 def other_minima(
@@ -140,12 +141,13 @@ def other_minima(
 ) -> OtherMinima:
     """Search for another stable equilibrium than `solve_rods` finds.
 
-    `solve_rods` reaches its equilibrium from the natural shape.
+    `solve_rods` reaches its equilibrium from the natural shape. Rods can curl with either hand, so
+    each rod starts again from the mirror image of its equilibrium. Equilibria whose centrelines
+    differ by more than 1e-3 L are distinct.
 
-    Such rods can curl with either hand. Each rod therefore starts again from the mirror
-    image of its equilibrium. Over the thesis's ranges this start found every rod that 28 others
-    did, straight, weakly curled, twisted either way, of two hands, random, or continued in the
-    weight. Equilibria whose centrelines differ by more than 1e-3 L are distinct.
+    Over the thesis's ranges this start found every rod that 28 other starts found. Those starts
+    were straight, weakly curled, twisted either way, of two hands, random, or continued in the
+    weight.
 
     Args:
         gamma: As for `solve_rods`.
@@ -154,10 +156,10 @@ def other_minima(
         poisson: As for `solve_rods`.
         elements: As for `solve_rods`.
         points: As for `solve_rods`.
-        solution: The result of `solve_rods` for exactly these arguments, to save solving again.
+        solution: Result of `solve_rods` for exactly these arguments. It saves solving again.
 
     Raises:
-        ValueError: An argument breaks its rule; the message names the field, the rule and the
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
             value.
     """
     weight = finite_array("gamma", gamma, (None,))
@@ -177,8 +179,8 @@ def other_minima(
 
     natural = np.stack([twist, np.zeros(n), bend], axis=1)[:, None, :]
     stiffness = (1.0 / (1.0 + poisson), 1.0, 1.0)
-    # The curvature of the start is cut to what the coarsest level can hold, and 0 for rods without
-    # one.
+    # The curvature of the start is cut down to the limit of the coarsest level. Rods without an
+    # equilibrium start straight.
     start = np.nan_to_num(found.curvature * MIRROR)
     largest = np.linalg.norm(start, axis=2).max(axis=1, initial=0.0)
     limit = 0.9 * ELEMENT_TURN_MAX * (elements // 4)
@@ -187,6 +189,7 @@ def other_minima(
         natural, weight, stiffness=stiffness, start_curvature=start, **options
     )
     distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
+    # `not <=` is also true for the NaN of a rod that `solve_rods` did not solve.
     distinct = other.stable & ~(distance <= DISTINCT)
     centerline = np.where(distinct[:, None, None], other.centerline, np.nan)
     return OtherMinima(distinct, np.where(distinct, other.energy, np.nan), centerline)

@@ -1,6 +1,7 @@
 """Equilibria of suspended rods.
 
-There is the family (gamma, phi0, phi1), and there are rods that vary along their length.
+`solve_rods` solves the family (gamma, phi0, phi1), and `solve_general_rods` solves rods that vary
+along their length.
 """
 
 from dataclasses import dataclass
@@ -28,61 +29,71 @@ CLAMP_FRAME = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 CLAMP_FRAME.flags.writeable = False
 
 ELEMENT_TURN_MAX = 2.5
-"""Largest turn of an element of the coarsest level in the shape that the search starts from [rad];
-see rods.hpp.
+"""Largest turn of an element of the coarsest level in the start of a search [rad].
+
+See rods.hpp.
 """
 
 RODS_AT_ONCE = 1024
-"""Rods whose fields are on the solver's grid at once: some 15 MB."""
+"""Number of rods whose fields are on the solver's grid at once, which takes some 15 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class RodSolution:
     """Equilibria of n rods at `points` points of uniform arc length s = 0 ... 1.
 
-    The clamp is at s = 0 and the free end at s = 1.
-
-    Lengths are in units of the rod's length L, moments in EI/L. The world has z up, gravity along
-    -z, and the clamp at the origin with d1 = -z (along gravity), d2 = +x, d3 = -y. A rod that did
-    not converge is NaN throughout.
+    The clamp is at s = 0 and the free end at s = 1. Lengths are in units of the rod's length L, and
+    moments in EI/L. The world has z up, gravity along -z, and the clamp at the origin with d1 = -z
+    (along gravity), d2 = +x, d3 = -y. A rod that did not converge is NaN throughout.
     """
 
     centerline: Floats
-    """Positions r(s) [L], shape (n, points, 3); r' = d1."""
+    """Positions r(s) [L], shape (n, points, 3), with r' = d1."""
 
     curvature: Floats
-    """Deformed curvature kappa(s) = (twist, bend about d2, bend about d3) [1/L] in the material
-    frame, shape (n, points, 3). The natural curvature is (phi0, 0, phi1)."""
+    """Deformed curvature kappa(s) in the material frame [1/L], shape (n, points, 3).
+
+    Its components are twist, bend about d2 and bend about d3. The natural curvature is (phi0, 0,
+    phi1).
+    """
 
     frame: Floats
-    """Material frames R(s), shape (n, points, 3, 3): `frame[..., :, k]`, column k, is d1 (tangent),
-    d2 or d3 in world axes, so that R takes material components to world components and R' = R
-    [kappa]x."""
+    """Material frames R(s), shape (n, points, 3, 3).
+
+    Column k, `frame[..., :, k]`, is d1 (tangent), d2 or d3 in world axes. R takes material
+    components to world components, and R' = R [kappa]x.
+    """
 
     energy: Floats
-    """Elastic plus gravitational energy [EI/L], shape (n,); the gravitational part is zero for a
-    rod all at z = 0.
+    """Elastic plus gravitational energy [EI/L], shape (n,).
+
+    The gravitational part is zero for a rod that lies at z = 0 as a whole.
     """
 
     stable: Bools
-    """Converged, and the Hessian on the finest level is positive definite, shape (n,): a strict
-    local minimum.
+    """Whether a rod converged to a strict local minimum, shape (n,).
+
+    The Hessian on the finest level is then positive definite.
     """
 
     converged: Bools
-    """Every level reached equilibrium and the levels agree, shape (n,)."""
+    """Whether every level reached equilibrium and the levels agree, shape (n,)."""
 
     iterations: Ints
     """Evaluations of the Hessian over all levels, shape (n,)."""
 
     residual: Floats
-    """Largest out-of-balance nodal moment on the finest level before the last Newton step [EI/L],
-    shape (n,).
+    """Largest out-of-balance moment of a node before the last Newton step [EI/L], shape (n,).
+
+    It is the value on the finest level.
     """
 
     refinement: Floats
-    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,). The error
-    left in `frame` was at most a quarter of it at 128 elements, and 2.3 times it at 48."""
+    """Largest turn of a frame by the last term of the extrapolation [rad], shape (n,).
+
+    The remaining error of `frame` was at most a quarter of it at 128 elements, and 2.3 times it at
+    48 elements.
+    """
 
 
 def solve_rods(
@@ -96,20 +107,25 @@ def solve_rods(
 ) -> RodSolution:
     """Compute the equilibrium that each rod reaches from its natural shape.
 
-    A Kirchhoff rod, inextensible and unshearable with K = diag(C, 1, 1), C = GJ/EI = 1/(1 +
-    poisson) (round section), minimises its energy on a geodesic chain of frames with `elements`/4,
-    /2 and /1 elements; the three levels are extrapolated to the continuous rod [Bertails et al.
-    2006; Bertails-Descoubes et al. 2018, Sec. 3]. A rod's bits depend on its own three numbers and
-    the settings only, not on the batch.
+    The rod is a Kirchhoff rod, inextensible and unshearable, with a round section: K = diag(C, 1,
+    1), C = GJ/EI = 1/(1 + poisson). It minimises its energy on a geodesic chain of frames with
+    `elements`/4, /2 and /1 elements, and the three levels are extrapolated to the continuous rod
+    [Bertails et al. 2006; Bertails-Descoubes et al. 2018, Sec. 3]. The bits of a rod depend on its
+    three numbers and the settings, and not on the batch.
 
-    Args: gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0; one number is a
-        single rod. phi0: Natural twist times L [rad], shape (n,). phi1: Natural bend about d3 times
-        L [rad], shape (n,). poisson: Poisson's ratio [-], in (-1, 0.5]. elements: Elements of the
-        finest level, a multiple of 4. Largest centreline error over gamma 100 ... 1300, phi0 0.2
-        ... 12, phi1 6 ... 20: see the README. points: Output points per rod, >= 2.
+    Args:
+        gamma: Weight against bending, rho A g L^3 / EI [-], shape (n,), >= 0. A number is a single
+            rod.
+        phi0: Natural twist times L [rad], shape (n,).
+        phi1: Natural bend about d3 times L [rad], shape (n,).
+        poisson: Poisson's ratio [-], in (-1, 0.5].
+        elements: Elements of the finest level, a multiple of 4. The README has the largest errors
+            of the centreline over gamma 100 ... 1300, phi0 0.2 ... 12, phi1 6 ... 20.
+        points: Output points per rod, >= 2.
 
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value.
+    Raises:
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
+            value.
     """
     fields = {"gamma": gamma, "phi0": phi0, "phi1": phi1}
     gamma, phi0, phi1 = (
@@ -130,7 +146,7 @@ def solve_rods(
 
 
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Floats:
-    """Return `values` as contiguous float64 of this shape, None standing for any extent."""
+    """Return `values` as contiguous float64 of this shape, in which None is any extent."""
     array = np.asarray(values)
     if array.ndim != len(shape) or any(
         b not in (None, a) for a, b in zip(array.shape, shape, strict=True)
@@ -148,7 +164,7 @@ def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) ->
 
 
 def check_count(name: str, value: int) -> None:
-    """Refuse a value that is no integer; the C++ core checks its range."""
+    """Refuse a value that is no integer in 0 ... 2^24. The C++ core checks its exact range."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"{name}: must be an integer, got {value!r}")
     if not 0 <= value < 2**24:
@@ -167,24 +183,29 @@ def solve_general_rods(
 ) -> RodSolution:
     """Compute the equilibrium that each rod reaches from its natural shape, or from another start.
 
-    As `solve_rods`, for rods that differ along their length: the energy is int 1/2 (kappa -
-    kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds [Bertails-Descoubes et al.
-    2018, Sec. 3]. Natural curvature is the cubic spline (not-a-knot ends) through its samples;
-    sample it finely enough for that. What the fields of the solution mean, and its units, is the
-    same; the clamp's frame is `clamp_frame`.
+    The function does the same as `solve_rods` for rods that vary along their length. The energy is
+    int 1/2 (kappa - kappa_bar(s))^T K (kappa - kappa_bar(s)) + gamma (1 - s) t . e_z ds
+    [Bertails-Descoubes et al. 2018, Sec. 3]. Natural curvature is the cubic spline (not-a-knot
+    ends) through its samples, which must be dense enough for it. The fields of the solution have
+    the same meanings and units, with `clamp_frame` as the frame of the clamp.
 
-    Args: natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of
-        uniform arc length (clamp ... free end, both included), shape (n, m, 3). m = 1: constant
-        along the rod. gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness
-        EI [-], shape (n,), >= 0. stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all
-        rods or (n, 3). clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z
-        up), shape (3, 3) or (n, 3, 3). start_curvature: Curvature of the shape from which the
-        search starts [1/L], shape (n, m', 3); None: the natural curvature. Another start may reach
-        another minimum. elements: Elements of the finest level, a multiple of 4. points: Output
-        points per rod, >= 2.
+    Args:
+        natural_curvature: Natural twist, bend about d2, bend about d3 [1/L] at m >= 1 points of
+            uniform arc length, clamp and free end included, shape (n, m, 3). A single sample (m =
+            1) is constant along the rod.
+        gamma: Weight against bending, rho A g L^3 / EI with the reference stiffness EI [-], shape
+            (n,), >= 0.
+        stiffness: K = (GJ, EI_2, EI_3) / EI [-], > 0, shape (3,) for all rods or (n, 3).
+        clamp_frame: Rotation R(0), columns d1 (tangent), d2, d3 in the world (z up), shape (3, 3)
+            or (n, 3, 3).
+        start_curvature: Curvature of the shape from which the search starts [1/L], shape (n, m',
+            3). None is the natural curvature. Another start may reach another minimum.
+        elements: Elements of the finest level, a multiple of 4.
+        points: Output points per rod, >= 2.
 
-    Raises: ValueError: An argument breaks its rule; the message names the field, the rule and the
-        value.
+    Raises:
+        ValueError: An argument breaks its rule. The message names the field, the rule and the
+            value.
     """
     natural = finite_array("natural_curvature", natural_curvature, (None, None, 3))
     n = len(natural)
@@ -213,11 +234,12 @@ def solve_general_rods(
     to_slope = interpolation_matrix(m, nodes, derivative=1)
     start_to_grid = interpolation_matrix(start.shape[1], grid)
     parts = []
+    # Even without rods the core runs once, which gives the result its fields.
     for begin in range(0, max(n, 1), RODS_AT_ONCE):
         some = slice(begin, begin + RODS_AT_ONCE)
         fields = to_grid @ natural[some]
         starts = fields if start is natural else start_to_grid @ start[some]
-        # The core checks it against `elements`. None is the largest of no rods.
+        # The core checks the largest curvature against `elements`. Without rods it is 0.
         largest = max(np.linalg.norm(f, axis=2).max(initial=0.0) for f in (fields, starts))
         slope = to_slope @ natural[some]
         at_points = to_points @ natural[some]
@@ -227,7 +249,11 @@ def solve_general_rods(
 
 
 def rod_stiffness(stiffness: ArrayLike, n: int) -> Floats:
-    """Return `stiffness` as (n, 3), checked."""
+    """Return `stiffness` as (n, 3).
+
+    Raises:
+        ValueError: It has another shape, or a number in it is not > 0.
+    """
     K = np.asarray(stiffness)
     K = finite_array("stiffness", np.broadcast_to(K, (n, 3)) if K.shape == (3,) else K, (n, 3))
     if (K <= 0).any():
@@ -247,8 +273,10 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
         raise ValueError(
             f"clamp_frame: must be a rotation, got R^T R - 1 = {error:.1e}, det {determinant:.3g}"
         )
-    from scipy.spatial.transform import Rotation  # here, so that importing the package stays quick
+    # Imported here, so that importing the package stays quick.
+    from scipy.spatial.transform import Rotation
 
+    # scipy has the scalar part last. Without rods there is nothing to convert.
     return (
         np.ascontiguousarray(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1))
         if n
@@ -258,7 +286,8 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
 
 def bspline_matrix(intervals: int, s: Floats) -> Floats:
     """Return the cubic B-splines on equal intervals at s (p,), shape (p, intervals + 3)."""
-    from scipy.interpolate import BSpline  # here, so that importing the package stays quick
+    # Imported here, so that importing the package stays quick.
+    from scipy.interpolate import BSpline
 
     knots = np.arange(-3.0, intervals + 4.0) / intervals
     return np.asarray(BSpline.design_matrix(s, knots, 3, extrapolate=True).toarray())
@@ -275,8 +304,8 @@ def _interpolants(samples: int, derivative: int) -> "BSpline":
 def interpolation_matrix(samples: int, s: Floats, derivative: int = 0) -> Floats:
     """Return the matrix (p, samples) that interpolates values at uniform arc length at s (p,).
 
-    Four samples or more: the cubic spline with not-a-knot ends. Three, two, one: the parabola,
-    line, constant.
+    Four samples or more give the cubic spline with not-a-knot ends. Three samples give a parabola,
+    two a line, and one a constant.
     """
     if samples == 1:
         return np.full((len(s), 1), 0.0 if derivative else 1.0)
