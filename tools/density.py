@@ -13,6 +13,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from size import docstring_lines
+
 ROOT = Path(__file__).parents[1]
 DISTRIBUTIONS: dict[str, tuple[str, ...]] = {
     "schemas": ("schemas/src",),
@@ -57,17 +59,6 @@ class Density:
     def mean_characters(self) -> float:
         """The mean characters of a code line, without its indentation."""
         return self.characters / max(self.code_lines, 1)
-
-
-def docstring_lines(tree: ast.Module) -> set[int]:
-    """Return the numbers of the lines of strings that stand alone."""
-    numbers: set[int] = set()
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
-            continue
-        if isinstance(node.value.value, str):
-            numbers |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return numbers
 
 
 def is_packed(node: ast.AST) -> bool:

@@ -38,6 +38,7 @@ from stickslip_services.queue.rows import (
     SampleRow,
     StoredTask,
     TaskResultRow,
+    TaskRow,
     job_columns,
     task_columns,
 )
@@ -85,17 +86,9 @@ class NoValidSamplesError(Exception):
     """All samples of a dataset were rejected, so there is nothing to publish."""
 
 
-class Leasable(Protocol):
+class Leasable(TaskRow, Protocol):
     """A `StoredTask`, or a row with more columns."""
 
-    @property
-    def seq(self) -> int: ...
-    @property
-    def stage(self) -> str: ...
-    @property
-    def key(self) -> bytes: ...
-    @property
-    def state(self) -> str: ...
     @property
     def build(self) -> str: ...
     @property
