@@ -162,9 +162,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         urls=tuple(options.url),
         store=options.store,
         name=options.name,
-        key=None
-        if options.key_file is None
-        else options.key_file.read_text(encoding="ascii").strip(),
+        key_file=options.key_file,
         tls_certificate=options.tls_certificate,
         max_cpus=options.max_cpus,
         render_gpus=options.render_gpus,

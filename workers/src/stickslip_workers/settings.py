@@ -28,8 +28,11 @@ class Settings:
     """Place of the store, see `store_place`. A directory is the same on every node."""
     name: str
     """Name of this dispatcher. A second dispatcher with the same name replaces the first one."""
-    key: str | None = None
-    """Key of the coordinator's worker API, or None if the coordinator wants no key."""
+    key_file: Path | None = None
+    """File with the key of the worker API, or None if the coordinator wants no key.
+
+    The dispatcher reads it again when the key is refused.
+    """
     tls_certificate: Path | None = None
     """Certificate of the coordinator.
 

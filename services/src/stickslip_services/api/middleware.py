@@ -25,6 +25,7 @@ from stickslip_schemas.transport.addresses import is_loopback
 from stickslip_services.access.keys import KeyRing
 from stickslip_services.access.principals import Principal, Scope, acting_as
 from stickslip_services.api.problems import ProblemError
+from stickslip_services.errors import InvalidKeyError
 
 STATIC_PATH = "/static/"
 """Path of the scripts and styles of the pages: the only answers that are the same for everybody."""
@@ -177,19 +178,21 @@ class KeyMiddleware:
             if needed in self._open_scopes:
                 return Principal(scopes=self._open_scopes)
             return _unauthorized(f"the request needs a key of the scope `{needed}`")
-        principal = await self._principal_of(authorization)
-        if principal is None:
-            return _unauthorized("the key is not known, or it was revoked")
+        try:
+            principal = await self._principal_of(authorization)
+        except InvalidKeyError as error:
+            return _unauthorized(str(error))
         if needed in self._open_scopes or principal.may(needed):
             return principal
         granted = ", ".join(scope for scope in Scope if scope in principal.scopes)
         detail = f"the request needs the scope `{needed}`, and the key has: {granted}"
         return ProblemError(403, ProblemCode.scope_missing, detail)
 
-    async def _principal_of(self, authorization: str) -> Principal | None:
+    async def _principal_of(self, authorization: str) -> Principal:
+        """Return the holder of the key in a header; raise InvalidKeyError."""
         secret = _secret(authorization)
         if secret is None:
-            return None
+            raise InvalidKeyError("the header Authorization has no key")
         if self._ring.is_fresh:
             return self._ring.holder_of(secret)
         # The ring reads the database, which must not block the event loop.
