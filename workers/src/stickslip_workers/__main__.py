@@ -173,7 +173,8 @@ def _dispatch(options: argparse.Namespace) -> int:
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.ray_calls import StartError
 
-    address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
+    address = options.ray_address or os.environ.get("RAY_ADDRESS")
+    data = options.ray_data
     if address is None and data is None:
         data = Path(settings.name)
         command = [sys.executable, "-m", "stickslip_workers", "head", "--ray-data", str(data)]

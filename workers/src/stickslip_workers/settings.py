@@ -8,8 +8,11 @@ from pathlib import Path
 from stickslip_schemas.base import Stage
 
 RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
-RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
-"""Environment variable with the render device, and its default."""
+RENDER_DEVICE = "STICKSLIP_RENDER_DEVICE"
+"""Environment variable with the render device."""
+
+CPU = "cpu"
+"""The render device that is used if the variable is not set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
