@@ -128,6 +128,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         middleware.OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host)
     )
     app.add_middleware(middleware.RequestMiddleware, observe=metrics.observe)
+    app.add_middleware(middleware.AddressMiddleware, root_path=settings.root_path)
     return app
 
 

@@ -13,6 +13,7 @@ from stickslip_schemas.store import Store
 
 from stickslip_services.access import audit_log
 from stickslip_services.access.principals import current_principal, is_visible_project
+from stickslip_services.addresses import link
 from stickslip_services.catalog.inspector import INSPECTOR
 from stickslip_services.database.database import Database, PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates, uploads
@@ -101,7 +102,7 @@ def find_certificate(connection: Connection, digest: str) -> Row[tuple[object, .
 
 
 def _entry(row: Row[tuple[object, ...]]) -> CertificateEntry:
-    return document_of(CertificateEntry, row, href=f"/v1/certificates/{row.digest}")
+    return document_of(CertificateEntry, row, href=link(f"/v1/certificates/{row.digest}"))
 
 
 def check_files(database: Database, store: Store, spec: JobSpec) -> None:

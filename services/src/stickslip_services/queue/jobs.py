@@ -20,6 +20,7 @@ from stickslip_schemas.documents.responses import (
 )
 
 from stickslip_services.access.principals import is_visible_project, is_visible_task
+from stickslip_services.addresses import link
 from stickslip_services.database.database import PageRequest, document_of, read_page
 from stickslip_services.database.statements import RowQuery, ValueQuery
 from stickslip_services.database.tables import events, job_tasks, jobs, previews, samples, tasks
@@ -36,6 +37,9 @@ from stickslip_services.queue.rows import (
     task_columns,
 )
 from stickslip_services.queue.workers import RegisteredWorker, alive_workers, count_slots
+
+MAX_JOBS_OF_VERSION = 10
+"""Jobs that the page of a version names."""
 
 _WITHOUT_RESULT = [state.value for state in TaskState if not state.is_settled]
 
@@ -112,6 +116,18 @@ def list_jobs(
         query = query.where(jobs.c.project == project)
     entries = partial(_entries, connection, workers=workers, frames={})
     return read_page(connection, query, page, jobs.c.seq, entries, newest_first=newest_first)
+
+
+def jobs_of_version(connection: Connection, dataset: str, version: int) -> list[tuple[str, str]]:
+    """Return id and name of the newest jobs that made or share a version; the name may be empty."""
+    query = (
+        select(jobs.c.id, func.coalesce(jobs.c.name, ""))
+        .where(jobs.c.dataset == dataset, jobs.c.version == version)
+        .where(is_visible_project(jobs.c.project))
+        .order_by(jobs.c.seq.desc())
+        .limit(MAX_JOBS_OF_VERSION)
+    )
+    return [(row[0], row[1]) for row in connection.execute(query)]
 
 
 def job_projects(connection: Connection) -> list[str]:
@@ -215,7 +231,9 @@ def list_previews(
         )
     rows = connection.execute(query.order_by(samples.c.slot).limit(count))
     return [
-        Preview(slot=row.slot, labels=json.loads(row.labels), href=f"/v1/previews/{row.digest}")
+        Preview(
+            slot=row.slot, labels=json.loads(row.labels), href=link(f"/v1/previews/{row.digest}")
+        )
         for row in rows
     ]
 
