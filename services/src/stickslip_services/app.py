@@ -24,6 +24,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
+from stickslip_schemas.logs import configure_logging
 
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
@@ -42,7 +43,7 @@ from stickslip_services.database.database import Clock, Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import CommandError
-from stickslip_services.local.supervisor import configure_logging, limit_arenas, listen, locked
+from stickslip_services.local.supervisor import limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue import background
 from stickslip_services.queue.context import Context
@@ -171,6 +172,7 @@ def _coordinator(settings: Settings, openapi: bool, migrate: bool, fd: int | Non
         # A key that cannot sign is found now, and not when the first version is published.
         sign(b"", settings.signing_key)
     configure_logging()
+    logging.getLogger("alembic").setLevel(logging.WARNING)
     limit_arenas()
     check_database(settings, Role.visitor if migrate else Role.coordinator, with_store=True)
     if migrate:

@@ -113,6 +113,12 @@ class Settings(BaseSettings):
     """Free space on the disks of store and database below which jobs are paused [bytes]."""
     previews_per_job: int = Field(default=24, ge=0)
     """Samples of a job with a preview, evenly spread over its slots."""
+    log_bytes: int = Field(default=16 * 2**20, ge=1024)
+    """Size from which on `stickslip up` rotates a log [bytes]."""
+    log_days: float = Field(default=30.0, gt=0, allow_inf_nan=False)
+    """Age from which on `stickslip up` rotates a log [d]."""
+    log_files: int = Field(default=5, ge=1, le=1000)
+    """Rotated files of each log; the oldest one is deleted."""
     body_limit: int = Field(default=16 * 2**20, ge=1024)
     """Largest accepted request body [bytes]."""
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 from stickslip_schemas.documents.tasks import task_adapter
+from stickslip_schemas.logs import configure_logging
 from stickslip_schemas.store import open_store, store_place
 
 from stickslip_workers.lease_client import Backoff, CoordinatorError
@@ -143,9 +144,7 @@ def _store(place: str) -> str:
 
 
 def _dispatch(options: argparse.Namespace) -> int:
-    logging.basicConfig(
-        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    configure_logging()
     logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
     if not options.blender_python.exists():
         log.error(
