@@ -1,6 +1,6 @@
 """Logs of long-running processes: one event a line on standard error, whose file may be rotated.
 
-Whoever rotates a log renames its file and makes a new one (`stickslip up`, logrotate). The process
+A rotation renames the file of a log and makes a new one (`stickslip up`, logrotate). The process
 that writes has the renamed file open. Before each record, and on SIGHUP, it compares the two, and
 changes to the file that has the name. So each record is in exactly one of the files, and no process
 must be started again.
