@@ -395,6 +395,11 @@ class Cloth:
                 )
                 self.spent = max(self.spent, self._spent / allowed)
 
+    @property
+    def last_begin(self) -> float:
+        """Time at which the last step of `advance` began [s], or inf before the first."""
+        return self._before[0]
+
     def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.
 
