@@ -97,9 +97,9 @@ def _crosses_surfaces(cloth: Cloth, time: float, smooth: Floats, straight: Float
         points = surface.at(time)
         near = _near(points, np.asarray(surface.triangles), low, high)
         both = np.concatenate([cloth.mesh.triangles, near + len(smooth)], dtype=np.int32)
-        found = self_intersections(np.concatenate([smooth, points]), both)
+        together = self_intersections(np.concatenate([smooth, points]), both)
         # A surface may cross itself, which is no crossing of the cloth.
-        if found > alone + self_intersections(points, np.ascontiguousarray(near)):
+        if together > alone + self_intersections(points, np.ascontiguousarray(near)):
             return True
     return False
 
