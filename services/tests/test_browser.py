@@ -5,10 +5,12 @@ Needs Chromium (`apt-get install chromium`): Playwright brings no browser of its
 Accessibility is checked with axe-core, which `axe-playwright-python` brings.
 """
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
@@ -19,11 +21,12 @@ from stickslip_schemas.scene.files import with_arrays
 from stickslip_services.app import make_app
 from stickslip_services.catalog.inputs import register_certificate
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.control import cancel_job
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_sim_core.scenes.cloth_scene import KIND
 from stickslip_testing.jobs import parsed, rods, show_job
-from stickslip_testing.servers import serving, wait_until
+from stickslip_testing.servers import serving, start_server, wait_until
 from stickslip_testing.worker import BUILDS, DirectApi, PretendWorker, rejection
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="make setup-dev")
@@ -329,4 +332,55 @@ def test_a_sample_without_webgl_says_so(browser: Any, url: str, paths: list[str]
     page.goto(url + paths[6])
     wait_until(lambda: "has no WebGL" in page.locator(".space .message").inner_text())
     assert page.locator(".space canvas").count() == 0
+    page.close()
+
+
+AWAY_SECONDS = 5.0
+"""Time after which a page must say that the service is away [s]."""
+
+
+def test_a_page_says_that_the_service_is_away_and_recovers(browser: Any, tmp_path: Path) -> None:
+    server = start_server(tmp_path / "data")
+    job = httpx.post(f"{server.url}/v1/jobs", json=rods()).json()["id"]
+    page = browser.new_page()
+    page.goto(f"{server.url}/jobs/{job}")
+    page.get_by_role("button", name="Pause").wait_for()
+    assert page.locator("#away").is_hidden()
+    port = int(server.url.rpartition(":")[2])
+    server.process.kill()
+    server.stop()
+    killed_at = time.monotonic()
+    page.locator("#away").wait_for(timeout=1000 * AWAY_SECONDS)
+    assert time.monotonic() - killed_at < AWAY_SECONDS
+    assert "The service is away since" in page.locator("#away").inner_text()
+    # A press meanwhile is not lost in silence, and can be repeated.
+    page.get_by_role("button", name="Pause").click()
+    page.locator("#lost").get_by_text(
+        "“Pause” had no effect: the service did not answer"
+    ).wait_for()
+    server = start_server(tmp_path / "data", port)
+    try:
+        page.locator("#away").wait_for(state="hidden", timeout=20_000)
+        page.locator("#lost").get_by_role("button", name="Try again").click()
+        page.get_by_role("button", name="Resume").wait_for()
+        assert page.locator(".state").first.inner_text() == "paused"
+        assert page.locator("#lost").inner_text() == ""
+    finally:
+        page.close()
+        server.stop()
+
+
+def test_a_refused_press_is_explained(
+    browser: Any, url: str, paths: list[str], app: FastAPI
+) -> None:
+    job = submit_job(app.state.context, parsed(rods(name="raced", gamma=(21.0,))), None)
+    assert isinstance(job, JobDetail)
+    page = browser.new_page()
+    # As of a page that is not told of changes.
+    page.route("**/ui/changes", lambda route: route.abort())
+    page.goto(f"{url}/jobs/{job.id}")
+    cancel_job(app.state.context, job.id)
+    page.get_by_role("button", name="Pause").click()
+    page.locator("#lost").get_by_text("“Pause” had no effect: job").wait_for()
+    assert "can be paused" in page.locator("#lost").inner_text()
     page.close()

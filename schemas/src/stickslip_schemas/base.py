@@ -219,13 +219,14 @@ class Reason(StrEnum):
     jumps = "jumps"
     unconverged = "unconverged"
     budget = "budget"
-    missed = "missed"
     crossings = "crossings"
     contact_gain = "contact_gain"
     stretch = "stretch"
     penetration = "penetration"
     passages = "passages"
     sharpness = "sharpness"
+    # The same, of rows that earlier versions wrote.
+    missed = "missed"
     # Only jobs end or wait for these.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"

@@ -24,6 +24,7 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.staticfiles import StaticFiles
+from stickslip_schemas.logs import configure_logging
 
 from stickslip_services import __version__
 from stickslip_services.access.keys import KeyRing, sealer, secret_in
@@ -34,6 +35,7 @@ from stickslip_services.api.routes import catalog, health, jobs, workers
 from stickslip_services.api.routes.health import Metrics
 from stickslip_services.api.routes.pages import datasets as dataset_pages
 from stickslip_services.api.routes.pages import jobs as job_pages
+from stickslip_services.api.routes.pages import submit as submit_pages
 from stickslip_services.api.sse import Feeds
 from stickslip_services.catalog.inspector import MAX_PROCESSES
 from stickslip_services.client.errors import ClientError
@@ -42,7 +44,7 @@ from stickslip_services.database.database import Clock, Role
 from stickslip_services.database.opening import check as check_database
 from stickslip_services.database.opening import opened
 from stickslip_services.errors import CommandError
-from stickslip_services.local.supervisor import configure_logging, limit_arenas, listen, locked
+from stickslip_services.local.supervisor import limit_arenas, listen, locked
 from stickslip_services.pages.rendering import STATIC
 from stickslip_services.queue import background
 from stickslip_services.queue.context import Context
@@ -115,7 +117,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with
     # one after the other.
-    modules = (workers, jobs, catalog, health, job_pages, dataset_pages)
+    modules = (workers, jobs, catalog, health, job_pages, dataset_pages, submit_pages)
     app.state.routes = [route for module in modules for route in module.router.routes]
     app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
@@ -128,6 +130,7 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
         middleware.OriginMiddleware, allowed_hosts=(*settings.allowed_hosts, settings.host)
     )
     app.add_middleware(middleware.RequestMiddleware, observe=metrics.observe)
+    app.add_middleware(middleware.AddressMiddleware, root_path=settings.root_path)
     return app
 
 
@@ -170,6 +173,7 @@ def _coordinator(settings: Settings, openapi: bool, migrate: bool, fd: int | Non
         # A key that cannot sign is found now, and not when the first version is published.
         sign(b"", settings.signing_key)
     configure_logging()
+    logging.getLogger("alembic").setLevel(logging.WARNING)
     limit_arenas()
     check_database(settings, Role.visitor if migrate else Role.coordinator, with_store=True)
     if migrate:

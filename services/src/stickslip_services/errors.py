@@ -22,6 +22,10 @@ class NotFoundError(StickslipError):
     """The requested thing does not exist."""
 
 
+class InvalidKeyError(StickslipError):
+    """The key of a request is unknown, was revoked, or has expired."""
+
+
 class ConflictError(StickslipError):
     """The state of the thing does not allow the request."""
 

@@ -15,6 +15,7 @@ from sqlalchemy.exc import ArgumentError
 from stickslip_schemas.store import open_store, store_place
 from stickslip_schemas.transport.addresses import DEFAULT_PORT, is_loopback
 
+from stickslip_services.addresses import checked_prefix
 from stickslip_services.errors import SettingsError
 
 R = TypeVar("R")
@@ -73,6 +74,10 @@ class Settings(BaseSettings):
     """Refuse requests without a key on loopback, too."""
     behind_proxy: bool = False
     """A proxy in front of the coordinator terminates TLS; requests need keys."""
+    root_path: str = ""
+    """Path below which a proxy offers the coordinator, such as /stickslip; its header
+    X-Forwarded-Prefix comes first.
+    """
     tls_certificate: Path | None = None
     """File of the TLS certificate and its chain."""
     tls_key: Path | None = None
@@ -108,6 +113,12 @@ class Settings(BaseSettings):
     """Free space on the disks of store and database below which jobs are paused [bytes]."""
     previews_per_job: int = Field(default=24, ge=0)
     """Samples of a job with a preview, evenly spread over its slots."""
+    log_bytes: int = Field(default=16 * 2**20, ge=1024)
+    """Size from which on `stickslip up` rotates a log [bytes]."""
+    log_days: float = Field(default=30.0, gt=0, allow_inf_nan=False)
+    """Age from which on `stickslip up` rotates a log [d]."""
+    log_files: int = Field(default=5, ge=1, le=1000)
+    """Rotated files of each log; the oldest one is deleted."""
     body_limit: int = Field(default=16 * 2**20, ge=1024)
     """Largest accepted request body [bytes]."""
 
@@ -136,6 +147,14 @@ class Settings(BaseSettings):
                     f"allowed_hosts must be names or addresses without a port; one is {host!r}"
                 )
         return hosts
+
+    @field_validator("root_path")
+    @classmethod
+    def _is_prefix(cls, root_path: str) -> str:
+        try:
+            return checked_prefix(root_path)
+        except ValueError as error:
+            raise ValueError(f"root_path {error}") from None
 
     @field_validator("store")
     @classmethod
@@ -296,6 +315,6 @@ _KINDS: dict[Any, dict[str, Any]] = {
 
 SERVER = (
     *("data", "store", "database", "host", "port", "allowed_hosts", "require_keys", "behind_proxy"),
-    *("tls_certificate", "tls_key", "signing_key"),
+    *("root_path", "tls_certificate", "tls_key", "signing_key"),
 )
 """Settings that are options of a coordinator."""

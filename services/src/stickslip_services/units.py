@@ -11,6 +11,15 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def percent(part: float, whole: float) -> str:
+    """Return a share: 0 %, 0.1 %, 99.9 %, 100 %. Only all of it is 100 %, and only nothing 0 %."""
+    if part <= 0 or whole <= 0:
+        return "0 %"
+    if part >= whole:
+        return "100 %"
+    return f"{min(max(100 * part / whole, 0.1), 99.9):.1f} %"
+
+
 def size(count: float) -> str:
     """Return a number of bytes: 512 B, 13.5 kB, 1.2 GB."""
     for unit in ("B", "kB", "MB", "GB"):

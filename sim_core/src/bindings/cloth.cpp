@@ -59,6 +59,22 @@ void bind_cloth(nb::module_& m) {
       "Internal: number of pieces of a mesh that hang together. Raises ValueError, naming the "
       "field, unless it is a "
       "triangulation that cloth can have.");
+  m.def(
+      "body_gaps",
+      [](const BodyTuple& body, const Points3& points) {
+        const Body at = bodies_of({body})[0];
+        Eigen::VectorXd distances(points.rows());
+        Points3 normals(points.rows(), 3);
+        for (Eigen::Index i = 0; i < points.rows(); ++i) {
+          const Gap gap = gap_of(at, points.row(i).transpose());
+          distances[i] = gap.distance;
+          normals.row(i) = gap.normal.transpose();
+        }
+        return std::make_pair(distances, normals);
+      },
+      "body"_a, "points"_a,
+      "Internal: signed distances of points (N, 3) from a body (N,) [m], negative inside, and the "
+      "outward normals there (N, 3).");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
   m.def(

@@ -22,8 +22,8 @@ double sagitta(double radius, double circle) {
 
 }  // namespace
 
-StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly)
-    : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
+StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly, double inside)
+    : assembly_(assembly), inside_(inside), cell_(mesh.rest.rows(), 0.0) {
   std::vector<int> around(mesh.rest.rows(), 0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     Matrix2d sides;
@@ -147,7 +147,8 @@ int StepDiagnostics::passages(const Body& begin, const Body& end, const StepTake
 // Of each node that touches a body, the work R . (change of gap n + slip): contact only takes
 // energy from the motion against a body. The gap's change stands for the normal part of the motion,
 // for a round face turns on the way. On a fillet, n = sum w_i n_i, it is sum w_i times
-// those of the gaps.
+// those of the gaps. What may begin inside a body counts as on its face: letting that out is no
+// work that a run may be judged by.
 void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newton,
                                        DiagnosticExtremes& out) const {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
@@ -161,8 +162,9 @@ void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newt
     // The change of a gap, and the share of its normal.
     const Vector2d displacement = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
-      return {gap.distance - gap_of(step.at_start[body], from).distance,
-              gap.normal.dot(on.gap.normal)};
+      const double before = gap_of(step.at_start[body], from).distance;
+      const bool may_be = before < 0.0 && before >= -inside_;
+      return {gap.distance - (may_be ? 0.0 : before), gap.normal.dot(on.gap.normal)};
     });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
     out.contact_work +=

@@ -49,15 +49,6 @@ def moved(height: float, by: ArrayLike, bodies: list[Body], held: ArrayLike = HE
     return cloth
 
 
-@pytest.mark.parametrize(
-    ("part", "whole", "ratio"),
-    [(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 4.0, 0.25), (1.0, 0.0, math.inf)],
-)
-def test_a_part_of_nothing_is_beyond_every_limit(part: float, whole: float, ratio: float) -> None:
-    """A run that gains energy where none flows must not pass as one that gains none."""
-    assert checks._ratio(part, whole) == ratio
-
-
 def test_a_sheet_on_a_floor_passes_all() -> None:
     cloth, _ = sheet(1e-4)
     for _ in range(20):
@@ -147,12 +138,7 @@ def test_the_reason_is_the_cause_and_not_what_follows() -> None:
     """A holder driven through a floor stretches the cloth, and no step fits its jerks."""
     cloth, _ = sheet(0.0)
     good = dict(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))
-    assert (
-        checks.failed({**good, "missed": 0.71, "stretch": 6.4, "penetration": 6.4})[0]
-        == "penetration"
-    )
-    assert checks.failed({**good, "missed": 1.5, "stretch": 6.4, "passages": 1.0})[0] == "passages"
-    assert (
-        checks.failed({**good, "missed": 0.58, "stretch": 2.9, "sharpness": 12.5})[0] == "stretch"
-    )
-    assert checks.failed({**good, "missed": 0.58})[0] == "missed"
+    assert checks.failed({**good, "stretch": 6.4, "penetration": 6.4})[0] == "penetration"
+    assert checks.failed({**good, "stretch": 6.4, "passages": 1.0})[0] == "passages"
+    assert checks.failed({**good, "stretch": 2.9, "sharpness": 12.5})[0] == "stretch"
+    assert checks.failed({**good, "missed": 1.0})[0] == "", "recorded, and not judged"

@@ -50,6 +50,20 @@ def watched(cloth: Cloth, steps: int, dt: float = 0.02, **drive: object) -> int:
     return cloth.total.unconverged - before
 
 
+def doubled_over(arc: Floats, length: float, radius: float) -> tuple[Floats, Floats]:
+    """Return where arc lengths (V,) of a strip lie along and above its lower half, both (V,) [m].
+
+    The strip has two straight halves, and half a circle between them.
+    """
+    straight = (length - np.pi * radius) / 2
+    angle = np.clip((arc - straight) / radius, 0.0, np.pi)
+    lower = np.minimum(arc, straight)
+    upper = straight - np.maximum(arc - straight - np.pi * radius, 0.0)
+    is_lower = angle < np.pi / 2
+    along = np.where(is_lower, lower, upper) + radius * np.sin(angle)
+    return along, radius * (1.0 - np.cos(angle))
+
+
 class TestWithoutContact:
     def test_results_are_the_same(self) -> None:
         """Of a sheet that is pulled over a floor, to 1e-9 m: solves end at residuals that differ by
@@ -430,19 +444,17 @@ class TestSurfaces:
 
 
 class TestNothingCrosses:
-    @pytest.mark.parametrize(
-        "seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1))]
-    )
+    @pytest.mark.parametrize("seed", [0, 1, 3])
     def test_crumpled_sheet_that_falls(self, seed: int) -> None:
+        """Of a sheet that is doubled over: whichever way it crumples, its halves meet."""
         rng = np.random.default_rng(seed)
         mesh = meshes.unstructured(0.1, 0.1, 0.01, seed)
         cloth = Cloth(mesh, SOFT, CERTIFIED, self_contact=SelfContact(float(rng.uniform(0.0, 1.0))))
         u, v = mesh.rest.T
-        wave = 0.006 * np.sin(80.0 * u + rng.uniform(0, 6)) + 0.003 * np.sin(
-            150.0 * v + rng.uniform(0, 6)
-        )
-        cloth.set_state(np.column_stack([0.7 * u, wave, 0.08 + 0.9 * v]))
-        unconverged = watched(cloth, 60, 0.01, bodies=[plane(0.4)])
+        wave = 0.004 * np.sin(80.0 * u + rng.uniform(0, 6))
+        along, above = doubled_over(v - v.min(), length=0.1, radius=0.004)
+        cloth.set_state(np.column_stack([0.9 * u, along, 0.03 + above + wave]))
+        unconverged = watched(cloth, 40, 0.01, bodies=[plane(0.4)])
         assert cloth.total.least_distance < 1.01 * THICKNESS  # it did touch itself
         assert cloth.total.least_distance > 0.9 * THICKNESS
         assert unconverged <= 1

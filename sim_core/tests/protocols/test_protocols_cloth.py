@@ -152,7 +152,7 @@ class TestInclinedPlane:
         result = protocols.run("inclined-plane", friction=(0.1, 1.5), cells=6)
         assert result.passed
         assert result.error < 1e-3
-        assert result.settings["drift_mm"] == 0.0
+        assert result.settings["drift_mm"] < 1e-12  # a start of other rounding is all that differs
 
     def test_creep_is_not_passed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(inclined_plane.OnSlope, "drift", lambda _: 2e-5)

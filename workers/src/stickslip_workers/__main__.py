@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 from stickslip_schemas.documents.tasks import task_adapter
+from stickslip_schemas.logs import configure_logging
 from stickslip_schemas.store import open_store, store_place
 
 from stickslip_workers.lease_client import Backoff, CoordinatorError
@@ -143,9 +144,7 @@ def _store(place: str) -> str:
 
 
 def _dispatch(options: argparse.Namespace) -> int:
-    logging.basicConfig(
-        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    configure_logging()
     logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
     if not options.blender_python.exists():
         log.error(
@@ -162,9 +161,7 @@ def _dispatch(options: argparse.Namespace) -> int:
         urls=tuple(options.url),
         store=options.store,
         name=options.name,
-        key=None
-        if options.key_file is None
-        else options.key_file.read_text(encoding="ascii").strip(),
+        key_file=options.key_file,
         tls_certificate=options.tls_certificate,
         max_cpus=options.max_cpus,
         render_gpus=options.render_gpus,
@@ -175,7 +172,8 @@ def _dispatch(options: argparse.Namespace) -> int:
     from stickslip_workers.dispatcher import Dispatcher
     from stickslip_workers.ray_calls import StartError
 
-    address, data = options.ray_address or os.environ.get("RAY_ADDRESS"), options.ray_data
+    address = options.ray_address or os.environ.get("RAY_ADDRESS")
+    data = options.ray_data
     if address is None and data is None:
         data = Path(settings.name)
         command = [sys.executable, "-m", "stickslip_workers", "head", "--ray-data", str(data)]

@@ -18,11 +18,14 @@ from stickslip_schemas.base import sha256
 
 log = logging.getLogger(__name__)
 
-RECONNECT_SECONDS, OWN_RECONNECT_SECONDS = "15", "2"
+RECONNECT_SECONDS = "15"
 """Time that Ray looks for a lost head [s].
 
-Ray then ends the driver, and another driver starts. The next head of this machine has another port.
+Ray then ends the driver, and another driver starts.
 """
+
+LOCAL_RECONNECT_SECONDS = "2"
+"""The same for a head of this machine, whose next head has another port [s]."""
 
 RETRY_SECONDS = 1.0
 """Time between two attempts to connect [s]."""
@@ -46,7 +49,7 @@ class RayCluster:
             # With 0, Ray does not replace loopback by another address of this machine.
             os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"}
             os.environ["RAY_AUTH_TOKEN_PATH"] = str(self.location / "token")
-            seconds = OWN_RECONNECT_SECONDS
+            seconds = LOCAL_RECONNECT_SECONDS
         else:  # `ray start` infers the mode from a token, `ray.init` does not
             has_token = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys()
             os.environ.setdefault("RAY_AUTH_MODE", "token" if has_token else "disabled")

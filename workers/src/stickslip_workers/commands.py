@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -24,7 +24,7 @@ from stickslip_schemas.plan.builds import digests, sources
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import with_arrays
 from stickslip_schemas.scene.parameters import with_values
-from stickslip_schemas.spec.cameras import load_rig
+from stickslip_schemas.spec.cameras import Camera, load_rig
 from stickslip_schemas.store import Store, open_store, write_durably
 from stickslip_sim_core import build_info, protocols
 from stickslip_sim_core.protocols.result import dense_master
@@ -61,9 +61,10 @@ def replay(
     if not isinstance(task, RenderTask):
         return run_tasks([task], open_store(store))[0]
     with TemporaryDirectory() as scratch:
-        given, answer = Path(scratch, "task.json"), Path(scratch, "result.json")
-        given.write_text(task.model_dump_json())
-        command = [blender_python, "-c", _RENDER, render_actor, store, given, answer]
+        request = Path(scratch, "task.json")
+        answer = Path(scratch, "result.json")
+        request.write_text(task.model_dump_json())
+        command = [blender_python, "-c", _RENDER, render_actor, store, request, answer]
         status = subprocess.run([str(word) for word in command], check=False).returncode
         if status != 0:
             return failed(Reason.renderer_crash, f"the renderer ended with status {status}")
@@ -89,9 +90,7 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
         OSError: A file cannot be read or written.
         RuntimeError: The drawing failed.
     """
-    given = scene.looks.cameras
-    views = [view.camera(name) for name, view in given.items()] if isinstance(given, dict) else []
-    cameras = load_rig(given) if isinstance(given, str) else views
+    cameras = _cameras(scene)
     with TemporaryDirectory(prefix="stickslip-preview-") as folder:
         pictures = {
             place: Path(folder, artifact_digest(name) or "")
@@ -108,7 +107,8 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
             "segments": scene_segments(scene.sheets, scene.bodies),
             "cameras": [camera.model_dump(mode="json") for camera in cameras],
         }
-        record, document = Path(folder, "record.npz"), Path(folder, "scene.json")
+        record = Path(folder, "record.npz")
+        document = Path(folder, "scene.json")
         np.savez(record, allow_pickle=False, **_record(scene, with_arrays(scene, store.read)))
         document.write_text(json.dumps(request), encoding="utf-8")
         out.mkdir(parents=True, exist_ok=True)
@@ -126,18 +126,28 @@ def preview(scene: Scene, store: Store, out: Path, blender_python: Path) -> list
     return done.stdout.split()
 
 
+def _cameras(scene: Scene) -> Sequence[Camera]:
+    """Return the cameras of a scene, which names a rig or describes its views."""
+    cameras = scene.looks.cameras
+    if isinstance(cameras, str):
+        return load_rig(cameras)
+    if cameras is None:
+        return []
+    return [view.camera(name) for name, view in cameras.items()]
+
+
 def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of a scene at the times of the animation."""
     for sheet in document["sheets"].values():
         if sheet["start"]["type"] == "hung":
             sheet["start"] = {"type": "flat"}
-    made = cloth_scene.scene(document)
+    staged = cloth_scene.scene(document)
     times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
-    start = SimpleNamespace(positions=np.repeat(made.start[None], FRAMES, axis=0))
-    tracks = {
-        name: np.stack([np.asarray(at(time)) for time in times]) for name, at in made.tracks.items()
-    }
-    return {**made.arrays(cast(ClothRun, start)), **made.record, **tracks}
+    start = SimpleNamespace(positions=np.repeat(staged.start[None], FRAMES, axis=0))
+    tracks = {}
+    for name, value_at in staged.tracks.items():
+        tracks[name] = np.stack([np.asarray(value_at(time)) for time in times])
+    return {**staged.arrays(cast(ClothRun, start)), **staged.record, **tracks}
 
 
 DOCUMENT_NAME = "certificate.json"
@@ -160,16 +170,17 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
     reports: list[ProtocolReport] = []
     for number, name in enumerate(certification.protocols, 1):
         say(f"{number}/{len(certification.protocols)} {name} ...")
-        cpu, wall = time.process_time(), time.monotonic()
+        cpu_start = time.process_time()
+        wall_start = time.monotonic()
         try:
             result = protocols.run(
                 name, preset, **(certification.quick.get(name, {}) if quick else {})
             )
             document = result.as_dict()
-            for shown, curve in zip(document["curves"], result.curves, strict=True):
-                shown["dense_x"], shown["dense_master"] = (
-                    v.tolist() for v in dense_master(result.protocol, curve)
-                )
+            for curve_document, curve in zip(document["curves"], result.curves, strict=True):
+                dense_x, dense_y = dense_master(result.protocol, curve)
+                curve_document["dense_x"] = dense_x.tolist()
+                curve_document["dense_master"] = dense_y.tolist()
             report = ProtocolReport.model_validate(document)
             canonical_json(report.model_dump(mode="json"))  # settings are free in form
         # Any error becomes part of the certificate, and the other protocols still run.
@@ -177,9 +188,10 @@ def certify(preset: str, out: Path, *, quick: bool, say: Say) -> Certificate:
             log.exception("the protocol %s broke off", name)
             report = _broken_off(name, error)
         reports.append(report)
-        spent = time.process_time() - cpu
-        environment[f"cpu_seconds/{name}"] = f"{spent:.2f}"
-        say(f"    {verdict(report)}; {spent:.1f} CPU s in {time.monotonic() - wall:.1f} s")
+        cpu_seconds = time.process_time() - cpu_start
+        wall_seconds = time.monotonic() - wall_start
+        environment[f"cpu_seconds/{name}"] = f"{cpu_seconds:.2f}"
+        say(f"    {verdict(report)}; {cpu_seconds:.1f} CPU s in {wall_seconds:.1f} s")
     certificate = Certificate(
         preset=preset,
         numbers=dict(certification.numbers()),

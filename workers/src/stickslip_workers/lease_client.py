@@ -8,7 +8,7 @@ import ssl
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -73,19 +73,51 @@ def pinned(certificate: Path) -> ssl.SSLContext:
     return context
 
 
+class KeyFile(httpx.Auth):
+    """Sends the key in a file. It is thread-safe.
+
+    `stickslip keys rotate` replaces the key, and the coordinator refuses the old one some time
+    later. The file is then read again, so that no dispatcher must be started again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._key = self._read()
+
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+        """Send a request, and repeat it once if its key is refused and the file has another."""
+        key = self._key
+        request.headers["Authorization"] = f"Bearer {key}"
+        response = yield request
+        if response.status_code != httpx.codes.UNAUTHORIZED:
+            return
+        # A missing file leaves the refusal of the coordinator as the answer.
+        with contextlib.suppress(OSError):
+            self._key = self._read()
+        if self._key != key:
+            log.info("the key of %s is another one now", self._path)
+            request.headers["Authorization"] = f"Bearer {self._key}"
+            yield request
+
+    def _read(self) -> str:
+        return self._path.read_text(encoding="ascii").strip()
+
+
 class CoordinatorClient:
     """Client of the worker API. It is thread-safe."""
 
     def __init__(
-        self, urls: Sequence[str], key: str | None = None, tls_certificate: Path | None = None
+        self,
+        urls: Sequence[str],
+        key_file: Path | None = None,
+        tls_certificate: Path | None = None,
     ) -> None:
         headers = {"Content-Type": "application/json"}
-        if key is not None:
-            headers["Authorization"] = f"Bearer {key}"
+        key = None if key_file is None else KeyFile(key_file)
         # trust_env=False: the client does not reach the coordinator through a proxy of the
         # environment.
         verify = True if tls_certificate is None else pinned(tls_certificate)
-        self._http = httpx.Client(headers=headers, verify=verify, trust_env=False)
+        self._http = httpx.Client(headers=headers, auth=key, verify=verify, trust_env=False)
         self._urls = deque(url.rstrip("/") for url in urls)
         """URLs of coordinators with one database. The client asks the first one."""
 

@@ -8,8 +8,11 @@ from pathlib import Path
 from stickslip_schemas.base import Stage
 
 RENDER_ACTOR = "stickslip_blender.actor:RenderActor"
-RENDER_DEVICE, CPU = "STICKSLIP_RENDER_DEVICE", "cpu"
-"""Environment variable with the render device, and its default."""
+RENDER_DEVICE = "STICKSLIP_RENDER_DEVICE"
+"""Environment variable with the render device."""
+
+CPU = "cpu"
+"""The render device that is used if the variable is not set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,8 +31,11 @@ class Settings:
     """Place of the store, see `store_place`. A directory is the same on every node."""
     name: str
     """Name of this dispatcher. A second dispatcher with the same name replaces the first one."""
-    key: str | None = None
-    """Key of the coordinator's worker API, or None if the coordinator wants no key."""
+    key_file: Path | None = None
+    """File with the key of the worker API, or None if the coordinator wants no key.
+
+    The dispatcher reads it again when the key is refused.
+    """
     tls_certificate: Path | None = None
     """Certificate of the coordinator.
 

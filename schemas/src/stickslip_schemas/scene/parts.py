@@ -39,6 +39,22 @@ def unit_hint(extent: float) -> str:
 
 
 Length = Annotated[Float, Field(gt=0, le=100)]
+
+THINNEST = 1e-4
+"""Least radius or side of a body [m]: thinner than any needle is taken for another unit."""
+
+
+def _of_a_body(value: Any) -> Any:
+    """Return the radius or side of a body [m]; raise ValueError if it is one of another unit."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and value > 0 and not THINNEST <= value <= LARGEST:
+        raise ValueError(f"must be {THINNEST:g} to {LARGEST:g} m{unit_hint(value)}")
+    return value
+
+
+BodyLength = Annotated[Float, Field(ge=THINNEST, le=LARGEST), BeforeValidator(_of_a_body)]
+"""A radius or side of a body [m]."""
+
 Place = Annotated[Float, Field(ge=-100, le=100)]
 Vector = tuple[Place, Place, Place]
 Angle = Annotated[Float, Field(ge=-6.2832, le=6.2832, description="at most a full turn [rad]")]
@@ -187,21 +203,21 @@ class Sphere(_Placed):
     """A ball."""
 
     type: Literal["sphere"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
 
 
 class Cylinder(_Placed):
     """A cylinder without ends, whose axis is z before it is turned."""
 
     type: Literal["cylinder"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
 
 
 class Capsule(_Placed):
     """A cylinder with round ends, whose axis is z before it is turned."""
 
     type: Literal["capsule"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
     length: Length = Field(description="between the middles of its ends [m]")
 
 
@@ -209,7 +225,7 @@ class Box(_Placed):
     """A box."""
 
     type: Literal["box"]
-    size: tuple[Length, Length, Length] = Field(description="of its edges [m]")
+    size: tuple[BodyLength, BodyLength, BodyLength] = Field(description="of its edges [m]")
     rounding: Float | None = Field(
         default=None,
         gt=0,

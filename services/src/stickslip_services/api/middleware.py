@@ -1,4 +1,4 @@
-"""Steps that a request passes before its route: an id, a timing, privacy, origin and key.
+"""Steps that a request passes before its route: its address, an id, a timing, privacy, origin, key.
 
 A page of another site that is open in a browser on this machine can send requests to the
 coordinator, but it cannot forge `Host` and `Origin`. The check of `Host` prevents DNS rebinding,
@@ -22,12 +22,17 @@ from starlette.types import Scope as HttpScope
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.transport.addresses import is_loopback
 
+from stickslip_services import addresses
 from stickslip_services.access.keys import KeyRing
 from stickslip_services.access.principals import Principal, Scope, acting_as
 from stickslip_services.api.problems import ProblemError
+from stickslip_services.errors import InvalidKeyError
 
 STATIC_PATH = "/static/"
 """Path of the scripts and styles of the pages: the only answers that are the same for everybody."""
+
+FORWARDED_SCHEMES = ("http", "https")
+"""Schemes of a client that a proxy may report."""
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9_.:-]{1,128}")
 _METHODS = frozenset(HTTPMethod)
@@ -38,6 +43,40 @@ _KEY_HELP = (
     ", as `Authorization: Bearer KEY` or as the password of Basic; `stickslip keys create` makes "
     "keys, and local workers use the one in the file `worker-key` of the data directory"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class AddressMiddleware:
+    """Notes how the client addresses the coordinator, and takes the prefix off the path.
+
+    The prefix is that of `X-Forwarded-Prefix`, or else the setting `root_path`. It must come
+    first: all other steps, the check of keys too, judge the path that the routes see.
+    """
+
+    app: ASGIApp
+    root_path: str = ""
+
+    async def __call__(self, scope: HttpScope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        forwarded = headers.get("x-forwarded-prefix")
+        try:
+            prefix = self.root_path if forwarded is None else addresses.checked_prefix(forwarded)
+        except ValueError as error:
+            # A wrong prefix is a fault of the proxy's configuration, and links would lead nowhere.
+            detail = f"X-Forwarded-Prefix {error}"
+            refusal = ProblemError(400, ProblemCode.validation_failed, detail)
+            await refusal.answer(scope, receive, send)
+            return
+        scheme = headers.get("x-forwarded-proto", "").lower()
+        if scheme not in FORWARDED_SCHEMES:
+            scheme = scope["scheme"]
+        origin = f"{scheme}://{headers.get('host', '')}"
+        addresses.enter(addresses.Address(origin, prefix))
+        own_path = addresses.without_prefix(scope["path"], prefix)
+        await self.app({**scope, "path": own_path}, receive, send)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,19 +216,21 @@ class KeyMiddleware:
             if needed in self._open_scopes:
                 return Principal(scopes=self._open_scopes)
             return _unauthorized(f"the request needs a key of the scope `{needed}`")
-        principal = await self._principal_of(authorization)
-        if principal is None:
-            return _unauthorized("the key is not known, or it was revoked")
+        try:
+            principal = await self._principal_of(authorization)
+        except InvalidKeyError as error:
+            return _unauthorized(str(error))
         if needed in self._open_scopes or principal.may(needed):
             return principal
         granted = ", ".join(scope for scope in Scope if scope in principal.scopes)
         detail = f"the request needs the scope `{needed}`, and the key has: {granted}"
         return ProblemError(403, ProblemCode.scope_missing, detail)
 
-    async def _principal_of(self, authorization: str) -> Principal | None:
+    async def _principal_of(self, authorization: str) -> Principal:
+        """Return the holder of the key in a header; raise InvalidKeyError."""
         secret = _secret(authorization)
         if secret is None:
-            return None
+            raise InvalidKeyError("the header Authorization has no key")
         if self._ring.is_fresh:
             return self._ring.holder_of(secret)
         # The ring reads the database, which must not block the event loop.

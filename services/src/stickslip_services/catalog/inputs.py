@@ -13,6 +13,7 @@ from stickslip_schemas.store import Store
 
 from stickslip_services.access import audit_log
 from stickslip_services.access.principals import current_principal, is_visible_project
+from stickslip_services.addresses import link
 from stickslip_services.catalog.inspector import INSPECTOR
 from stickslip_services.database.database import Database, PageRequest, document_of, read_page
 from stickslip_services.database.tables import certificates, uploads
@@ -24,25 +25,6 @@ _NOT_UPLOADED = "must name a file that was uploaded; `stickslip upload FILE` doe
 _NOT_RESOLVED = (
     "must be sha256: and the digest of an uploaded file; `stickslip submit` uploads files of scenes"
 )
-
-
-def standing_certificate(
-    connection: Connection, preset: str, sim_core: Sha256
-) -> tuple[Sha256, list[str]] | None:
-    """Return digest and protocols of the newest full certificate of a preset and a build.
-
-    None if there is none, or if it did not pass.
-    """
-    columns = certificates.c
-    row = connection.execute(
-        select(columns.digest, columns.passed, columns.protocols)
-        .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
-        .order_by(columns.created_at.desc(), columns.seq.desc())
-        .limit(1)
-    ).one_or_none()
-    if row is None or not row.passed:
-        return None
-    return row.digest, row.protocols.split()
 
 
 def register_certificate(
@@ -101,7 +83,7 @@ def find_certificate(connection: Connection, digest: str) -> Row[tuple[object, .
 
 
 def _entry(row: Row[tuple[object, ...]]) -> CertificateEntry:
-    return document_of(CertificateEntry, row, href=f"/v1/certificates/{row.digest}")
+    return document_of(CertificateEntry, row, href=link(f"/v1/certificates/{row.digest}"))
 
 
 def check_files(database: Database, store: Store, spec: JobSpec) -> None:

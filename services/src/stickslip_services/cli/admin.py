@@ -23,7 +23,7 @@ from stickslip_services.access import quotas as stored_quotas
 from stickslip_services.access import webhooks as stored_webhooks
 from stickslip_services.access.keys import command_transaction
 from stickslip_services.access.principals import Scope
-from stickslip_services.cli.common import CommandGroup, shows_errors
+from stickslip_services.cli.common import CommandGroup, amount, shows_errors
 from stickslip_services.cli.output import print_json_line, print_table, say, tell
 from stickslip_services.database.database import Role, as_datetime
 from stickslip_services.database.opening import check
@@ -32,6 +32,17 @@ from stickslip_services.settings import SERVER, Settings, options
 
 NAME_LETTERS = 63
 """Most letters of the name of a dispatcher."""
+
+HOUR_SECONDS = 3600.0
+DAY_SECONDS = 24 * HOUR_SECONDS
+
+MAX_DAYS = 36_500
+"""Longest lifetime of a key [d]: dates beyond the year 9999 cannot be written."""
+
+_KEEP_KEY = (
+    f"Keep the key: it cannot be shown again. Use it as {API_KEY_VARIABLE}, or in the header "
+    "Authorization: Bearer KEY. Browsers send it as the password of any user name"
+)
 
 
 @click.command()
@@ -97,7 +108,17 @@ def administers(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group(cls=CommandGroup)
 def keys() -> None:
-    """Make, list and revoke API keys."""
+    """Make, list, rotate and revoke API keys."""
+
+
+def lifetime_option(default: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return the option of the lifetime of a new key."""
+    return click.option(
+        "--days",
+        type=amount("days", 0.01, MAX_DAYS),
+        metavar="DAYS",
+        help=f"the key expires after so many days; default: {default}",
+    )
 
 
 @keys.command("create")
@@ -114,30 +135,76 @@ def keys() -> None:
     default="",
     help="project of the jobs that it submits: projects share leases, and may have quotas",
 )
+@lifetime_option("never")
 @administers
-def create_key(connection: Connection, name: str, scope: tuple[Scope, ...], project: str) -> None:
+def create_key(
+    connection: Connection,
+    name: str,
+    scope: tuple[Scope, ...],
+    project: str,
+    days: float | None,
+) -> None:
     """Make a key and print it, once: the database keeps only its digest."""
-    key_id, secret = stored_keys.create_key(connection, name, scope, time.time(), project=project)
+    now = time.time()
+    expires_at = None if days is None else now + DAY_SECONDS * days
+    key_id, secret = stored_keys.create_key(
+        connection, name, scope, now, project=project, expires_at=expires_at
+    )
     # Only the secret goes to standard output: `key=$(stickslip keys create ...)`.
     click.echo(secret)
+    say(f"{key_id} is made{_until(expires_at)}. {_KEEP_KEY}")
+
+
+def _until(expires_at: float | None) -> str:
+    return "" if expires_at is None else f", and expires at {_minute(expires_at)} UTC"
+
+
+@keys.command("rotate")
+@click.argument("key_id", metavar="KEY", help="id of a key, as `stickslip keys list` shows it")
+@click.option(
+    "--overlap",
+    type=amount("hours", 0.0, 24 * MAX_DAYS),
+    metavar="HOURS",
+    default=24.0,
+    help="the old key stays valid for so long",
+)
+@lifetime_option("as many as the old key")
+@shows_errors
+@options("data", "database")
+def rotate_key(settings: Settings, key_id: str, overlap: float, days: float | None) -> None:
+    """Make the successor of a key and print it, once. Both are valid during the overlap.
+
+    The successor of the workers' key is also written to the file `worker-key` of the data
+    directory. A worker reads its file again when its key is refused.
+    """
+    lifetime = None if days is None else DAY_SECONDS * days
+    with command_transaction(settings) as connection:
+        rotation = stored_keys.rotate_key(
+            connection, key_id, time.time(), overlap=HOUR_SECONDS * overlap, lifetime=lifetime
+        )
+    # The database comes first: with the new file alone, workers would be refused.
+    is_worker = stored_keys.replace_worker_key(settings.worker_key_path, rotation)
+    click.echo(rotation.secret)
     say(
-        f"{key_id} is made. Keep the key: it cannot be shown again. Use it as {API_KEY_VARIABLE}, "
-        "or in the header Authorization: Bearer KEY. Browsers send it as the password of any user "
-        "name"
+        f"{rotation.key_id} is made{_until(rotation.expires_at)}, and {key_id} expires at "
+        f"{_minute(rotation.old_expires_at)} UTC. {_KEEP_KEY}"
     )
+    if is_worker:
+        say(f"{settings.worker_key_path} has the new key: copy it to workers on other machines")
 
 
 @keys.command("list")
 @administers
 def list_keys(connection: Connection) -> None:
-    """List all keys, newest first, including revoked ones."""
+    """List all keys, newest first, including revoked and expired ones. Times are in UTC."""
     rows = []
     for key in stored_keys.list_keys(connection):
         revoked_at = "" if key.revoked_at is None else _minute(key.revoked_at)
+        expires_at = "never" if key.expires_at is None else _minute(key.expires_at)
         scopes = key.scopes.replace(" ", ", ")
         created_at = _minute(key.created_at)
-        rows.append((key.id, key.name, revoked_at, scopes, key.project, created_at))
-    print_table(("key", "name", "revoked", "scopes", "project", "made"), rows)
+        rows.append((key.id, key.name, expires_at, revoked_at, scopes, key.project, created_at))
+    print_table(("key", "name", "expires", "revoked", "scopes", "project", "made"), rows)
 
 
 def _minute(seconds: float) -> str:

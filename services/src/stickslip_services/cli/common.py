@@ -61,8 +61,9 @@ def first_sentence(text: str) -> str:
     return " ".join(text.split("\n\n")[0].split())
 
 
-def amount(unit: str, least: float) -> Callable[[str], float]:
-    """Return the type of an option that is a finite number of a unit."""
+def amount(unit: str, least: float, most: float = math.inf) -> Callable[[str], float]:
+    """Return the type of an option that is a finite number of a unit, within limits."""
+    limits = f"{least:g} or more" if most == math.inf else f"{least:g} to {most:g}"
 
     def read(text: str) -> float:
         try:
@@ -70,10 +71,8 @@ def amount(unit: str, least: float) -> Callable[[str], float]:
         except ValueError:
             value = math.nan
         # This refuses NaN, too, which compares with nothing.
-        if not least <= value < math.inf:
-            raise click.BadParameter(
-                f"must be a number of {unit}, {least:g} or more, and is {text!r}"
-            )
+        if not (least <= value <= most and value < math.inf):
+            raise click.BadParameter(f"must be a number of {unit}, {limits}, and is {text!r}")
         return value
 
     return read

@@ -300,6 +300,8 @@ api_keys = _numbered(
     sa.Column("project", sa.String, nullable=False, server_default=""),
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Column("revoked_at", sa.Float),
+    sa.Column("expires_at", sa.Float),  # null: never
+    sa.Column("successor", sa.String),  # id of the key that a rotation has made for it
 )
 
 projects = _table(  # those with a quota; the others exist by being named

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from stickslip_services.errors import CommandError
+from stickslip_services.local.rotation import last_lines
 
 MAX_FAILED_STARTS = 5
 """Failed starts in a row after which `stickslip up` gives up."""
@@ -135,19 +136,13 @@ class Child:
 
     def log_end(self) -> str:
         """Return the last lines of the log, indented."""
-        lines = self._log_lines()
-        return "\n".join(f"  {line}" for line in lines[-LOG_LINES:]) or "  (empty)"
+        lines = last_lines(self.log, LOG_LINES)
+        return "\n".join(f"  {line}" for line in lines) or "  (empty)"
 
     def last_line(self) -> str:
         """Return the last line of the log that is not empty; an empty text without one."""
-        lines = [line.strip() for line in self._log_lines() if line.strip()]
-        return lines[-1][:300] if lines else ""
-
-    def _log_lines(self) -> list[str]:
-        try:
-            return self.log.read_text(encoding="utf-8", errors="replace").splitlines()
-        except OSError:
-            return ["(no log)"]
+        lines = last_lines(self.log, 1)
+        return lines[-1].strip()[:300] if lines else ""
 
     def _reap(self) -> int:
         """Kill the group of the process, and return its exit status.

@@ -7,11 +7,12 @@ files are below one directory: `coordinator.sqlite3`, `store/`, `logs/`, `url` (
 Children that die are restarted with growing delays. A Ray or a dispatcher that fails to start five
 times in a row ends the supervisor, which prints the end of its log. A coordinator that has answered
 once is restarted forever, since work that is running needs no coordinator for a while.
+
+The supervisor rotates the logs of its children by size and age, and on SIGHUP.
 """
 
 import ctypes
 import fcntl
-import logging
 import os
 import shlex
 import signal
@@ -20,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
@@ -28,6 +30,7 @@ from stickslip_schemas.store import write_durably
 
 from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.local.child import Child
+from stickslip_services.local.rotation import DAY_SECONDS, LogRotation
 from stickslip_services.settings import Settings
 
 _M_ARENA_MAX = -8  # of glibc's malloc.h
@@ -94,18 +97,6 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def configure_logging() -> None:
-    """Log to standard error, one event a line: `time level logger: message`, in UTC."""
-    formatter = logging.Formatter(
-        "%(asctime)s.%(msecs)03dZ %(levelname)s %(name)s: %(message)s", "%Y-%m-%dT%H:%M:%S"
-    )
-    formatter.converter = time.gmtime
-    handler = logging.StreamHandler()
-    handler.setFormatter(formatter)
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    logging.getLogger("alembic").setLevel(logging.WARNING)
-
-
 ANSWER_SECONDS = 180.0
 """Time limit for the coordinator's first answer [s]; migrations may be slow while simulations use
 all cores.
@@ -123,6 +114,19 @@ BACKLOG = 512
 """Connections that wait while the coordinator restarts."""
 
 _TICK_SECONDS = 0.1
+
+_ROTATION_SECONDS = 1.0
+"""Time between two looks at the sizes of the logs [s]."""
+
+
+@dataclass(slots=True)
+class Signals:
+    """Signals that have arrived, oldest first."""
+
+    stops: list[int] = field(default_factory=list)
+    """SIGINT, SIGTERM, and the SIGHUP of a terminal that was closed."""
+    rotations: list[int] = field(default_factory=list)
+    """SIGHUP without a terminal: rotate the logs now, as services do on it."""
 
 
 def run(
@@ -144,7 +148,7 @@ def run(
     with ExitStack() as stack:
         # Before anything else: a second supervisor must not touch what the first has.
         lock = stack.enter_context(locked(data))
-        signals = _stop_signals()
+        signals = _catch_signals()
         # The supervisor owns the socket, so requests wait while the coordinator restarts.
         listener = stack.enter_context(listen(settings.host, settings.port))
         listener.listen(BACKLOG)
@@ -160,23 +164,41 @@ def run(
         ]
         try:
             coordinator.start()
-            if not _wait_until_ready(settings, coordinator, signals):
+            if not _wait_until_ready(settings, coordinator, signals.stops):
                 return 0
             # Other commands find the service by this file, so it appears when requests are
             # answered.
             write_durably(data / "url", f"{settings.url}\n".encode())
             on_ready(settings.url)
             # Ray and the dispatcher start here, like children that have died.
-            while not signals:
-                for child in children:
-                    child.restart_if_dead()
-                time.sleep(_TICK_SECONDS)
+            _supervise(children, signals, settings)
             return 0
         finally:
             # The dispatcher stops first: it returns its leases to the coordinator.
             for child in reversed(children):
-                child.stop(lambda: len(signals) > 1)
+                child.stop(lambda: len(signals.stops) > 1)
             (data / "url").unlink(missing_ok=True)
+
+
+def _supervise(children: list[Child], signals: Signals, settings: Settings) -> None:
+    """Start children that have died, and rotate logs, until a signal to stop."""
+    rotation = LogRotation(
+        settings.log_bytes, DAY_SECONDS * settings.log_days, files=settings.log_files
+    )
+    next_look = 0.0
+    while not signals.stops:
+        for child in children:
+            child.restart_if_dead()
+        # Several SIGHUPs at once ask for one rotation.
+        if signals.rotations:
+            signals.rotations.clear()
+            for child in children:
+                rotation.rotate(child.log, time.time())
+        elif time.monotonic() >= next_look:
+            next_look = time.monotonic() + _ROTATION_SECONDS
+            for child in children:
+                rotation.rotate_if_due(child.log, time.time())
+        time.sleep(_TICK_SECONDS)
 
 
 def _child(name: str, data: Path, command: list[str]) -> Child:
@@ -248,18 +270,24 @@ def _wait_until_ready(settings: Settings, coordinator: Child, signals: list[int]
     return False
 
 
-def _stop_signals() -> list[int]:
-    """Return a list of the numbers of the signals to stop, which grows as they come."""
-    caught: list[int] = []
+def _catch_signals() -> Signals:
+    """Return the signals that arrive from now on, in lists that grow."""
+    caught = Signals()
     message = (
         b"stopping; another Ctrl-C stops at once. Jobs go on when you start the service again\n"
     )
 
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        if not caught:
-            os.write(2, message)
-        caught.append(number)
+    def on_stop(number: int, _frame: FrameType | None) -> None:
+        if not caught.stops:
+            # The terminal may be gone.
+            with suppress(OSError):
+                os.write(2, message)
+        caught.stops.append(number)
+
+    def on_rotation(number: int, _frame: FrameType | None) -> None:
+        caught.rotations.append(number)
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+        signal.signal(number, on_stop)
+    signal.signal(signal.SIGHUP, on_stop if os.isatty(0) else on_rotation)
     return caught

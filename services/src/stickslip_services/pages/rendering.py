@@ -21,7 +21,8 @@ from fastapi import Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.units import duration, size
+from stickslip_services.addresses import prefix, url
+from stickslip_services.units import duration, percent, size
 
 STATIC = Path(__file__).parent / "static"
 
@@ -54,7 +55,8 @@ def _environment() -> Environment:
     )
     # Curves keep their order, and a script of the page could not read NaN.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    filters = (duration, size, number, moment, ago, words)
+    filters = (duration, size, percent, number, moment, ago, words, plain)
+    environment.globals |= {"root": prefix, "service_url": url}
     environment.filters |= {function.__name__: function for function in filters}
     return environment
 
@@ -94,6 +96,11 @@ def ago(value: datetime) -> str:
 def words(value: object) -> str:
     """Return the name of a state or reason as words, without underscores."""
     return str(value).replace("_", " ")
+
+
+def plain(text: str) -> str:
+    """Return a text without the marks of code, which pages do not show."""
+    return text.replace("`", "")
 
 
 def table(

@@ -1,4 +1,4 @@
-"""Control of jobs by users: cancel, pause, resume and prioritise.
+"""Control of jobs by users: cancel, pause, resume, prioritise, and retry a task.
 
 Each of these is one transaction. It writes one row of `jobs`, an event and an audit entry, whatever
 the number of tasks. Workers hear at their next heartbeat which tasks to drop.
@@ -9,17 +9,20 @@ from contextlib import contextmanager
 from typing import NamedTuple, cast
 
 from sqlalchemy import update
-from stickslip_schemas.base import JobState, Reason
+from stickslip_schemas.base import JobState, Reason, TaskState
 from stickslip_schemas.documents.responses import JobDetail
 
 from stickslip_services.access import audit_log
 from stickslip_services.database.tables import jobs
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.failures import requeue
 from stickslip_services.queue.job_states import set_job_state, settle_job
 from stickslip_services.queue.jobs import find_job, show_job
 from stickslip_services.queue.planner import plan_waiting_jobs
-from stickslip_services.queue.rows import SCHEDULABLE, JobRow
+from stickslip_services.queue.rerun import reset_tasks
+from stickslip_services.queue.rows import SCHEDULABLE, JobRow, TaskRow
+from stickslip_services.queue.task_log import find_task_of_job
 from stickslip_services.queue.transaction import QueueTransaction
 from stickslip_services.queue.workers import NO_WORKER, update_unschedulable_jobs
 
@@ -94,6 +97,32 @@ def prioritise_job(context: Context, job_id: str, priority: int) -> JobDetail:
             )
         change = update(jobs).where(jobs.c.seq == job.seq).values(priority=priority)
         tx.connection.execute(change)
+    return _show(context, job.seq)
+
+
+def retry_task(context: Context, job_id: str, name: str) -> JobDetail:
+    """Let a failed task of a job run again, with all its tries.
+
+    A task that waits for its next try runs at once. Raises ConflictError if the job has ended, or
+    if the task has not failed.
+    """
+    with _change(context, job_id, "job.retry-task", task=name) as (tx, job):
+        if not JobState(job.state).is_open or job.state == JobState.cancelling:
+            raise ConflictError(
+                f"job {job_id} is {job.state} and starts no task; submit its spec again, which "
+                "keeps all results and tries the failed tasks again"
+            )
+        task = find_task_of_job(tx.connection, job.seq, name)
+        if task.state == TaskState.soft_failed:
+            requeue(tx, [cast("TaskRow", task)])
+        elif task.state == TaskState.failed:
+            reset_tasks(tx, [cast("TaskRow", task).seq])
+        else:
+            raise ConflictError(f"task {name} is {task.state}, and only a failed one can run again")
+        # A paused job keeps the reason why it rests.
+        if job.state in SCHEDULABLE:
+            message = f"task {name} runs again, as a user asked"
+            set_job_state(tx, job.seq, JobState(job.state), message=message)
     return _show(context, job.seq)
 
 

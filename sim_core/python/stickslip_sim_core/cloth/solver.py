@@ -21,6 +21,7 @@ from stickslip_sim_core.cloth.contact import (
     Surface,
 )
 from stickslip_sim_core.cloth.fabrics import Fabric
+from stickslip_sim_core.cloth.history import StepHistory
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 
@@ -154,6 +155,8 @@ class Cloth:
         self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
         self.total = StepReport()
         """Report of all steps: counts, least distances, and in `seen` the values for `checks`."""
+        self.history = StepHistory()
+        """What each step measured, for `checks` that judge the worst stretch of a run."""
         self.spent = 0.0
         """Most iterations in a second of scene time over the preset's `newton_per_second`.
 
@@ -316,6 +319,7 @@ class Cloth:
         )
         self.time += dt
         self.total.add(report)
+        self.history.add(dt, report)
         return report
 
     def advance(
@@ -381,6 +385,7 @@ class Cloth:
             self._before = self.time, self.positions, self.velocities
             self.time, report = self._solver.advance(self.time, event, drive, track)
             self.total.add(report)
+            self.history.add(self.time - self._before[0], report)
             # The sum of iterations drains at the allowed rate. A few hard steps therefore stay
             # within the budget of a second, and many hard steps in a row exceed it.
             if self.preset.step_error is not None:
@@ -389,6 +394,11 @@ class Cloth:
                     max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
                 )
                 self.spent = max(self.spent, self._spent / allowed)
+
+    @property
+    def last_begin(self) -> float:
+        """Time at which the last step of `advance` began [s], or inf before the first."""
+        return self._before[0]
 
     def positions_at(self, time: float, *, straight: bool = False) -> Floats:
         """Return the positions (V, 3) [m] at a time [s] in the last step of `advance`.

@@ -31,7 +31,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     the order of their names.
 
     - `SHEET.positions`, `SHEET.rest`, `SHEET.triangles`, and `SHEET.contact` (frame, vertex): 0
-      open, 1 stick, 2 slip
+      open, 1 stick, 2 slip, at the vertex nearest to each point that touches
     - `contact_force` (frame, sheet, other, 3) [N]: on each sheet, by each body and then by each
       sheet
     - `holder_force` (frame, holder, 3) [N], `holder_pose` (frame, holder, 3, 4), `grasped` (frame,
@@ -264,13 +264,14 @@ class _Forces:
             # the last node on the other.
             first = owner[:, 0]
             last = owner[:, 3]
+            nearest = _nearest(pairs.weights)
             for corner in range(4):
                 own = owner[:, corner]
                 pull = pairs.weights[:, corner, None] * pairs.forces
                 np.add.at(force, (own, np.where(own == first, last, first)), pull)
-                # Only vertices of cloth have a state, and a node without a weight does not touch.
-                # Slip (2) in one pair outweighs sticking (1) in another.
-                here = (pairs.vertices[:, corner] < vertices) & (pairs.weights[:, corner] != 0.0)
+                # Only vertices of cloth have a state. Slip (2) in one pair outweighs sticking (1)
+                # in another.
+                here = (pairs.vertices[:, corner] < vertices) & nearest[:, corner]
                 np.maximum.at(
                     state,
                     pairs.vertices[here, corner],
@@ -286,6 +287,18 @@ class _Forces:
             for name, own in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
         }
         return found | ({"holder_force": pulls} if len(self._holders) else {})
+
+
+def _nearest(weights: Floats) -> NDArray[np.bool_]:
+    """Return which nodes of pairs (P, 4) are nearest to the points that touch: (P, 4).
+
+    The weights of a pair are positive on one side and negative on the other. On each side the node
+    with the largest weight is the nearest, or several with the same. The others may be a cell away.
+    """
+    nearest = np.zeros(weights.shape, np.bool_)
+    for side in (np.maximum(weights, 0.0), np.maximum(-weights, 0.0)):
+        nearest |= (side > 0.0) & (side == side.max(axis=1, keepdims=True))
+    return nearest
 
 
 def _arrays(

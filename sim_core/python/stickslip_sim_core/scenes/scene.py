@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import build_info, self_intersections
+from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
 from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
@@ -15,6 +15,7 @@ from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.scenes.frames import frame_at
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
 
@@ -189,9 +190,10 @@ class Scene:
             ValueError: The scene cannot begin.
         """
         hands, cloth = self.begin() if begun is None else begun
-        paths = [cloth.positions]
+        first = frame_at(cloth, 0.0, lambda time: self.motion(time)[1])
+        paths = [first.positions]
         forces = [self.forces(cloth)]
-        crossed = [self._crossings(cloth.positions)]
+        crossed = [first.crossings]
         calm = 0
         rest_time = np.nan
         for frame in range(1, self.frames):
@@ -200,12 +202,9 @@ class Scene:
             # The budget of iterations is spent, and the cloth has not reached the frame.
             if cloth.spent > 1.0:
                 break
-            paths.append(cloth.positions_at(time))
-            crossed.append(self._crossings(paths[-1]))
-            # A cubic continues the velocity before an impact, and may reach through the obstacle.
-            if crossed[-1] and self.self_contact is not None:
-                paths[-1] = cloth.positions_at(time, straight=True)
-                crossed[-1] = self._crossings(paths[-1])
+            now = frame_at(cloth, time, lambda time: self.motion(time)[1])
+            paths.append(now.positions)
+            crossed.append(now.crossings)
             forces.append(self.forces(cloth))
             if on_frame is not None:
                 on_frame(frame + 1, self.frames)
@@ -253,17 +252,6 @@ class Scene:
         )
         # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
-
-    def _crossings(self, positions: Floats) -> int:
-        """Return the number of pairs of triangles that cross, or 0 without finite positions.
-
-        `positions` are (V, 3) [m].
-        """
-        return (
-            self_intersections(positions, self.mesh.triangles)
-            if np.isfinite(positions).all()
-            else 0
-        )
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
         """Return whether nothing moved between two frames (V, 3) [m], and nothing will move."""

@@ -1,5 +1,6 @@
 """The commands `stickslip-train info` and `stickslip-train export`."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -55,7 +56,8 @@ def _facts(reader: DatasetReader, files: str) -> Table:
     splits = ", ".join(f"{manifest.split_counts.get(split, 0)} {split}" for split in SPLITS)
     facts.add_row("samples", f"{manifest.valid_count} of {manifest.sample_count} valid: {splits}")
 
-    acceptance = f"{manifest.acceptance_rate:.1%}"
+    # Rounded down: 100 % means that no sample was rejected.
+    acceptance = f"{math.floor(1000 * manifest.acceptance_rate) / 10:.1f}%"
     reasons = Counter(str(rejection.reason) for rejection in reader.rejections())
     if reasons:
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

@@ -196,7 +196,7 @@ class Samples(Dataset[Item]):
     ) -> "DataLoader[Item]":
         """Return a DataLoader over this dataset.
 
-        `options` are those of DataLoader, but for `collate_fn`.
+        DataLoader takes `options`; `collate_fn` is set here.
         """
         return DataLoader(
             self, batch_size=batch_size, shuffle=shuffle, collate_fn=collate, **options
@@ -238,9 +238,9 @@ class Stream:
     and twice the batch size sees the same rounds. The last round is left out if it is not full,
     unless there is one process: it then has a smaller batch.
 
-    `state_dict` counts the batches that the loop has been given: those that workers of the
-    DataLoader have read ahead are read again. Put it into your checkpoint, and `load_state_dict`
-    goes on with the next batch, bit for bit.
+    `state_dict` counts the batches that the loop has been given. Batches that
+    workers of the DataLoader have read ahead are read again. Put it into your checkpoint, and
+    `load_state_dict` goes on with the next batch, bit for bit.
     """
 
     def __init__(
@@ -256,8 +256,8 @@ class Stream:
     ) -> None:
         """Begin with the first batch of epoch 0.
 
-        `rank` and `world_size` are those of torch.distributed if it runs, else 0 and 1.
-        `options` are those of DataLoader. Raises ValueError if a number makes no sense, or no
+        `rank` and `world_size` come from torch.distributed if it runs; else they are 0 and 1.
+        DataLoader takes `options`. Raises ValueError if a number makes no sense, or no
         round is full.
         """
         distributed = torch.distributed

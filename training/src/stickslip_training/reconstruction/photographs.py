@@ -103,7 +103,7 @@ def reconstruct_folder(
     """Reconstruct the rod in the photographs of a folder.
 
     The calibration is laid out as `rigs/rod-4.toml` of the schemas; `rig` says which of its rigs,
-    if it has several. Lengths and positions are in its unit; `options` are those of `reconstruct`.
+    if it has several. Lengths and positions are in its unit; `options` go to `reconstruct`.
     Photographs must have been freed of lens distortion.
     """
     cameras = read_calibration(calibration, rig)

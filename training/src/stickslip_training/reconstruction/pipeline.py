@@ -3,8 +3,8 @@
 1. Silhouettes: the coverage of each pixel [silhouette].
 2. Starts: ways through all silhouettes at once, from the clamp, as long as the rod, and the
    centroid of a cylinder that moves through the visual hull, as in the thesis [starts].
-3. Each start is moved until a tube about it looks as the views do [refinement]; the one that does
-   so best wins.
+3. Each start is moved until a tube about it looks as the views do [refinement]; the best fit
+   wins.
 4. The winner is judged: the parts that it leaves unexplained or unsupported, and whether
    another curve would do as well.
 

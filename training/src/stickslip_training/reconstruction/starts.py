@@ -1,9 +1,9 @@
 """Starts for the refinement: curves from the clamp to the free end.
 
-`follow` goes through all views at once, in steps of one length. Of all ways, a beam of those is
-kept whose points lie in the middle of every silhouette and that bend evenly. At a crossing in one
-view, the other views and the even bend decide. A way that takes a short cut has length left over
-for which no silhouette has room.
+`follow` goes through all views at once, in steps of one length. A beam search keeps the ways whose
+points lie in the middle of every silhouette and that bend evenly. At a crossing in one view, the
+other views and the even bend decide. A way that takes a short cut has length left over for which no
+silhouette has room.
 
 `visual_hull` is a cloud of points, and `moving_cylinder` the thesis's way from it to a centreline
 [thesis, 5.3.1]. A cloud has no order, and where turns of a curl come close in several views it has
@@ -154,7 +154,7 @@ def visual_hull(views: Sequence[View], cell: float = HULL_CELL) -> Floats:
     Points are at most `cell` [L] apart.
 
     There are none if the silhouettes leave room for far more than a slender rod. Cubes are
-    halved again and again; those are kept whose surrounding ball touches every silhouette.
+    halved again and again; a cube is kept if its surrounding ball touches every silhouette.
     """
     outside = [ndimage.distance_transform_edt(view.coverage < 0.5) for view in views]
     halvings = int(np.ceil(np.log2(2.0 * ROOM / cell)))

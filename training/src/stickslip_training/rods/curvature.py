@@ -186,7 +186,7 @@ class CurvatureTraining(engine.FitSettings):
     batch_size: int = 16
     """After six passes over 1,985 rods, 16 had a test loss of 0.50 rad, and 64 of 1.75."""
     learning_rate: float = 1.0
-    """Of Adadelta [Zeiler 2012]; this and the decay are those of the thesis (4.4)."""
+    """Learning rate of Adadelta [Zeiler 2012]; it and the decay stand in the thesis (4.4)."""
     decay: float = 0.95
     averaging: float = 0.98
     """Decay of the running average over steps that is the model's weights; 0 takes the last weights

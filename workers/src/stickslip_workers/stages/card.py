@@ -168,11 +168,10 @@ def _pictures(manifest: Manifest) -> list[str]:
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [
-        header,
-        tuple("---" for _ in header),
-        *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows),
-    ]
+    lines = [header, ("---",) * len(header)]
+    for row in rows:
+        # A bar in a cell would end the cell.
+        lines.append(tuple(cell.replace("|", "\\|") for cell in row))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

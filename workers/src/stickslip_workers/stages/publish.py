@@ -280,12 +280,11 @@ class _Labels:
 
     def files(self) -> list[FileEntry]:
         """Store the files of all labels, and return their entries."""
-        numbers = [
-            (array, number)
-            for array in self.arrays
-            for number in range(-(-self.count // self._spec.samples_per_file(array)))
-        ]
-        return in_parallel(self._file, numbers)
+        array_files = []
+        for array in self.arrays:
+            file_count = -(-self.count // self._spec.samples_per_file(array))
+            array_files += [(array, number) for number in range(file_count)]
+        return in_parallel(self._file, array_files)
 
     def _file(self, array_and_number: tuple[ArrayLayout, int]) -> FileEntry:
         array, number = array_and_number
@@ -375,7 +374,9 @@ def _preview(
     array = pictured(task.spec)
     if array is None:
         return None
-    files = {file.path: file for file in chain.from_iterable(part.files for part in parts)}
+    files = {}
+    for section in parts:
+        files.update({file.path: file for file in section.files})
     samples_per_shard = task.spec.samples_per_shard
     index_bytes = shard_index_size(samples_per_shard)
 

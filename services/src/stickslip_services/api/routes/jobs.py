@@ -16,6 +16,7 @@ from stickslip_schemas.documents.responses import (
 from stickslip_schemas.kinds import AnyJobSpec
 from stickslip_schemas.spec.jobs import JobSpec
 
+from stickslip_services.addresses import link
 from stickslip_services.api.bodies import SMALL_BYTES, SPEC_BYTES, JsonBody
 from stickslip_services.api.problems import EVENT_ID_PATTERN
 from stickslip_services.api.routes.common import (
@@ -87,10 +88,10 @@ def post_job(
     job = submit_job(context, spec, idempotency_key, priority=priority)
     if isinstance(job, Replay):
         return Response(
-            job.response, 200, {"Location": f"/v1/jobs/{job.job_id}"}, "application/json"
+            job.response, 200, {"Location": link(f"/v1/jobs/{job.job_id}")}, "application/json"
         )
     return Response(
-        job.model_dump_json(), 202, {"Location": f"/v1/jobs/{job.id}"}, "application/json"
+        job.model_dump_json(), 202, {"Location": link(f"/v1/jobs/{job.id}")}, "application/json"
     )
 
 
@@ -148,6 +149,15 @@ def pause_job(job_id: str, context: ContextDep) -> JobDetail:
 def resume_job(job_id: str, context: ContextDep) -> JobDetail:
     """Resume a paused job."""
     return control.resume_job(context, job_id)
+
+
+@router.post("/v1/jobs/{job_id}/tasks/{task_id}:retry", status_code=202, responses=_CHANGED)
+def retry_task(job_id: str, task_id: str, context: ContextDep) -> JobDetail:
+    """Let a failed task run again, with all its tries. 409: the job has ended, or it did not fail.
+
+    A task that waits for its next try runs at once.
+    """
+    return control.retry_task(context, job_id, task_id)
 
 
 @router.get("/v1/jobs/{job_id}/samples", responses=problem_responses(404))

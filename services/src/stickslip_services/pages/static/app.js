@@ -1,10 +1,5 @@
-// What htmx does not do: change events for parts of a page, copying, and clips.
+// What htmx does not do: copying, sliders, plots and clips.
 "use strict";
-
-if (document.body.hasAttribute("data-live")) {
-  const source = new EventSource("/ui/changes");
-  source.addEventListener("change", () => document.body.dispatchEvent(new CustomEvent("server-change")));
-}
 
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("button.copy");

@@ -1,5 +1,5 @@
 // The view of a sample in three dimensions. It follows the cursor of time of its page.
-import * as three from "/static/three.min.js";
+import * as three from "./three.min.js";
 
 const STATES = ["--open", "--stick", "--slip"]; // colours of the states of contact, by code
 

@@ -16,6 +16,7 @@ from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.store import Store
 
+from stickslip_services.addresses import link
 from stickslip_services.api.artifacts import matches
 from stickslip_services.api.routes.common import ContextDep, Version
 from stickslip_services.catalog.inputs import find_certificate, list_certificates
@@ -35,6 +36,7 @@ from stickslip_services.pages.rendering import html_page, plot, spec_text, table
 from stickslip_services.pages.sample_page import sample_view
 from stickslip_services.pages.samples import Array, SampleData
 from stickslip_services.queue.context import Context
+from stickslip_services.queue.jobs import jobs_of_version
 from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter(include_in_schema=False)
@@ -53,20 +55,22 @@ Step = Annotated[int, Query(ge=1, le=32)]
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A version that a page shows, and its arrays."""
+    """A version that a page shows, its arrays, and the jobs that made it (id, name)."""
 
     dataset: Dataset
     version: DatasetVersion
     data: SampleData
+    jobs: list[tuple[str, str]]
 
 
 def _opened(dataset: str, version: Version, context: ContextDep) -> Opened:
     with context.database.read() as connection:
         visible_dataset = find_dataset(connection, dataset)
         visible_version = find_version(connection, dataset, version)
+        makers = jobs_of_version(connection, dataset, version)
     # The manifest never changes, so what it lists is read once for all pages of the version.
     data = _sample_data(context.store, visible_version.manifest)
-    return Opened(visible_dataset, visible_version, data)
+    return Opened(visible_dataset, visible_version, data, makers)
 
 
 @lru_cache(maxsize=8)
@@ -92,11 +96,11 @@ def get_dataset(dataset: str, context: ContextDep) -> Response:
         versions = find_dataset(connection, dataset).versions
     if not versions:
         raise NotFoundError(f"dataset {dataset} has no version yet")
-    return RedirectResponse(f"/datasets/{dataset}/v{versions[-1].version}")
+    return RedirectResponse(link(f"/datasets/{dataset}/v{versions[-1].version}"))
 
 
 @router.get("/datasets/{dataset}/v{version}")
-def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Response:
+def get_version(request: Request, opened: OpenedDep) -> Response:
     """Show a version: its spec, its samples within the filters of the query, and its labels."""
     data = opened.data
     values = thumbs(data, request.query_params, 0) | losses(data)
@@ -106,13 +110,13 @@ def get_version(request: Request, opened: OpenedDep, context: ContextDep) -> Res
         dataset=opened.dataset,
         version=opened.version,
         manifest=data.manifest,
+        jobs=opened.jobs,
         sliders=sliders(data.manifest.spec),
         histograms=histograms(data),
         splits=SPLITS,
         file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
         card="README.md" if data.contents.file("README.md") else None,
         picture="preview.webp" if data.contents.file("preview.webp") else None,
-        url=context.settings.url,
         **values,
     )
 
@@ -126,7 +130,7 @@ def get_thumbs(
     page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **values)
     if start == 0:
         # The address of the page shows the filters, so that it can be sent to somebody.
-        page.headers["HX-Replace-Url"] = (
+        page.headers["HX-Replace-Url"] = link(
             f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
         )
     return page
@@ -153,6 +157,7 @@ def get_sample(
         here="datasets",
         dataset=opened.dataset,
         version=opened.version,
+        jobs=opened.jobs,
         slot=slot,
         last_slot=last,
         rejections=[rejection for rejection in rejections.values() if rejection is not None],

@@ -18,6 +18,7 @@ from stickslip_schemas.documents.responses import JobDetail
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.plan.costs import count, estimate_cost
 
+from stickslip_services.addresses import link
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.api.sse import KEEP_ALIVE_SECONDS, EventStream
 from stickslip_services.catalog.inputs import list_certificates
@@ -26,7 +27,7 @@ from stickslip_services.database.tables import dataset_versions
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.rendering import grid_maps, html_page, spec_text
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.control import cancel_job, pause_job, resume_job
+from stickslip_services.queue.control import cancel_job, pause_job, resume_job, retry_task
 from stickslip_services.queue.failures import failed_tasks
 from stickslip_services.queue.jobs import (
     find_job,
@@ -39,6 +40,7 @@ from stickslip_services.queue.jobs import (
 )
 from stickslip_services.queue.progress import stage_durations
 from stickslip_services.queue.submit import submit_job
+from stickslip_services.queue.task_log import read_task_log
 from stickslip_services.queue.workers import alive_workers, show_workers
 
 router = APIRouter(include_in_schema=False)
@@ -51,6 +53,9 @@ SHOWN_CERTIFICATES = 200
 
 MAX_SAMPLES = 20_000
 """Larger grids have no map, because reading the states of so many samples takes seconds."""
+
+MAY_RETRY = (TaskState.failed, TaskState.soft_failed)
+"""States of a task that may run again."""
 
 LOST = (TaskState.rejected, TaskState.failed)
 
@@ -113,6 +118,7 @@ def get_job(job_id: str, context: ContextDep) -> Response:
             spec=spec_text(job.spec),
             durations=stage_durations(connection, seq),
             elapsed=None if job.started_at is None else end - job.started_at.timestamp(),
+            accepted=job.sample_count - job.rejected_count,
             costs=estimate_cost(job.spec, count(job.spec), {}, 0),
             previews=list_previews(connection, seq, count=24, newest=True),
             rejected=list_samples(
@@ -120,8 +126,29 @@ def get_job(job_id: str, context: ContextDep) -> Response:
             ).items,
             failed=failed_tasks(connection, seq, context.settings, SHOWN_LOST),
             states=JobState,
-            url=context.settings.url,
         )
+
+
+@router.get("/jobs/{job_id}/tasks/{task_id}")
+def get_task(job_id: str, task_id: str, context: ContextDep) -> Response:
+    """Show a task of a job: its numbers, the log of its attempts, and how to run it again."""
+    with context.database.read() as connection:
+        seq = int(find_job(connection, job_id).seq)
+        return html_page(
+            "task.html",
+            here="jobs",
+            job=show_job(context, connection, seq),
+            task=read_task_log(connection, seq, task_id, context.settings),
+            may_retry=MAY_RETRY,
+        )
+
+
+@router.post("/ui/jobs/{job_id}/tasks/{task_id}/retry")
+def retry_failed_task(job_id: str, task_id: str, context: ContextDep) -> Response:
+    """Let a failed task of a job run again; redirect to its page."""
+    retry_task(context, job_id, task_id)
+    page = link(f"/jobs/{job_id}/tasks/{task_id}")
+    return Response(status_code=204, headers={"HX-Redirect": page})
 
 
 @router.get("/ui/jobs/{job_id}/map")
@@ -146,7 +173,7 @@ def get_slowest(job_id: str, context: ContextDep) -> Response:
     """Show the tasks of a job that took longest."""
     with context.database.read() as connection:
         slowest = slowest_tasks(connection, int(find_job(connection, job_id).seq), SHOWN_SLOWEST)
-    return html_page("slowest.html", slowest=slowest)
+    return html_page("slowest.html", slowest=slowest, job_id=job_id)
 
 
 @router.post("/ui/jobs/{job_id}/{verb}")
@@ -162,7 +189,7 @@ def change_job(job_id: str, verb: str, context: ContextDep) -> Response:
         {"pause": pause_job, "resume": resume_job, "cancel": cancel_job}[verb](context, job_id)
     else:
         raise NotFoundError(f"a job has no verb {verb[:50]!r}")
-    return Response(status_code=204, headers={"HX-Redirect": f"/jobs/{job_id}"})
+    return Response(status_code=204, headers={"HX-Redirect": link(f"/jobs/{job_id}")})
 
 
 @router.get("/ui/changes")

@@ -1,0 +1,62 @@
+"""The history of a run: what each step measured, in the order of the steps.
+
+A share over a whole run becomes small if the run goes on calmly after its worst moment. The checks
+therefore judge the worst stretch of steps, which no later step can improve.
+"""
+
+import numpy as np
+
+from stickslip_sim_core._sim_core import StepReport
+from stickslip_sim_core.arrays import Floats
+
+_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed")
+
+
+class StepHistory:
+    """One row of measured numbers for each step."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+
+    def add(self, duration: float, report: StepReport) -> None:
+        """Add a step of `duration` [s]."""
+        extremes = report.seen
+        self._rows.append(
+            (duration, extremes.contact_work, extremes.flow, report.unconverged, report.missed)
+        )
+
+    def column(self, name: str) -> Floats:
+        """Return a number of each step: (steps,).
+
+        `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
+        `missed`, both 0 or 1.
+        """
+        rows = np.array(self._rows, float).reshape(-1, len(_COLUMNS))
+        return np.asarray(rows[:, _COLUMNS.index(name)])
+
+
+def worst_stretch(part: Floats, whole: Floats, most: float) -> float:
+    """Return the largest sum(part) over the whole of a stretch of steps, or 0 without steps.
+
+        max over k of (P_k - P_j) / max(W_k - W_j, most),  j = min{i < k: W_k - W_i <= most}
+
+    P and W are the cumulative sums. A stretch that ends with step k goes back as far as it has at
+    most `most` of the whole, and has one step at least. A stretch with less is over `most`: a part
+    of nothing counts no more than it is.
+
+    The result belongs to the steps until now: later ones leave all earlier stretches as they are,
+    and later ones without a part add none that is worse. NaN makes the result NaN.
+
+    Args:
+        part: Part of each step, 0 or more: (steps,).
+        whole: Whole of each step, 0 or more, in the same unit or another: (steps,).
+        most: Largest whole of a stretch of several steps, above 0.
+    """
+    if not len(part):
+        return 0.0
+    parts = np.append(0.0, np.cumsum(part))
+    wholes = np.append(0.0, np.cumsum(whole))
+    first = np.searchsorted(wholes, wholes[1:] - most, "left")
+    # One step may have more than `most`, and is then a stretch by itself.
+    first = np.minimum(first, np.arange(len(part)))
+    return float(((parts[1:] - parts[first]) / np.maximum(wholes[1:] - wholes[first], most)).max())
