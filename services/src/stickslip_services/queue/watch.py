@@ -11,7 +11,7 @@ from stickslip_services.database.statements import RowQuery
 from stickslip_services.queue.workers import present_workers
 
 MAX_IDLE_JOBS = 20
-"""Idle jobs that are told apart: those that have waited longest."""
+"""Most idle jobs with a number each: the longest idle ones."""
 
 FORGET_SECONDS = 86_400.0
 """Time after which a silent worker is presumed to be removed [s]."""
@@ -41,7 +41,7 @@ class _Times(NamedTuple):
 
 
 # A job in the queue waits for its turn, and may do so for days. A job that waits for a worker is in
-# the same state, but something is wrong. The last event tells of a start, a pause and a failure.
+# the same state, but something is wrong. The last event is a start, a resumption or a failure.
 _ACTIVE_JOBS = RowQuery(
     _Times,
     "SELECT jobs.id, jobs.created_at, "
