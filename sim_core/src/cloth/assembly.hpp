@@ -78,8 +78,9 @@ class Assembly {
   void set_lagged_stretch(const Buffer<double>& x, double share) {
     membrane_.set_lagged_stretch(kernel, x.data(), share);
   }
-  // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt.
-  void set_diagonal(double dt, double damping);
+  // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt, and of `interval`
+  // between the velocities before and in it, s.
+  void set_diagonal(double dt, double interval, double damping);
   // Mean of a node's block on the diagonal, N/m.
   double own_stiffness(int node) const;
   // That block, N/m.

@@ -84,7 +84,7 @@ struct ClothMatrix {
   const int* membrane_begin;  // (nodes + 1)
   const int* membrane_node;
   float* membrane;  // (blocks, 3, 4): columns
-  float* diagonal;  // (nodes): mass / dt^2 and damping, N/m
+  float* diagonal;  // (nodes): inertia and damping, N/m
   const FoldData* folds;
   const PairData* pairs;  // may be null
 };

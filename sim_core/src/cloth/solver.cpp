@@ -120,7 +120,9 @@ void ClothSolver::meet(const std::vector<Body>& bodies) {
   std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, medial_axes);
   const long kept = 4L * (next->numbering.nodes - next->numbering.capsule_points);
   std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
-  std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());
+  std::copy(impl_->stepper.velocities.at_end.begin(),
+            impl_->stepper.velocities.at_end.begin() + kept,
+            next->stepper.velocities.at_end.begin());
   impl_ = std::move(next);
 }
 
@@ -132,7 +134,7 @@ void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
     refuse(
         "positions: must not cross a surface, and under self-contact cloth must not cross itself");
   }
-  impl_->load(velocities, impl_->stepper.v);
+  impl_->load(velocities, impl_->stepper.velocities.at_end);
   impl_->stepper.restart({});
   begin(bodies, begins);
   impl_->controller.restart();
@@ -162,7 +164,7 @@ StepReport ClothSolver::advance(double& time, double event, const Motion& motion
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
 
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
-Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v); }
+Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.velocities.at_end); }
 Points3 ClothSolver::reactions() const { return impl_->unload(impl_->newton.residual); }
 
 template <class Call>
@@ -256,7 +258,7 @@ double ClothSolver::lowest_eigenvalue(const Points3& positions) {
   Assembly& assembly = impl_->assembly;
   const int free_nodes = impl_->numbering.free_nodes;
   const Buffer<double> x = impl_->at(positions);
-  assembly.set_diagonal(period, 0.0);
+  assembly.set_diagonal(period, period, 0.0);
   assembly.use_convex_hessian = false;
   assembly.evaluate(x, true);
   const ContactState open(free_nodes);

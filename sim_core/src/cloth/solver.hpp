@@ -1,4 +1,4 @@
-// Dynamics of cloth in contact with moving bodies, itself and moving surfaces: implicit Euler,
+// Dynamics of cloth in contact with moving bodies, itself and moving surfaces: staggered steps,
 // exact Coulomb friction.
 #pragma once
 
@@ -83,7 +83,7 @@ class ClothSolver {
 
   // A step of the controller's choice: see StepController::advance.
   StepReport advance(double& time, double event, const Motion& motion, const Path& path);
-  // Change of the cloth's momentum over the last step, N.
+  // Rate of the cloth's momentum in the last step, N: the sum of all forces.
   Eigen::Vector3d momentum_rate() const;
 
   Points3 positions() const;

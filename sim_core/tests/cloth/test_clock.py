@@ -114,7 +114,7 @@ def watched(
 def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> None:
     """It moves as a rigid block does: with the floor, or with |v'| = mu g.
 
-    A step takes the latter to begin at its end.
+    A step has one direction of slip, that at its end.
     """
     begin, size, dt = 0.5, 2e-3, 1e-5
 
@@ -131,7 +131,7 @@ def test_cloth_at_rest_feels_a_floor_that_begins_to_shake(frequency: float) -> N
         if tick % 500 == 0:
             block.append(x)
     sticks = size * (2.0 * np.pi * frequency) ** 2 < GRAVITY
-    assert path == pytest.approx(block, abs=3e-5 if sticks else 3e-3)
+    assert path == pytest.approx(block, abs=3e-5 if sticks else 4e-3)
     assert np.ptp(path) > size
     assert checks.failed(checks.values(checks.Seen(cloth, cloth.positions[None], 0))) == ("", "")
 
@@ -165,20 +165,15 @@ def test_what_moves_evenly_is_valid() -> None:
 
 @pytest.mark.physics
 def test_between_steps_frames_are_cubic() -> None:
-    """A falling cloth is at rest in its own frame: -g t^2/2, less what implicit Euler adds in steps
-    of dt: -g t dt/2.
-
-    The cubic with the velocities at both ends is off by 0.1 g dt^2/2 at most [Hermite].
-    """
-    dt = 0.02
-    cloth = Cloth(PATCH, MATERIAL, replace(CERTIFIED, step_error=None, time_step=dt))
+    """A falling cloth is at -g t^2/2 at any time: the cubic has its velocities at both ends."""
+    cloth = Cloth(PATCH, MATERIAL, replace(CERTIFIED, step_error=None, time_step=0.02))
     cloth.set_state(np.column_stack([PATCH.rest, np.zeros(len(PATCH.rest))]))
     gravity = cloth.gravity.copy()
     for time in np.linspace(0.001, 0.1, 34):
         cloth.advance(time, lambda _: (gravity, np.empty((0, 3)), []))
-        fallen = -0.5 * GRAVITY * (time * time + time * dt)
+        fallen = -0.5 * GRAVITY * time * time
         assert cloth.positions_at(time)[:, 2] == pytest.approx(
-            np.full(len(PATCH.rest), fallen), abs=0.05 * GRAVITY * dt**2
+            np.full(len(PATCH.rest), fallen), abs=1e-7
         )
     for time in (0.0, cloth.time + 1e-6):
         with pytest.raises(ValueError, match=r"time: must be in the last step, .* s, got"):

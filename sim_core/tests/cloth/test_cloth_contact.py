@@ -249,7 +249,7 @@ class TestBalances:
             ends = ends + np.array([0.0, 2e-4, -1e-4 if step < 30 else 0.0])
             report = cloth.step(0.02, held=ends, bodies=[plane(0.4)])
             assert report.converged
-            inertia = np.array(cloth._solver.momentum_rate()) - cloth.masses @ cloth.gravity
+            inertia = cloth.momentum_rate - cloth.masses @ cloth.gravity
             pushed = cloth.reactions
             free_floating = (cloth.contacts < 0) & ~np.isin(np.arange(len(pushed)), held)
             assert pushed.sum(axis=0) == pytest.approx(inertia, abs=1e-10)
@@ -263,21 +263,22 @@ class TestBalances:
 
     @pytest.mark.parametrize("mesh", [PATCH, SCATTERED], ids=["grid", "unstructured"])
     def test_free_fall_is_exact(self, mesh: Mesh) -> None:
-        """Of implicit Euler: after n steps it has fallen by g dt^2 n (n + 1) / 2."""
+        """After t it has fallen by g t^2/2, whatever the lengths of the steps."""
         cloth = laid(mesh, 1.0)
         start = cloth.positions
-        for _ in range(20):
-            cloth.step(0.01)
-        fallen = np.tile([0.0, 0.0, -GRAVITY * 1e-4 * 210], (len(start), 1))
+        for dt in (0.01, 0.02, 0.04, 0.005, 0.005, 0.02, 0.1):
+            cloth.step(dt)
+        fallen = np.tile([0.0, 0.0, -0.5 * GRAVITY * 0.2**2], (len(start), 1))
         assert cloth.positions - start == pytest.approx(
-            fallen, abs=2e-7
+            fallen, abs=1e-6
         )  # corrections are of single precision
         assert cloth.velocities[:, 2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
 
     def test_energy_does_not_grow(self) -> None:
-        """A crumpled cloth that falls on the floor only ever loses.
+        """A crumpled cloth that falls on the floor only loses.
 
-        Friction and implicit Euler both take.
+        The velocity at the end of a step is that of its middle and half of what the acceleration
+        adds, which is off by what stiff motions lose within the step.
         """
         mesh = meshes.grid(0.1, 0.1, 8, 8)
         cloth = Cloth(mesh, isotropic(0.2, 100.0, 2e-5), CERTIFIED)
@@ -297,10 +298,7 @@ class TestBalances:
         for _ in range(100):
             cloth.step(0.01, bodies=[plane(0.3)])
             energies.append(total())
-        slack = (
-            1e-3 * cloth.force_scale * len(at) * 0.01
-        )  # residuals times what a vertex may move in a step
-        assert np.diff(energies).max() < slack
+        assert np.diff(energies).max() < 1e-3 * np.ptp(energies)
         assert energies[-1] < 0.5 * energies[0]
 
     def test_rerun_is_bit_identical(self) -> None:

@@ -125,8 +125,8 @@ class TestStack:
         dt, steps = 0.01, 8
         assert watched(two.cloth, steps, dt, bodies=two.floor) == 0
         upper = two.level == 1
-        speed = np.linalg.norm(two.cloth.velocities[upper].mean(axis=0))
-        assert speed / (dt * steps) == pytest.approx(
+        way = np.linalg.norm((two.cloth.positions - two.start)[upper].mean(axis=0))
+        assert 2.0 * way / (dt * steps) ** 2 == pytest.approx(
             GRAVITY * (np.sin(angle) - mu * np.cos(angle)), rel=5e-3
         )
         assert two.moved()[~upper].max() < 1e-8
@@ -273,7 +273,7 @@ class TestSeveralFabrics:
             cloth.step(0.02)
         speed = cloth.velocities[:, 0]
         assert speed[: len(self.A.rest)] == pytest.approx(1.0, rel=1e-6)
-        assert speed[len(self.A.rest) :] == pytest.approx((1.0 + 3.0 * 0.02) ** -5, rel=1e-4)
+        assert speed[len(self.A.rest) :] == pytest.approx(np.exp(-3.0 * 0.1), rel=0.01)
 
     def test_residuals_are_measured_in_the_lightest(self) -> None:
         assert self.both().force_scale == pytest.approx(

@@ -425,6 +425,16 @@ class Cloth:
         bent = h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
         return np.asarray(x + s * s * (3.0 - 2.0 * s) * way + bent)
 
+    @property
+    def momentum_rate(self) -> Floats:
+        """Rate of the cloth's momentum in the last step (3,) [N]: the sum of all forces.
+
+        The change of `masses @ velocities` over a step is not this rate times its length: the step
+        changes the velocity at the middle of the step before to that at its own middle. It is zero
+        before the first step.
+        """
+        return np.asarray(self._solver.momentum_rate())
+
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
@@ -436,7 +446,7 @@ class Cloth:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        return np.asarray(self._solver.momentum_rate() - weight - holders)
+        return np.asarray(self.momentum_rate - weight - holders)
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state [1/s^2].

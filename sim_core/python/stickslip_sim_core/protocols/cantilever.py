@@ -103,7 +103,7 @@ def hang(
         at_rest = (
             2.0 * dt > LONGEST and float(np.abs(cloth.positions - before).max()) < REST * LENGTH
         )
-        # Implicit Euler damps more in longer steps, which bring the strip to rest sooner.
+        # The scheme damps more in longer steps, which bring the strip to rest sooner.
         if cloth.total.steps > STEADY_STEPS:
             dt = min(dt * GROWTH, LONGEST)
     reach, _, drop = cloth.positions[clamped.tip].mean(axis=0)
