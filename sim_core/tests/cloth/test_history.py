@@ -122,6 +122,6 @@ def test_a_preset_says_how_many_steps_may_stay_unconverged(share: float, value: 
     assert values(cloth)["unconverged"] == 0.0
     # The second step reaches the floor, which takes more than one iteration.
     for _ in range(2):
-        cloth.step(0.02, bodies=[plane(0.5, origin=(0.0, 0.0, -0.01))])
+        cloth.step(0.02, bodies=[plane(0.5, origin=(0.0, 0.0, -0.005))])
     assert cloth.total.unconverged == 1
     assert values(cloth)["unconverged"] == pytest.approx(value)

