@@ -155,7 +155,7 @@ def test_files_become_arrays() -> None:
         (
             PATH,
             b"t,x,y,z\n",
-            "must begin with the line time,x,y,z,rx,ry,rz, with commas between columns, and begins with 't,x,y,z'",
+            "must begin with the line time,x,y,z,rx,ry,rz, and begins with 't,x,y,z'",
         ),
         (
             PATH,

@@ -113,7 +113,7 @@ def find_reason(directory: Path) -> str:
     for name in ("raylet.err", "gcs_server.err", "raylet.out", "gcs_server.out"):
         with contextlib.suppress(OSError):
             for line in (logs / name).read_text(errors="replace").splitlines():
-                # C is Ray's level of errors that end a process. Other exceptions say so.
+                # C is Ray's level of errors that end a process; other exceptions have a phrase.
                 is_fatal = re.match(r"\[[\d-]+ [\d:,.]+ C ", line) or "Unhandled exception" in line
                 if is_fatal and (match := FATAL.search(line)):
                     return f"{name.partition('.')[0]}: {match[1][:MAX_REASON_LETTERS]}"

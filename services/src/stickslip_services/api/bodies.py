@@ -193,19 +193,22 @@ def _parse(body: bytes) -> tuple[Any, list[str]]:
             json.dumps(values, ensure_ascii=False).encode("utf-8")
     except RecursionError as error:
         raise _too_deep() from error
-    # These are ValueErrors, too, whose messages are for programmers.
-    except UnicodeDecodeError as error:
-        reason = f"it must be text in UTF-8, and byte {error.start} is not"
-        raise malformed(reason) from error
-    except UnicodeEncodeError as error:
-        raise malformed(
-            f"it must not have the lone surrogate {error.object[error.start]!a}"
-        ) from error
-    except json.JSONDecodeError as error:
-        raise malformed(f"{error.msg}, line {error.lineno}, column {error.colno}") from error
     except ValueError as error:
-        raise malformed(str(error)) from error
+        raise malformed(_syntax_fault(error)) from error
     return values, not_finite
+
+
+def _syntax_fault(error: ValueError) -> str:
+    """Return what is wrong with the text of a body, without words for programmers."""
+    match error:
+        case UnicodeDecodeError():
+            return f"it must be text in UTF-8, and byte {error.start} is not"
+        case UnicodeEncodeError():
+            return f"it must not have the lone surrogate {error.object[error.start]!a}"
+        case json.JSONDecodeError():
+            return f"{error.msg}, line {error.lineno}, column {error.colno}"
+        case _:
+            return str(error)
 
 
 def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:
