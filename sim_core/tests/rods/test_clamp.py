@@ -62,7 +62,7 @@ class TestLevelClamp:
             assert fit.solution.frame[0, 0] == pytest.approx(LEVEL, abs=1e-6)
 
     def test_bend_and_weight_that_look_alike(self) -> None:
-        """A short rod sags by so little that a bend does the same, and the fit says so."""
+        """A stiff rod sags by so little that a bend does the same, and the fit reports it."""
         stiff, soft = (
             solve_general_rods(
                 np.array([[[0.0, 0.0, 0.5]]]), np.array([gamma]), clamp_frame=LEVEL, points=101
