@@ -5,6 +5,7 @@ Needs Chromium (`apt-get install chromium`): Playwright brings no browser of its
 Accessibility is checked with axe-core, which `axe-playwright-python` brings.
 """
 
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -287,6 +288,7 @@ def test_a_sample_in_space_turns_and_follows_the_cursor(
     page = browser.new_page()
     page.goto(url + next(path for path in paths if path.endswith("/samples/1")))
     canvas = page.locator(".space canvas")
+    page.get_by_role("button", name="Show it in three dimensions").click()
     page.locator(".space[data-drawn]").wait_for()
     seen = [canvas.screenshot()]
     canvas.focus()
@@ -313,16 +315,25 @@ def test_two_samples_share_the_cursor_and_the_layer(
 ) -> None:
     page = browser.new_page()
     page.goto(url + next(path for path in paths if "?beside=" in path))
-    page.locator("select").select_option("depth")
+    page.locator(".layer").select_option("depth")
     page.locator(".time").focus()
     page.keyboard.press("End")
-    shown = [image.get_attribute("src") for image in page.locator(".clip > img").all()]
-    assert [source.rpartition("samples")[2] for source in shown] == [
-        "/0/depth/4.png",
-        "/1/depth/4.png",
+    # Both clips are at the middle of their last frame, and have one scale.
+    times = "[...document.querySelectorAll('video')].map((video) => video.currentTime)"
+    wait_until(lambda: page.evaluate(times) == pytest.approx([0.45, 0.45]))
+    links = [link.get_attribute("href") for link in page.locator(".mp4").all()]
+    assert [link.rpartition("samples")[2] for link in links] == [
+        "/0/depth.mp4?beside=1",
+        "/1/depth.mp4?beside=0",
     ]
-    assert page.locator(".mp4").first.get_attribute("href").endswith("/samples/0/depth.mp4")
-    assert page.locator(".space[data-drawn]").count() == 2
+    headings = page.locator(".clip h2").all_inner_texts()
+    assert [heading.split("mu")[0].strip() for heading in headings] == ["Sample 0", "Sample 1"]
+    legend = page.locator(".plots .u-legend").first.inner_text()
+    assert "sample 0: " in legend
+    assert "sample 1: " in legend
+    for number in (0, 1):
+        page.get_by_role("button", name=f"Show sample {number} in three dimensions").click()
+    page.locator(".space[data-drawn]").nth(1).wait_for()
     page.close()
 
 
@@ -330,8 +341,46 @@ def test_a_sample_without_webgl_says_so(browser: Any, url: str, paths: list[str]
     page = browser.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(url + paths[6])
+    page.get_by_role("button", name="Show it in three dimensions").click()
     wait_until(lambda: "has no WebGL" in page.locator(".space .message").inner_text())
     assert page.locator(".space canvas").count() == 0
+    page.close()
+
+
+LEAST_BYTES = 300_000
+"""Most bytes that the page of a sample of cloth loads before somebody asks for more."""
+
+
+def test_a_sample_of_cloth_is_light_and_plays(browser: Any, url: str, paths: list[str]) -> None:
+    page = browser.new_page()
+    sizes: list[int] = []
+    page.on("response", lambda response: sizes.append(len(response.body())))
+    page.goto(url + next(path for path in paths if path.endswith("/samples/1")))
+    page.wait_for_load_state("networkidle")
+    assert 10_000 < sum(sizes) <= LEAST_BYTES
+    time_of = "document.querySelector('video').currentTime"
+    wait_until(lambda: page.evaluate(time_of) == pytest.approx(0.05))
+    page.get_by_role("button", name="One frame on").press("Enter")
+    wait_until(lambda: page.evaluate(time_of) == pytest.approx(0.15))
+    page.get_by_role("button", name="One frame back").press("Enter")
+    wait_until(lambda: page.evaluate(time_of) == pytest.approx(0.05))
+    page.locator(".speed").select_option("0.25")
+    page.get_by_role("button", name="Play").press("Enter")
+    wait_until(lambda: page.evaluate(time_of) > 0.1)
+    page.get_by_role("button", name="Stop").press("Enter")
+    assert re.fullmatch(r"\d\.\d\d of \d\.\d\d s", page.locator(".controls output").inner_text())
+    page.close()
+
+
+def test_a_sample_without_mp4_shows_its_frames(browser: Any, url: str, paths: list[str]) -> None:
+    page = browser.new_page()
+    page.route("**/*.mp4", lambda route: route.fulfill(status=404))
+    page.goto(url + next(path for path in paths if path.endswith("/samples/1")))
+    page.locator(".time").focus()
+    page.keyboard.press("End")
+    picture = page.locator(".clip > img.screen")
+    wait_until(lambda: (picture.get_attribute("src") or "").endswith("/video/4.png"))
+    assert picture.is_visible()
     page.close()
 
 

@@ -21,18 +21,29 @@ CONSTANT_RATE_FACTOR = "18"
 """Quality of H.264, at which the eye sees no loss."""
 
 
-def coloured(array: ArrayLayout, values: npt.NDArray[np.generic], index: int) -> Picture:
+Range = tuple[float, float]
+"""Least and largest number of a clip, or of several that are compared."""
+
+
+def range_of(values: npt.NDArray[np.generic]) -> Range:
+    """Return the range of the finite numbers of a clip; (0, 0) without any."""
+    finite = values[np.isfinite(values)].astype(np.float32)
+    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+
+
+def coloured(
+    array: ArrayLayout, values: npt.NDArray[np.generic], index: int, scale: Range | None = None
+) -> Picture:
     """Return a frame of pictures or of ground truth (y, x, 3) as sRGB.
 
-    Codes get a colour each. Numbers are scaled by their range over the clip.
+    Codes get a colour each. Numbers are scaled by a range, by default theirs over the clip.
     """
     frame = values[index]
     if array.dimensions[-1] == "rgb":
         return np.asarray(frame)
     if "categories" in array.attributes:
         return np.asarray(_PALETTE[frame % len(_PALETTE)])
-    finite = values[np.isfinite(values)].astype(np.float32)
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    low, high = scale or range_of(values)
     if low < 0.0:
         # Of two signs: grey is 0.
         high = max(-low, high)

@@ -3,11 +3,7 @@ import * as three from "./three.min.js";
 
 const STATES = ["--open", "--stick", "--slip"]; // colours of the states of contact, by code
 
-for (const figure of document.querySelectorAll(".space")) {
-  show(figure).catch((error) => { figure.querySelector(".message").textContent = error.message; });
-}
-
-async function show(figure) {
+export async function show(figure, start) {
   const canvas = figure.querySelector("canvas"), view = figure.closest(".sample");
   let renderer;
   try {
@@ -16,6 +12,8 @@ async function show(figure) {
     canvas.remove();
     throw Error("This browser has no WebGL, which the view in three dimensions needs. Everything else is here.");
   }
+  canvas.hidden = false;
+  figure.querySelector(".legend").hidden = false;
   const answer = await fetch(figure.dataset.motion);
   if (!answer.ok) throw Error("The motion of this sample could not be read.");
   const motion = await answer.json(), paints = [], moves = [];
@@ -95,7 +93,7 @@ async function show(figure) {
   }
 
   const controls = new three.OrbitControls(camera, canvas), draw = () => renderer.render(scene, camera);
-  let now = +(view.querySelector(".time")?.value ?? 0);
+  let now = start;
   const go = () => {
     const step = Math.max(0, motion.instants.findLastIndex((instant) => instant <= now));
     for (const move of moves) move(step);
