@@ -433,3 +433,87 @@ def test_a_refused_press_is_explained(
     page.locator("#lost").get_by_text("“Pause” had no effect: job").wait_for()
     assert "can be paused" in page.locator("#lost").inner_text()
     page.close()
+
+
+MAX_TABS = 300
+"""Presses of Tab after which a test gives up."""
+
+IS_FOCUSED = """wanted => {
+    const focused = document.activeElement;
+    const names = [focused.name, focused.id, focused.textContent, focused.ariaLabel];
+    return names.some((name) => (name || "").trim() === wanted);
+}"""
+
+
+def tab_to(page: Any, wanted: str) -> None:
+    """Press Tab until the focus is on the element of a name, an id, a text or a label."""
+    for _ in range(MAX_TABS):
+        if page.evaluate(IS_FOCUSED, wanted):
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"Tab does not lead to {wanted!r}")
+
+
+def test_a_grid_is_submitted_filtered_and_downloaded_by_keyboard(
+    browser: Any, url: str, worker: PretendWorker
+) -> None:
+    page = browser.new_page()
+    page.goto(url)
+    tab_to(page, "Submit")
+    page.keyboard.press("Enter")
+    page.locator("#scene").wait_for()
+    tab_to(page, "scene")
+    page.keyboard.type("turning")
+    tab_to(page, "Show its form")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**scene=turning-ball*")
+    for field, text in (
+        ("name", "by-keyboard"),
+        ("axes.mu.form", "evenly"),
+        ("axes.mu.from", "0.1"),
+        ("axes.mu.to", "0.9"),
+        ("axes.mu.num", "10"),
+        ("frames", "5"),
+    ):
+        tab_to(page, field)
+        page.keyboard.type(text)
+    tab_to(page, "allow_uncertified")
+    page.keyboard.press("Space")
+    # The size and the cost stand there before the job does.
+    check = page.locator("#check")
+    wait_until(
+        lambda: "samples\n10" in check.inner_text() and "certificate" not in check.inner_text()
+    )
+    assert "CPU time" in check.inner_text()
+    tab_to(page, "Submit the job")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/jobs/job-*")
+    worker.work()
+    page.locator(".state.succeeded").wait_for()
+    tab_to(page, "Download files")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/datasets/ds-*/v1*")
+    for number, operator, value in ((0, "<", "0.5"), (1, ">", "0.15")):
+        tab_to(page, f"where{number}.label")
+        page.keyboard.type("mu")
+        tab_to(page, f"where{number}.operator")
+        page.keyboard.type(operator)
+        tab_to(page, f"where{number}.value")
+        page.keyboard.type(value)
+    page.keyboard.press("Enter")
+    wait_until(lambda: page.locator("#thumbs p").first.inner_text().startswith("4 of 10 samples"))
+    with page.expect_download() as zipped:
+        tab_to(page, "Download these as zip")
+        page.keyboard.press("Enter")
+    assert zipped.value.suggested_filename == "by-keyboard-v1.zip"
+    page.locator(".thumbs a").first.focus()
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/samples/1")
+    tab_to(page, "Play")
+    page.keyboard.press("Enter")
+    page.get_by_role("button", name="Stop").wait_for()
+    with page.expect_download() as shard:
+        tab_to(page, "Download the shard video/c/0/0/0/0/0")
+        page.keyboard.press("Enter")
+    assert shard.value.suggested_filename == "video-c-0-0-0-0-0"
+    page.close()

@@ -19,7 +19,8 @@ import yaml
 from fastapi import FastAPI
 from PIL import Image
 from stickslip_schemas.base import JobState
-from stickslip_schemas.scene.library import load_scene
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app
 from stickslip_services.pages.rendering import _environment, plot, table
@@ -286,7 +287,14 @@ def test_scenes_have_pages_with_their_parameters(client: httpx.Client) -> None:
     digest = load_scene("turning-ball").digest
     assert f'<a href="/scenes/{digest}">turning-ball</a>' in listed
     page = read(client, f"/scenes/{digest}")
-    assert "stickslip scene preview turning-ball" in page
+    assert "stickslip scene preview turning-ball preview" in page
+    shown = re.search(r"<h3>scene.yaml</h3>.*?<pre[^>]*>(.*?)</pre>", page, re.DOTALL)
+    assert shown is not None
+    assert Scene.model_validate(yaml.safe_load(html.unescape(shown[1]))).digest == digest
+    for name in scene_names():
+        picture = client.get(f"/static/scenes/{name}.webp")
+        assert Image.open(BytesIO(picture.content)).size == (640, 160)
+        assert f"/static/scenes/{name}.webp" in listed
     assert all(name in page for name in ("mu", "speed", "rad/s", "bodies.ball.motion.spin.speed"))
     assert client.get(f"/scenes/{'0' * 64}").status_code == 404
 

@@ -36,7 +36,7 @@ from stickslip_services.pages.browsing import histograms, losses, picture_array,
 from stickslip_services.pages.choosing import CONDITIONS, OPERATORS, choose, sliders, sortable
 from stickslip_services.pages.motion import motion
 from stickslip_services.pages.pictures import Range, coloured, mp4, range_of
-from stickslip_services.pages.rendering import html_page, plot, spec_text, table
+from stickslip_services.pages.rendering import html_page, plot, scene_text, spec_text, table
 from stickslip_services.pages.sample_page import overlaid, sample_view
 from stickslip_services.pages.samples import Array, SampleData
 from stickslip_services.pages.zipping import MAX_ZIPPED, zipped
@@ -342,7 +342,13 @@ def get_scene(digest: str, context: ContextDep) -> Response:
         known = known_scenes(connection).get(digest)
     if known is None:
         raise NotFoundError(f"there is no scene {digest[:64]!r}")
-    return html_page("scene.html", here="scenes", known=known, scene=known.scene)
+    return html_page(
+        "scene.html",
+        here="scenes",
+        known=known,
+        scene=known.scene,
+        text=scene_text(known.scene),
+    )
 
 
 @router.get("/certificates")
