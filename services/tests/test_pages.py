@@ -288,7 +288,7 @@ def test_scenes_have_pages_with_their_parameters(client: httpx.Client) -> None:
     assert f'<a href="/scenes/{digest}">turning-ball</a>' in listed
     page = read(client, f"/scenes/{digest}")
     assert "stickslip scene preview turning-ball preview" in page
-    shown = re.search(r"<h3>scene.yaml</h3>.*?<pre[^>]*>(.*?)</pre>", page, re.DOTALL)
+    shown = re.search(r">scene.yaml</p>.*?<pre[^>]*>(.*?)</pre>", page, re.DOTALL)
     assert shown is not None
     assert Scene.model_validate(yaml.safe_load(html.unescape(shown[1]))).digest == digest
     for name in scene_names():

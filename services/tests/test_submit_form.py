@@ -123,7 +123,7 @@ def test_a_form_is_checked_and_submitted(server: RunningServer) -> None:
     checked = post(server, "/ui/submit/check", filled).text
     assert "<dt>samples</dt><dd>10</dd>" in checked
     assert re.search(r"<dt>CPU time</dt><dd>about [\d.]+ (s|min)", checked)
-    shown = re.search(r"<h3>spec.yaml</h3>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
+    shown = re.search(r">spec.yaml</p>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
     assert shown is not None
     assert yaml.safe_load(html.unescape(shown[1]))["axes"]["mu"]["num"] == 10
     assert f"curl {server.url}/v1/jobs" in html.unescape(checked)
