@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from stickslip_schemas.base import ARTIFACT, Bool, Document, Float, Int, is_sha256
-from stickslip_schemas.spec.arrays import CLIP_SIZE
-from stickslip_schemas.spec.cameras import Camera, rig_names, square
+from stickslip_schemas.spec.cameras import Camera, central, rig_names
 from stickslip_schemas.spec.names import (
     FARTHEST,
     LOWEST,
@@ -22,6 +21,7 @@ from stickslip_schemas.spec.names import (
     Substrate,
     did_you_mean,
 )
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
 
 SMALLEST = 1e-3
 """Least extent of a sheet or of a mesh [m]: anything smaller is taken for another unit."""
@@ -230,7 +230,8 @@ class Box(_Placed):
         default=None,
         gt=0,
         le=50,
-        description="radius of its edges [m]; null: 5 mm, or half the least of size",
+        description="radius of its edges [m]; null: 5 mm or 0.9 cells of the coarsest sheet, at "
+        "most half the least of size",
     )
 
     @model_validator(mode="after")
@@ -471,7 +472,10 @@ class View(Document):
     position: Vector = Field(description="[m]")
     target: Vector = Field(description="the point in the middle of the picture [m]")
     focal_length: Float = Field(
-        default=50.0, ge=10, le=400, description="for a film 36 mm wide [mm]"
+        default=50.0,
+        ge=10,
+        le=400,
+        description="for a film whose shorter side is 36 mm [mm]",
     )
 
     @model_validator(mode="after")
@@ -497,7 +501,7 @@ class View(Document):
         x, y, z = (b - a for a, b in zip(self.position, self.target, strict=True))
         return x, y, z
 
-    def camera(self, name: str) -> Camera:
+    def camera(self, name: str, resolution: tuple[int, int] = DEFAULT_RESOLUTION) -> Camera:
         """Return the calibrated camera: upright, with the principal point in the middle."""
         # Rows of the rotation are the axes of the camera: right, which is level, down and forward.
         x, y, z = (value / math.hypot(*self._forward) for value in self._forward)
@@ -505,7 +509,8 @@ class View(Document):
         rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
         # t = -R p, for the camera itself is at the origin of its axes.
         a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
-        return square(name, CLIP_SIZE, self.focal_length / FILM * CLIP_SIZE, rotation, (a, b, c))
+        focal = self.focal_length / FILM * min(resolution)
+        return central(name, resolution, focal, rotation, (a, b, c))
 
 
 class SheetLook(Document):

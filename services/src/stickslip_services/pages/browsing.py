@@ -12,6 +12,9 @@ from stickslip_services.pages.choosing import Query, choose, sliders, sortable
 from stickslip_services.pages.rendering import grid_maps
 from stickslip_services.pages.samples import SampleData
 
+THUMB_SIDE = 112
+"""Least shorter side of a picture that a page shows small [px]."""
+
 SHOWN_THUMBS = 48
 """Samples that a page shows at once."""
 
@@ -57,6 +60,7 @@ def thumbs(data: SampleData, query: Query, start: int) -> dict[str, Any]:
         "kept_query": {name: value for name, value in query.items() if name not in _PLACES},
         "pictured": pictured,
         "picture_index": middle,
+        "picture_step": 1 if pictures is None else max(1, min(pictures.shape[1:3]) // THUMB_SIDE),
     }
 
 

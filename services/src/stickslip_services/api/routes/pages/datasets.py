@@ -35,7 +35,7 @@ from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import histograms, losses, picture_array, shards, thumbs
 from stickslip_services.pages.choosing import CONDITIONS, OPERATORS, choose, sliders, sortable
 from stickslip_services.pages.motion import motion
-from stickslip_services.pages.pictures import Range, coloured, mp4, range_of
+from stickslip_services.pages.pictures import Range, coloured, mp4, range_of, shown_part
 from stickslip_services.pages.rendering import html_page, plot, scene_text, spec_text, table
 from stickslip_services.pages.sample_page import overlaid, sample_view
 from stickslip_services.pages.samples import Array, SampleData
@@ -54,6 +54,9 @@ SHOWN_CURVES = 6
 PICTURE_SECONDS = 24 * 3600
 """Time for which a browser keeps a picture [s]."""
 
+COVER_SIDE = 56
+"""Least shorter side of the picture of a dataset in the list [px]."""
+
 _NO_PICTURE = png(np.full((2, 2, 3), 127, np.uint8))
 """A grey picture for a dataset without one."""
 
@@ -68,7 +71,7 @@ class DatasetFilter(BaseModel):
 
 DatasetFilterDep = Annotated[DatasetFilter, Query()]
 Slot = Annotated[int, Path(ge=0)]
-Step = Annotated[int, Query(ge=1, le=8)]
+Step = Annotated[int, Query(ge=1, le=32)]
 Beside = Annotated[int | None, Query(ge=0)]
 
 
@@ -130,9 +133,10 @@ def get_cover(opened: OpenedDep) -> Response:
     valid = np.flatnonzero(data.label("valid"))
     if name is None or not valid.size:
         return Response(_NO_PICTURE, media_type="image/png", headers=headers)
-    values = data.read(name, int(valid[0]))
-    picture = coloured(data.arrays[name], values, len(values) // 2)
-    return Response(png(picture[::4, ::4]), media_type="image/png", headers=headers)
+    values = _value(data, name, int(valid[0]))
+    (picture,) = coloured(data.arrays[name], values, [len(values) // 2])
+    step = max(1, min(picture.shape[:2]) // COVER_SIDE)
+    return Response(png(picture[::step, ::step]), media_type="image/png", headers=headers)
 
 
 @router.get("/datasets/{dataset}")
@@ -256,9 +260,9 @@ def get_film(opened: OpenedDep, slot: Slot, array: str, beside: Beside = None) -
     if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
         raise NotFoundError(f"{array[:50]} is no clip")
     scale = _scale(data, array, values, beside)
-    frames = [coloured(data.arrays[array], values, index, scale) for index in range(len(values))]
+    film = mp4(coloured(data.arrays[array], values, range(len(values)), scale))
     headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}"}
-    return Response(mp4(frames), media_type="video/mp4", headers=headers)
+    return Response(film, media_type="video/mp4", headers=headers)
 
 
 def _scale(data: SampleData, array: str, values: Array, beside: int | None) -> Range | None:
@@ -300,7 +304,8 @@ def get_picture(
     if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
         raise NotFoundError(f"{array[:50]} has no picture {index}")
     scale = _scale(data, array, values, beside)
-    content = png(coloured(data.arrays[array], values, index, scale)[::step, ::step])
+    (picture,) = coloured(data.arrays[array], values, [index], scale)
+    content = png(picture[::step, ::step])
     return Response(content, media_type="image/png", headers=headers)
 
 
@@ -322,7 +327,8 @@ def _value(data: SampleData, array: str, slot: int) -> Array:
     if array not in data.arrays or slot >= data.manifest.sample_count:
         raise NotFoundError(f"the dataset has no {array[:50]!r} of sample {slot}")
     try:
-        return data.read(array, slot)
+        size = data.picture_size(slot)
+        return shown_part(data.arrays[array], data.read(array, slot), size)
     except KeyError as error:
         raise NotFoundError(f"sample {slot} has no {array[:50]!r}") from error
 
