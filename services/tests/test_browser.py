@@ -131,7 +131,7 @@ SCENES = (
         "turning-ball",
         {"duration": 1.0, "sheets.napkin.mesh.cells": [6, 6], "bodies.ball.motion.spin.begin": 0.0},
     ),
-    ("over-the-edge", {"duration": 1.0, "sheets.strip.mesh.cells": [24, 2]}),
+    ("over-the-edge", {"duration": 1.0, "sheets.strip.mesh.cells": [40, 4]}),
 )
 """Small scenes: one with a floor and a ball, one with a table and a holder, but without a floor."""
 
