@@ -228,7 +228,9 @@ def test_every_page_is_whole(browser: Any, url: str, paths: list[str], width: in
     page.on(
         "request",
         lambda request: (
-            None if request.url.startswith((url, "data:")) else faults.append(request.url)
+            None
+            if request.url.startswith((url, "data:", f"blob:{url}"))
+            else faults.append(request.url)
         ),
     )
     for path in paths:

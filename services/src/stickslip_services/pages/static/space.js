@@ -103,9 +103,16 @@ export async function show(figure, start) {
   view.addEventListener("instant", (event) => { now = event.detail; go(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   controls.target.copy(middle);
-  const far = 0.56 * extent / Math.sin(Math.PI / 360 * camera.fov) / Math.min(1, canvas.clientWidth / canvas.clientHeight);
-  camera.position.copy(middle).addScaledVector(new three.Vector3(0.5, -0.78, 0.38), far);
-  controls.update();
+  // Two samples beside each other have one scale: that of the larger one.
+  const place = (size) => {
+    const far = 0.56 * size / Math.sin(Math.PI / 360 * camera.fov) / Math.min(1, canvas.clientWidth / canvas.clientHeight);
+    camera.position.copy(middle).addScaledVector(new three.Vector3(0.5, -0.78, 0.38), far);
+    controls.update();
+    draw();
+  };
+  view.addEventListener("extent", ({ detail }) => place(detail));
+  view.dataset.extent = Math.max(extent, +(view.dataset.extent ?? 0));
+  view.dispatchEvent(new CustomEvent("extent", { detail: +view.dataset.extent }));
   controls.listenToKeyEvents(canvas);
   controls.addEventListener("change", draw);
   new ResizeObserver(() => {
