@@ -201,6 +201,9 @@ def preview(
     for slot in shown:
         pictures = np.empty(array.shape, dtype=np.uint8)
         decode_sample(array, chunk(slot), pictures)
+        part = spec.picture_part(points[slot])
+        if part is not None:
+            pictures = pictures[:, : part[1], : part[0]]
         count = min(FRAMES, len(pictures)) if array.is_clip else 1
         varied = {
             name: value for name, value in points[slot].items() if spec.named_axes[name].num > 1
