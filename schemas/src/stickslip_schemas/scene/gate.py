@@ -279,7 +279,10 @@ def _read_header(name: str, header: bytes) -> tuple[int, tuple[int, ...]]:
         raise UnfitFileError(f"{name} must be numbers, and its type is {str(number)[:40]}")
     shape = fields["shape"]
     if not isinstance(shape, tuple) or not all(_is_side(side) for side in shape):
-        raise UnfitFileError(f"{name} must have a shape of whole numbers, and it is {shape!s:.60}")
+        raise UnfitFileError(
+            f"{name} must have a shape of whole numbers from 0 to {MAX_FILE_BYTES}, and it is "
+            f"{shape!s:.60}"
+        )
     return int(match[1]), shape
 
 
