@@ -95,8 +95,8 @@ def test_values_are_read_as_they_are_written() -> None:
         gamma(axes__gamma__form="spiral")
     more = document_of(form, sent(more="views: null\naxes: {phi0: 2}", axes__phi1__values="3"))
     assert (more["views"], more["axes"]) == (None, {"phi1": 3, "phi0": 2})
-    for wrong in ("a: [", "just a word", "- 1"):
-        with pytest.raises(FormError, match=r"more: (is not YAML|must be keys)"):
+    for wrong in ("a: [", "just a word", "- 1", "x: !!binary aGk=", "x: !!set {a}", "1: 2"):
+        with pytest.raises(FormError, match=r"more: (is not YAML|must be keys|must have values)"):
             document_of(form, sent(more=wrong))
 
 
