@@ -439,6 +439,29 @@ def test_a_refused_press_is_explained(
     page.close()
 
 
+def test_a_form_that_did_not_arrive_is_offered_again(
+    browser: Any, url: str, worker: PretendWorker
+) -> None:
+    assert worker.id
+    page = browser.new_page()
+    page.goto(f"{url}/submit?kind=rod_hang")
+    for axis in ("gamma", "phi0", "phi1"):
+        page.locator(f"[name='axes.{axis}.values']").fill("4.5")
+    page.route("**/ui/submit", lambda route: route.abort())
+    page.get_by_role("button", name="Submit the job").press("Enter")
+    notice = page.locator("#lost").get_by_text("“Submit the job” had no effect")
+    notice.wait_for()
+    page.unroute("**/ui/submit")
+    page.get_by_role("button", name="Try again").press("Enter")
+    page.wait_for_url("**/jobs/job-*")
+    # A check that is refused, as with a key that may only read, gives the reason.
+    refusal = '{"detail": "the request needs the scope submit"}'
+    page.route("**/ui/submit/check", lambda route: route.fulfill(status=403, body=refusal))
+    page.goto(f"{url}/submit?kind=rod_hang")
+    page.locator("#lost").get_by_text("the request needs the scope submit").wait_for()
+    page.close()
+
+
 MAX_TABS = 300
 """Presses of Tab after which a test gives up."""
 
