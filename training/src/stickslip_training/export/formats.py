@@ -379,13 +379,13 @@ def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> N
             path, schema, compression="zstd", write_page_checksum=True
         ) as writer:
             for first in range(0, len(slots), rows):
-                some = slots[first : first + rows]
+                batch = slots[first : first + rows]
                 columns = [
-                    _column(content.read(array.name, some), schema.field(array.name).type)
+                    _column(content.read(array.name, batch), schema.field(array.name).type)
                     for array in content.arrays
                 ]
                 writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
-                on_bytes(len(some) * content.sample_bytes)
+                on_bytes(len(batch) * content.sample_bytes)
     (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
 
 
