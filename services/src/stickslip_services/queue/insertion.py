@@ -40,7 +40,7 @@ from stickslip_services.queue.integrity import (
 from stickslip_services.queue.job_states import set_job_state
 from stickslip_services.queue.plan import Plan, PlannedTask
 from stickslip_services.queue.ready import add_ready
-from stickslip_services.queue.rerun import RESET_ATTEMPTS, reset_tasks, wait_for
+from stickslip_services.queue.rerun import RESET_ATTEMPTS, add_dependencies, reset_tasks
 from stickslip_services.queue.rows import HAS_RESULT, PlanInputs, SampleRow, task_columns
 from stickslip_services.queue.transaction import QueueTransaction
 
@@ -280,7 +280,7 @@ def _rewire(
         tx.connection.execute(update(tasks).where(tasks.c.seq.in_(batch)).values(waiting_on=0))
     # Without edges each task waits for nothing. This counts its missing results anew.
     for seq in wrong:
-        wait_for(tx, seq, sorted(expected[seq]))
+        add_dependencies(tx, seq, sorted(expected[seq]))
 
 
 class _NewTasks:

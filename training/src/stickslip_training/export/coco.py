@@ -50,8 +50,8 @@ def write(content: Content, directory: Path, on_bytes: OnBytes) -> None:
 def _by_split(content: Content) -> dict[str, list[int]]:
     """Return the slots of each split that has any."""
     slots: dict[str, list[int]] = {}
-    for split, _, _, some in content.parts():
-        slots.setdefault(split, []).extend(some.tolist())
+    for split, _, _, batch in content.parts():
+        slots.setdefault(split, []).extend(batch.tolist())
     return slots
 
 

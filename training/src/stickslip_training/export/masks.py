@@ -63,12 +63,12 @@ def document(frames: Array, names: list[str], file_name: str) -> dict[str, Any]:
     """
     height, width = frames.shape[1:]
     images = []
-    found: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for number, codes in enumerate(frames):
         images.append(image(number, file_name.format(frame=number), width, height))
         for annotation in annotations(codes, names):
-            found.append({"id": len(found) + 1, "image_id": number, **annotation})
-    return {"images": images, "annotations": found, "categories": categories(names)}
+            entries.append({"id": len(entries) + 1, "image_id": number, **annotation})
+    return {"images": images, "annotations": entries, "categories": categories(names)}
 
 
 def image(number: int, file_name: str, width: int, height: int) -> dict[str, Any]:

@@ -113,10 +113,10 @@ def statistics_of_codes(codes: Array, levels: Array) -> dict[str, Any]:
     count = int(counts[0].sum())
     mean = counts @ levels / count
     variance = (counts * (levels - mean[:, None]) ** 2).sum(axis=1) / count
-    seen = [levels[np.flatnonzero(row)] for row in counts]
+    occurring = [levels[np.flatnonzero(row)] for row in counts]
     statistics = {
-        "min": np.array([values[0] for values in seen]),
-        "max": np.array([values[-1] for values in seen]),
+        "min": np.array([values[0] for values in occurring]),
+        "max": np.array([values[-1] for values in occurring]),
         "mean": mean,
         "std": np.sqrt(variance),
     }
