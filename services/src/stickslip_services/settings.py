@@ -126,7 +126,7 @@ class Settings(BaseSettings):
     def chosen(cls, **values: object) -> Self:
         """Return settings with these values; raise SettingsError.
 
-        Settings that are not given are those of the environment.
+        The environment has the settings that are not given.
         """
         settings = {name: value for name, value in values.items() if value not in (None, ())}
         try:

@@ -297,7 +297,7 @@ class StoredEvent:
 
 
 def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
-    """Return the events of a job after the one with the id `after`."""
+    """Return the events of a job whose ids are above `after`."""
     query = select(events.c.id, events.c.name, events.c.data).where(
         events.c.job == job, events.c.id > after
     )
