@@ -19,6 +19,7 @@ from stickslip_sim_core.protocols import (
     cantilever,
     inclined_plane,
     lateral_buckling,
+    motion,
     stick_slip,
 )
 from stickslip_sim_core.protocols.protocol import LENGTH, strip
@@ -178,11 +179,32 @@ class TestInclinedPlane:
         assert 0.0 < late[1] < late[0] < 1e-2 / 0.5 * 1.5
 
 
+class TestMotion:
+    @pytest.mark.parametrize("name", ["fall", "slide-to-rest"])
+    @pytest.mark.parametrize("preset", ["fast", "certified"])
+    def test_passes(self, name: str, preset: str) -> None:
+        result = protocols.run(name, preset)
+        assert result.passed
+        assert result.settings["unconverged_steps"] == 0
+
+    @pytest.mark.parametrize("name", ["fall", "slide-to-rest"])
+    def test_fails_for_a_wrong_gravity(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(motion, "GRAVITY", 1.005 * motion.GRAVITY)
+        assert not protocols.run(name).passed
+
+
 class TestPresets:
     @pytest.mark.parametrize("preset", sorted(PRESETS))
     def test_every_preset_names_the_protocols(self, preset: str) -> None:
         certification = protocols.CERTIFICATION[preset]
-        always = {"stick-slip", "cantilever", "lateral-buckling", "inclined-plane"}
+        always = {
+            "fall",
+            "slide-to-rest",
+            "stick-slip",
+            "cantilever",
+            "lateral-buckling",
+            "inclined-plane",
+        }
         contact = {"capstan", "heavy-fold", "stacked-incline", "pull-out"}
         assert set(certification.protocols) == (
             always if preset.startswith("thesis-") else always | contact

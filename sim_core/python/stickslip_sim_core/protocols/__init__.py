@@ -14,6 +14,7 @@ from stickslip_sim_core.protocols.capstan import Capstan
 from stickslip_sim_core.protocols.heavy_fold import HeavyFold
 from stickslip_sim_core.protocols.inclined_plane import InclinedPlane, StackedIncline
 from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
+from stickslip_sim_core.protocols.motion import Fall, SlideToRest
 from stickslip_sim_core.protocols.protocol import Protocol
 from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
@@ -40,6 +41,8 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
             PullOut,
             HeavyFold,
             Capstan,
+            Fall,
+            SlideToRest,
         )
     }
 )
@@ -79,6 +82,8 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "capstan": {"friction": (0.3,), "bending": (0.05,)},
     "heavy-fold": {"friction": (0.3,), "cells": 80},
     "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
+    "fall": {"durations": (0.3,)},
+    "slide-to-rest": {"friction": (0.3,)},
     "pull-out": {"friction": (0.3,), "loads": (1.0,), "unstructured": 0},
 }
 
@@ -103,7 +108,14 @@ class Certification:
     """Settings by protocol for a first look. A certificate made with them certifies nothing."""
 
 
-_CLOTH = ("inclined-plane", "lateral-buckling", "stick-slip", "cantilever")
+_CLOTH = (
+    "fall",
+    "slide-to-rest",
+    "inclined-plane",
+    "lateral-buckling",
+    "stick-slip",
+    "cantilever",
+)
 SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-out")
 """Protocols that a certificate needs for a scene with self-contact."""
 

@@ -1,0 +1,90 @@
+"""Motion: how far cloth falls, and how far it slides until it rests.
+
+Both are closed forms of a constant acceleration. The step control of the preset chooses the steps,
+as in scenes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.contact import Body, plane
+from stickslip_sim_core.cloth.fabrics import fabric
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.protocols.inclined_plane import DIRECTION
+from stickslip_sim_core.protocols.protocol import ClothProtocol
+from stickslip_sim_core.protocols.result import Setting
+
+SIDE = 0.1  # m
+FABRIC = "gray-interlock"
+DURATIONS = (0.1, 0.3, 0.5)  # s
+FRICTION = (0.1, 0.3, 1.0)
+SPEED = 0.6  # at the start of a slide [m/s]
+# A slide is over by then, with a margin for one that is too long.
+LONGER = 1.2
+
+
+@dataclass(kw_only=True, eq=False)
+class MotionProtocol(ClothProtocol):
+    """A patch of cloth that moves without deforming, under the step control of the preset."""
+
+    cells: int = 5
+    """Number of cells along a side of the patch."""
+
+    def moved(self, until: float, velocity: Floats, bodies: Sequence[Body], along: Floats) -> float:
+        """Return how far a flat patch moves along a direction until a time [s]: mean, in m."""
+        mesh = meshes.grid(SIDE, SIDE, self.cells, self.cells)
+        cloth = Cloth(mesh, fabric(FABRIC), self.solver)
+        start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
+        cloth.set_state(start, np.tile(velocity, (len(start), 1)), bodies)
+        gravity = cloth.gravity.copy()
+        nothing_held = np.empty((0, 3))
+        cloth.advance(until, lambda _time: (gravity, nothing_held, bodies))
+        self.tally.count(cloth)
+        return float((cloth.positions_at(until) - start).mean(axis=0) @ along)
+
+    def reported(self) -> dict[str, Setting]:
+        return {**super().reported(), "cells": self.cells}
+
+
+@dataclass(kw_only=True, eq=False)
+class Fall(MotionProtocol):
+    """The distance that a patch has fallen after a time, against g t^2/2."""
+
+    name = "fall"
+    x_name = "time [s]"
+    y_name = "distance [m]"
+    points = "durations"
+
+    durations: Sequence[float] = DURATIONS
+    """Times of falling [s]."""
+    tolerance: float = 1e-4
+
+    def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        down = np.array([0.0, 0.0, -1.0])
+        return self.moved(x, np.zeros(3), (), down), 0.5 * GRAVITY * x * x
+
+
+@dataclass(kw_only=True, eq=False)
+class SlideToRest(MotionProtocol):
+    """The distance that a patch slides on a level plane until it rests, against v^2/(2 mu g)."""
+
+    name = "slide-to-rest"
+    x_name = "mu"
+    y_name = "distance [m]"
+    points = "friction"
+    constants: ClassVar = {"speed": SPEED}
+
+    friction: Sequence[float] = FRICTION
+    """Coefficients of friction mu."""
+    tolerance: float = 3e-3
+
+    def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
+        # Along no edge of the mesh.
+        along = np.append(DIRECTION, 0.0)
+        until = LONGER * SPEED / (x * GRAVITY)
+        return self.moved(until, SPEED * along, [plane(x)], along), SPEED**2 / (2.0 * x * GRAVITY)
