@@ -120,6 +120,9 @@ class ContactSet {
   // into forces.
   void count_errors(double stiffness, ForceNorms& norms) const;
 
+  // By how much a pair's vector rho turns in the step: with a body or surface, or half with each
+  // sheet.
+  Eigen::Matrix3d turn_of(const Candidate& stencil, const Eigen::Vector4d& weights);
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
   // The medial axis of a pair, or null.

@@ -235,9 +235,12 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
                     given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a body or surface,
-// or half with each sheet.
+// Motion of the first point over the second, less that by which rho turns.
 Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, const Vector3d& rho) {
+  return rho - turn_of(stencil, weights) * between_closest(weights, points_of(stencil, *start_));
+}
+
+Matrix3d ContactSet::turn_of(const Candidate& stencil, const Vector4d& weights) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
   Matrix3d turn = Matrix3d::Zero();
@@ -251,7 +254,7 @@ Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, con
         turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
     }
   }
-  return rho - turn * between_closest(weights, points_of(stencil, *start_));
+  return turn;
 }
 
 }  // namespace sim_core

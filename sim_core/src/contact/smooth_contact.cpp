@@ -154,4 +154,11 @@ double SmoothContact::mu(int node) const {
   return materials_.mu(sheet_of_node_[node], surface_of(projections_[node].triangle));
 }
 
+Vector3d SmoothContact::normal_near(int node, const Vector3d& p) const {
+  const Projection& last = projections_[node];
+  const std::optional<Projection> found =
+      patches_.projection(end_, p, last.triangle, track_.side[node]);
+  return found ? found->normal : last.normal;
+}
+
 }  // namespace sim_core

@@ -65,6 +65,8 @@ class SmoothContact {
   // began, m; friction; and the projection.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
   double mu(int node) const;
+  // The normal at p, which is near what the node saw last: that one where there is no projection.
+  Eigen::Vector3d normal_near(int node, const Eigen::Vector3d& p) const;
   const Projection& projection(int node) const { return projections_[node]; }
   const std::vector<std::array<int, 3>>& triangles() const { return patches_.triangles(); }
 

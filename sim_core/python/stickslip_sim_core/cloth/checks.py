@@ -8,7 +8,7 @@ No judged value depends on what follows its worst moment: each is a largest valu
 of the worst stretch of steps (`history.worst_stretch`). A calm end therefore mends no run.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -46,6 +46,9 @@ class Seen:
     """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact.
     """
 
+    others: Sequence[str] = ()
+    """Names of all bodies, then of all surfaces, then of all sheets; without them, numbers."""
+
     @property
     def total(self) -> StepReport:
         """The report of all steps together."""
@@ -68,6 +71,9 @@ class Check:
     """The grounds for the limit."""
 
     unit: str = "1"
+
+    advice: Callable[[Seen], str] = lambda _seen: ""
+    """What is at fault and what to change, for the reason."""
 
 
 CHECKS = (
@@ -119,7 +125,7 @@ CHECKS = (
         lambda seen: worst_stretch(
             seen.cloth.history.column("contact_work"),
             seen.cloth.history.column("flow"),
-            _flow_scale(seen.cloth),
+            FLOW * _lift(seen.cloth),
         ),
         1e-3,
         "contact takes energy from the motion against a body and never gives any; a body that "
@@ -129,7 +135,7 @@ CHECKS = (
         "energy_gain",
         "largest energy gained beyond the work of gravity, holders and bodies, over the flow "
         "of energy",
-        lambda seen: seen.total.seen.gain / max(seen.total.seen.flow, _flow_scale(seen.cloth)),
+        lambda seen: seen.total.seen.gain / max(seen.total.seen.flow, FLOW * _lift(seen.cloth)),
         None,
         "recorded: good runs reach 0.9 %, and bad ones begin at 1 %",
     ),
@@ -160,11 +166,15 @@ CHECKS = (
         "the fabrics were measured up to 1 + 1/6; drops reach 1.09 and heaps 1.17",
     ),
     Check(
-        "sharpness",
-        "side of a cell over the radius of the sharpest edge, ball or rod that bore cloth",
-        lambda seen: 1.0 / seen.total.sharpest,
-        2.0,
-        "cells catch on what has less than half their side as radius",
+        "friction_error",
+        "bound on the error of the coefficient of friction with one body, surface or sheet, where "
+        "friction does the work that lifts the cloth by a cell: mean over this work of e, where "
+        "cloth that turns by an angle a along a cell has e = a^4/100 at vertices, which are "
+        "corrected for cells, and a^2/8 elsewhere and over radii below 0.7 cells",
+        lambda seen: max(_friction_errors(seen.cloth), default=0.0),
+        0.1,
+        "LIMIT",
+        advice=lambda seen: _sharpest(seen),
     ),
     Check(
         "missed",
@@ -192,13 +202,34 @@ def _unconverged(cloth: Cloth) -> float:
     return worst_stretch(unconverged, np.ones_like(unconverged), 1.0 / allowed) / allowed
 
 
-def _flow_scale(cloth: Cloth) -> float:
-    """Return the flow of energy of the stretches in which work is judged [J]."""
+def _lift(cloth: Cloth) -> float:
+    """Return the work that lifts all cloth by the side of a cell [J]."""
+    return float(cloth.masses.sum() * GRAVITY * _cell(cloth))
+
+
+def _cell(cloth: Cloth) -> float:
+    """Return the mean side of a cell, which is a square of two triangles [m]."""
     rest = cloth.mesh.rest[np.asarray(cloth.mesh.triangles)]
     (a, b), (c, d) = np.moveaxis(rest[:, 1:] - rest[:, :1], 0, -1)
-    # Two triangles make a cell.
-    cell = np.sqrt(np.abs(a * d - b * c).mean())
-    return float(FLOW * cloth.masses.sum() * GRAVITY * cell)
+    return float(np.sqrt(np.abs(a * d - b * c).mean()))
+
+
+def _friction_errors(cloth: Cloth) -> list[float]:
+    """Return the bound on the error of friction with each body, surface and sheet."""
+    lift = _lift(cloth)
+    friction = np.moveaxis(cloth.history.friction, 1, 0)
+    return [worst_stretch(other[:, 1], other[:, 0], lift) for other in friction]
+
+
+def _sharpest(seen: Seen) -> str:
+    errors = _friction_errors(seen.cloth)
+    other = int(np.argmax(errors))
+    name = seen.others[other] if seen.others else f"number {other} of bodies, surfaces and sheets"
+    radius = 1e3 * _cell(seen.cloth)
+    return (
+        f"{name} is too sharp for the cells of the cloth: give it edges with a radius of "
+        f"{radius:.3g} mm, a mesh a thickness of {2.0 * radius:.3g} mm, or the cloth finer cells"
+    )
 
 
 def values(seen: Seen) -> Mapping[str, float]:
@@ -206,16 +237,20 @@ def values(seen: Seen) -> Mapping[str, float]:
     return MappingProxyType({check.name: float(check.value(seen)) for check in CHECKS})
 
 
-def failed(worst: Mapping[str, float]) -> tuple[str, str]:
-    """Return the code and the text of the first check that fails, or empty texts."""
+def failed(worst: Mapping[str, float], seen: Seen | None = None) -> tuple[str, str]:
+    """Return the code and the text of the first check that fails, or empty texts.
+
+    With `seen`, the text ends with advice where the check has some.
+    """
     for check in CHECKS:
         value = worst[check.name]
         # `not value <= limit` is also true for NaN, which `value > limit` would let pass.
         if check.limit is not None and not value <= check.limit:
             unit = "" if check.unit == "1" else f" {check.unit}"
+            advice = check.advice(seen) if seen is not None else ""
             return (
                 check.name,
                 f"{check.name}: must be at most {check.limit:g}{unit}, got {value:.4g} "
-                f"({check.formula})",
+                f"({check.formula})" + (f": {advice}" if advice else ""),
             )
     return "", ""

@@ -17,6 +17,7 @@ class StepHistory:
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
+        self._friction: list[list[tuple[float, float]]] = []
 
     def add(self, duration: float, report: StepReport) -> None:
         """Add a step of `duration` [s]."""
@@ -24,6 +25,16 @@ class StepHistory:
         self._rows.append(
             (duration, extremes.contact_work, extremes.flow, report.unconverged, report.missed)
         )
+        self._friction.append(extremes.friction)
+
+    @property
+    def friction(self) -> Floats:
+        """Work of friction of each step, and the bound on its error: (steps, others, 2) [J].
+
+        The others are bodies, then surfaces, then sheets, with which cloth of another sheet rubs.
+        """
+        others = max(map(len, self._friction), default=0)
+        return np.reshape(self._friction, (len(self._friction), others, 2))
 
     def column(self, name: str) -> Floats:
         """Return a number of each step: (steps,).

@@ -157,6 +157,9 @@ class Scene:
     kernel: str | None = None
     """Level of the kernels, see `Cloth`."""
 
+    others: Sequence[str] = ()
+    """Names of bodies, then of surfaces, then of sheets, for the reasons of checks."""
+
     reason: str = ""
     """Reason why no run of the scene is valid, or empty."""
 
@@ -228,9 +231,12 @@ class Scene:
         for name, at in self.tracks.items():
             record[name] = np.stack([np.asarray(at(float(time))) for time in times])
         # Without self-contact cloth may pass through itself, so crossings are no fault.
-        worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
+        evidence = checks.Seen(cloth, path, max(crossed) if self.self_contact else 0, self.others)
+        worst = checks.values(evidence)
         # A start that is no equilibrium spoils the run even if all checks pass.
-        code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
+        code, reason = (
+            ("solver_diverged", self.reason) if self.reason else checks.failed(worst, evidence)
+        )
         run = ClothRun(
             positions=path,
             rest=self.mesh.rest,
