@@ -30,8 +30,8 @@ from stickslip_schemas.documents.tasks import (
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
-from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import FRAMING
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
 from stickslip_schemas.store import open_store
 from stickslip_workers.commands import replay
 
@@ -93,7 +93,8 @@ def _clip(task: RenderTask, store: str) -> npt.NDArray[np.uint8]:
     seen = replay(task, store=store, blender_python=BLENDER_PYTHON)
     if not isinstance(seen.output, RenderOutput):
         sys.exit(f"not rendered: {seen.message}")
-    video = np.empty((INSTANTS, CLIP_SIZE, CLIP_SIZE, 3), np.uint8)
+    width, height = DEFAULT_RESOLUTION
+    video = np.empty((INSTANTS, height, width, 3), np.uint8)
     decode_clip(open_store(store).read(seen.output.chunks["video"].digest), video)
     return np.concatenate(list(video), axis=1)
 
@@ -120,7 +121,8 @@ def main() -> None:
         found = strip(name, axes, change, all_views=options.views, record=options.record)
         picture = Image.fromarray(found)
         small = picture.resize(
-            (INSTANTS * SIDE, picture.height * SIDE // CLIP_SIZE), Image.Resampling.LANCZOS
+            (INSTANTS * SIDE, picture.height * SIDE // DEFAULT_RESOLUTION[1]),
+            Image.Resampling.LANCZOS,
         )
         path = options.out / f"{name}.webp"
         small.save(path, quality=70, method=6)

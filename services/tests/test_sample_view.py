@@ -14,7 +14,7 @@ from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
 from stickslip_services.pages.browsing import sliders, thumbs
 from stickslip_services.pages.motion import deformed, motion
-from stickslip_services.pages.pictures import coloured, mp4
+from stickslip_services.pages.pictures import coloured, mp4, shown_part
 from stickslip_services.pages.sample_page import sample_view
 
 
@@ -30,6 +30,7 @@ def sample(values: dict[str, Any] | None = None, **spec: Any) -> Any:
         arrays=arrays,
         manifest=SimpleNamespace(spec=parsed),
         read=lambda name, _slot: known[name],
+        picture_size=lambda _slot: None,
         named=lambda array, value: array.categories[value] if array.categories else value.tolist(),
         store=SimpleNamespace(read=built_in_files().__getitem__),
     )
@@ -179,32 +180,38 @@ def test_a_body_of_triangles_follows_its_bones() -> None:
 
 def test_a_film_shows_the_frames_of_the_clip() -> None:
     av = pytest.importorskip("av", reason="make setup-dev")
-    frames = [np.full((224, 224, 3), level, np.uint8) for level in (20, 120, 220)]
+    # H.264 for browsers has even sides only: an odd picture gets its last row and column twice.
+    frames = [np.full((223, 129, 3), level, np.uint8) for level in (20, 120, 220)]
     with av.open(BytesIO(mp4(frames))) as film:
         assert (film.streams.video[0].average_rate, film.streams.video[0].codec_context.name) == (
             10,
             "h264",
         )
-        levels = [frame.to_ndarray(format="rgb24").mean() for frame in film.decode(video=0)]
+        shown = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        levels = [picture.mean() for picture in shown]
+    assert shown[0].shape == (224, 130, 3)
     assert levels == pytest.approx([20, 120, 220], abs=3)
 
 
 def test_ground_truth_is_shown_in_colours() -> None:
     y_x = {"frame": 2, "y": 1, "x": 2}
     flow = np.array([[[[0.0, 2.0], [-1.0, 0.0]]]] * 2, dtype=np.float16)
-    assert coloured(array("flow", "", "float16", y_x | {"xy": 2}), flow, 1).tolist() == [
-        [[127, 255, 127], [63, 127, 127]]
-    ]
+    (shown,) = coloured(array("flow", "", "float16", y_x | {"xy": 2}), flow, [1])
+    assert shown.tolist() == [[[127, 255, 127], [63, 127, 127]]]
     depth = np.array([[[1.0, np.inf]], [[3.0, 2.0]]], dtype=np.float32)
-    assert coloured(array("depth", "", "float32", y_x), depth, 0).tolist() == [
-        [[0, 0, 0], [0, 0, 0]]
-    ]
-    assert coloured(array("depth", "", "float32", y_x), depth, 1).tolist() == [
-        [[255] * 3, [127] * 3]
-    ]
+    near, far = coloured(array("depth", "", "float32", y_x), depth, [0, 1])
+    assert near.tolist() == [[[0, 0, 0], [0, 0, 0]]]
+    assert far.tolist() == [[[255] * 3, [127] * 3]]
     codes = array(
         "segmentation", "", "uint8", y_x, attributes={"categories": ["background", "cloth"]}
     )
-    assert (
-        len(np.unique(coloured(codes, np.array([[[0, 1]]] * 2, dtype=np.uint8), 0), axis=1)[0]) == 2
-    )
+    (segments,) = coloured(codes, np.array([[[0, 1]]] * 2, dtype=np.uint8), [0])
+    assert len(np.unique(segments, axis=1)[0]) == 2
+
+
+def test_only_the_part_of_a_frame_with_the_picture_is_shown() -> None:
+    frames = np.arange(2 * 3 * 4, dtype=np.float32).reshape(2, 3, 4)
+    depth = array("depth", "", "float32", {"frame": 2, "y": 3, "x": 4})
+    assert shown_part(depth, frames, np.array([2, 3])).shape == (2, 3, 2)
+    assert shown_part(depth, frames, None) is frames
+    assert shown_part(array("mu", "friction"), frames[0, 0, 0], np.array([2, 3])).shape == ()

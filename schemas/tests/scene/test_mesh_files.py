@@ -12,7 +12,8 @@ import pytest
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.errors import UnfitFileError
 from stickslip_schemas.scene.files import counts_of, frames_of, read_file, weld_notes
-from stickslip_schemas.scene.mesh_files import read_polygons
+from stickslip_schemas.scene.mesh_files import FARTHEST, read_polygons
+from stickslip_schemas.scene.plain_obj import read_tables
 
 BODY = ("bodies", "cube", "file")
 MESH = ("sheets", "towel", "mesh", "file")
@@ -369,3 +370,57 @@ def test_a_vertex_that_parts_from_its_twin_is_not_welded(tmp_path: Path) -> None
 
 def test_only_a_pattern_is_asked_for_texture_coordinates() -> None:
     assert read_polygons(textured().encode()).pattern is None
+
+
+def random_obj(rng: np.random.Generator, corner: str, *, extra: str = "") -> str:
+    """Return an OBJ file of random polygons; `corner` writes a corner with its vertex."""
+    count = int(rng.integers(4, 30))
+    lines = ["# a comment", "o thing"]
+    lines += [f"v {x:.9g}  {y:.3e}\t{z:.6f}{extra}" for x, y, z in rng.uniform(-1, 1, (count, 3))]
+    lines += [f"vt {u:.9g} {v:.9g}" for u, v in rng.uniform(0, 1, (count, 2))]
+    lines += ["vn 0 0 1"]
+    for _ in range(int(rng.integers(1, 9))):
+        corners = rng.permutation(count)[: int(rng.integers(3, min(count, 7) + 1))]
+        lines.append("f " + " ".join(corner.format(v=vertex + 1) for vertex in corners))
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("corner", ["{v}", "{v}/{v}", "{v}//1", "{v}/{v}/1"])
+@pytest.mark.parametrize("extra", ["", " 0.5 0.5 0.5"])
+def test_tables_are_what_lines_are(corner: str, extra: str) -> None:
+    """A plain file gives the same numbers as one that is read line by line."""
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        text = random_obj(rng, corner, extra=extra).encode()
+        assert read_tables(text, with_pattern=True, farthest=FARTHEST) is not None
+        # A comment behind a line is unusual, and changes nothing.
+        unusual = text.replace(b"vn 0 0 1", b"vn 0 0 1 # up")
+        assert read_tables(unusual, with_pattern=True, farthest=FARTHEST) is None
+        plain, by_lines = read_polygons(text), read_polygons(unusual)
+        for one, other in zip(plain, by_lines, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -1\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2 3\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/2/3 2 3/4/5/6/7\n",
+        "v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0 inf\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0 1e3\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0 x\nv 0 1 0\nf 1 2 3\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf \n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3.0\n",
+        "v 0 0 0\nv 1 0 0\nf 1 2 3\nv 0 1 0\n",
+        "f 1 2 3\n",
+        "v 0 0 0\n",
+        "",
+    ],
+)
+def test_what_is_not_plain_is_read_by_lines(text: str) -> None:
+    assert read_tables(text.encode(), with_pattern=False, farthest=FARTHEST) is None

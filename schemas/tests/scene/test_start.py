@@ -1,5 +1,6 @@
 """Scenes that can never work: each is refused with the place, the rule and the value."""
 
+import io
 from copy import deepcopy
 from typing import Any
 
@@ -31,6 +32,8 @@ SCENE: dict[str, Any] = {
             "material": "lining",
             "mesh": {"type": "grid", "size": [0.1, 0.1], "cells": [8, 8]},
             "origin": [0.0, 0.0, 0.06],
+            "turn": [0.0, 0.0, 0.0],
+            "start": {"type": "flat"},
         },
     },
     "bodies": {"floor": {"type": "plane"}},
@@ -77,7 +80,69 @@ def islands() -> bytes:
     )
 
 
+CUBE = 0.02 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+CUBE_TRIANGLES = [
+    half
+    for a, b, c, d in [
+        (0, 1, 3, 2),
+        (4, 6, 7, 5),
+        (0, 4, 5, 1),
+        (2, 3, 7, 6),
+        (0, 2, 6, 4),
+        (1, 5, 7, 3),
+    ]
+    for half in ((a, b, c), (a, c, d))
+]
+
+
+def frames(*moves: tuple[float, list[float]]) -> bytes:
+    """Return an NPZ file of a cube whose middle is at a place at each time."""
+    packed = io.BytesIO()
+    np.savez(
+        packed,
+        positions=np.stack([CUBE + move for _, move in moves]),
+        triangles=np.array(CUBE_TRIANGLES),
+        times=np.array([time for time, _ in moves]),
+    )
+    return packed.getvalue()
+
+
+def skin(height: float) -> bytes:
+    """Return an NPZ file of a cube on a bone that rises by a height [m] within 5 ms."""
+    bones = np.zeros((3, 1, 3, 4))
+    bones[:, 0, :, :3] = np.eye(3)
+    bones[2, 0, 2, 3] = height
+    packed = io.BytesIO()
+    np.savez(
+        packed,
+        rest=CUBE,
+        weights=np.ones((8, 1)),
+        bones=bones,
+        triangles=np.array(CUBE_TRIANGLES),
+        times=np.array([0.0, 0.2, 0.205]),
+    )
+    return packed.getvalue()
+
+
+def square_sheet(scale: float) -> bytes:
+    """Return a sheet of 0.1 m whose flat pattern is `scale` times as large."""
+    flat, triangles = pattern()
+    return obj(np.column_stack([flat, np.zeros(len(flat))]), triangles, scale * flat)
+
+
 FILES = {
+    "unit-pattern.obj": square_sheet(10.0),
+    "stretched.obj": square_sheet(1 / 1.4),
+    "cube.obj": obj(CUBE, CUBE_TRIANGLES),
+    "teleport.npz": frames((0, [0, 0, 0.02]), (0.2, [0, 0, 0.02]), (0.201, [0, 0, 0.32])),
+    "there-and-back.npz": frames((0, [0, 0, 0.02]), (0.04, [0, 0, 1.02]), (0.08, [0, 0, 0.02])),
+    "slow.npz": frames((0, [0, 0, 0.02]), (0.5, [0, 0, 0.035])),
+    "late.npz": frames(
+        (0, [0, 0, 0.02]), (0.9, [0, 0, 0.02]), (1.0, [0, 0, 0.02]), (1.001, [0, 0, 0.32])
+    ),
+    "skin.npz": skin(0.4),
+    "press.npz": frames((0, [0, 0, 0.1]), (0.4, [0, 0, 0.005]), (0.6, [0, 0, 0.005])),
+    "soft-press.npz": frames((0, [0, 0, 0.1]), (0.4, [0, 0, 0.0225]), (0.6, [0, 0, 0.0225])),
     "islands.obj": islands(),
     "plate.obj": obj(*square(0.06)),
     "blade.obj": obj([(-0.02, 0, 0.03), (0.02, 0, 0.03), (0, 0.001, 0.09)], [(0, 1, 2)]),
@@ -252,6 +317,115 @@ FAULTS: list[tuple[dict[tuple[str, ...], Any], tuple[str, ...], str, Any]] = [
 ]
 
 
+LYING: dict[tuple[str, ...], Any] = {ORIGIN: [0.0, 0.0, 0.002]}
+THING = ("bodies", "thing")
+FAULTS += [
+    (
+        {THING: {"type": "mesh", "file": "teleport.npz"}},
+        ("bodies", "thing", "file"),
+        "must have frames that steps of 0.0078125 s follow to 0.0004 m, as the preset fast asks",
+        None,
+    ),
+    (
+        {(*CLOTH, "mesh"): file_mesh("unit-pattern.obj"), (*CLOTH, "start"): {"type": "file"}},
+        (*CLOTH, "start"),
+        "as long as in the flat pattern, and they are 0.1 times as long",
+        "file",
+    ),
+    (
+        {THING: {"type": "mesh", "file": "there-and-back.npz"}},
+        ("bodies", "thing", "file"),
+        "give it more time, with more frames or a lower frame_rate",
+        None,
+    ),
+    (
+        {THING: {"type": "mesh", "file": "skin.npz"}},
+        ("bodies", "thing", "file"),
+        "off an even motion, at a speed of",
+        None,
+    ),
+    (
+        {
+            HOLDERS: {
+                "h": {
+                    "edge": "left",
+                    "motion": {"keys": [{"time": 0}, {"time": 0.1, "turn": [0, 0, 6.28]}]},
+                }
+            }
+        },
+        (*HOLDERS, "h", "motion"),
+        "turns are in radians",
+        None,
+    ),
+    (
+        {**LYING, THING: {"type": "mesh", "file": "press.npz"}},
+        ("bodies", "thing", "file"),
+        "between this body and floor, and at 0.4 s it is 15 mm further than the cloth lets it",
+        {"time": 0.4},
+    ),
+    (
+        {
+            **LYING,
+            THING: {
+                "type": "mesh",
+                "file": "cube.obj",
+                "motion": keys((0.0, [0, 0, 0.1]), (0.5, [0, 0, 0.01])),
+            },
+        },
+        ("bodies", "thing", "motion"),
+        "between this body and floor, and at 0.5 s it is 10 mm further than the cloth lets it",
+        {"time": 0.5},
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.062],
+            THING: {"type": "mesh", "file": "plate.obj"},
+            ("bodies", "ball"): {
+                **BALL,
+                "origin": [0, 0, 0.1],
+                "motion": keys((0.0, [0, 0, 0]), (0.5, [0, 0, -0.03])),
+            },
+        },
+        ("bodies", "ball", "motion"),
+        "must leave room for the cloth between this body and thing",
+        {"time": 0.5},
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.02],
+            (*CLOTH, "turn"): [np.pi / 2, 0, 0],
+            (*CLOTH, "start"): {"type": "hung"},
+            HOLDERS: {"h": {"edge": "top"}},
+        },
+        ORIGIN,
+        "where it hangs, vertex 0 of the sheet is 30 mm inside floor",
+        None,
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.12],
+            (*CLOTH, "start"): {"type": "hung"},
+            HOLDERS: {"h": {"edge": "left"}},
+            ("bodies", "ball"): {**BALL, "origin": [-0.05, 0.0, 0.06]},
+        },
+        ORIGIN,
+        "where it hangs, vertex 41 of the sheet is 27.5 mm inside ball",
+        None,
+    ),
+    (
+        {
+            ORIGIN: [0.0, 0.0, 0.1],
+            (*CLOTH, "start"): {"type": "hung"},
+            HOLDERS: {"h": {"edge": "left"}},
+            THING: {"type": "mesh", "file": "plate.obj"},
+        },
+        ORIGIN,
+        "must not cross body thing where it hangs",
+        None,
+    ),
+]
+
+
 def without_placeholders(value: Any) -> Any:
     """Return a body without the fields of the shape that it replaces."""
     if isinstance(value, dict):
@@ -272,37 +446,64 @@ def test_it_is_refused(
         assert fault.value == value
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {ORIGIN: [0.0, 0.0, 0.0]},
-        {("sheets", "other"): {**OTHER, "origin": [0, 0, 0.0605]}},
-        {("bodies", "ball"): {**BALL, "origin": [0, 0, 0.0295]}},
-        {("bodies", "thing"): {"type": "mesh", "file": "plate.obj"}, ORIGIN: [0.0, 0.0, 0.0605]},
-        {HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, 0.1]))}}},
-        {
-            HOLDERS: {
-                "a": {"edge": "left"},
-                "b": {"edge": "right", "motion": keys((0.0, [0, 0, 0]), (0.5, [0.02, 0, 0]))},
-            }
+CAN_START: list[dict[tuple[str, ...], Any]] = [
+    {},
+    {ORIGIN: [0.0, 0.0, 0.0]},
+    {("sheets", "other"): {**OTHER, "origin": [0, 0, 0.0605]}},
+    {("bodies", "ball"): {**BALL, "origin": [0, 0, 0.0295]}},
+    {("bodies", "thing"): {"type": "mesh", "file": "plate.obj"}, ORIGIN: [0.0, 0.0, 0.0605]},
+    {HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, 0.1]))}}},
+    {
+        HOLDERS: {
+            "a": {"edge": "left"},
+            "b": {"edge": "right", "motion": keys((0.0, [0, 0, 0]), (0.5, [0.02, 0, 0]))},
+        }
+    },
+    {
+        ORIGIN: [0.0, 0.0, 0.002],
+        ("bodies", "ball"): {
+            "type": "box",
+            "size": [0.05, 0.05, 0.02],
+            "origin": [0, 0, 0.03],
+            "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.0195])),
         },
-        {
-            ORIGIN: [0.0, 0.0, 0.002],
-            ("bodies", "ball"): {
-                "type": "box",
-                "size": [0.05, 0.05, 0.02],
-                "origin": [0, 0, 0.03],
-                "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.0195])),
-            },
+    },
+    {HOLDERS: {"h": {"rim": True}}, ORIGIN: [0.0, 0.0, 0.03]},
+    {THING: {"type": "mesh", "file": "slow.npz"}},
+    {(*CLOTH, "mesh"): file_mesh("unit-pattern.obj")},
+    {(*CLOTH, "mesh"): file_mesh("stretched.obj"), (*CLOTH, "start"): {"type": "file"}},
+    {THING: {"type": "mesh", "file": "late.npz"}},
+    {**LYING, THING: {"type": "mesh", "file": "soft-press.npz"}},
+    # Cloth that stands at a wall falls before a press is there.
+    {
+        (*CLOTH, "turn"): [0, np.pi / 2, 0],
+        THING: {
+            "type": "mesh",
+            "file": "cube.obj",
+            "motion": keys((0.0, [0.1, 0, 0.06]), (0.5, [-0.1, 0, 0.06])),
         },
-        {HOLDERS: {"h": {"rim": True}}, ORIGIN: [0.0, 0.0, 0.03]},
-        {
-            (*CLOTH, "mesh"): {"type": "unstructured", "size": [0.1, 0.1], "spacing": 0.01},
-            HOLDERS: {"a": {"edge": "left"}, "b": {"low": [-0.03, -0.05], "high": [0.03, -0.04]}},
-        },
-    ],
-)
+        ("bodies", "ball"): {"type": "plane", "origin": [-0.005, 0, 0], "normal": [1, 0, 0]},
+    },
+    # How a sheet hangs from a corner, only a simulation tells.
+    {
+        (*CLOTH, "start"): {"type": "hung"},
+        HOLDERS: {"h": {"vertices": [0]}},
+        ("bodies", "ball"): {**BALL, "origin": [0.0, 0.0, 0.0]},
+    },
+    {
+        ORIGIN: [0.0, 0.0, 0.12],
+        (*CLOTH, "start"): {"type": "hung"},
+        HOLDERS: {"h": {"edge": "left"}},
+        ("bodies", "ball"): {**BALL, "origin": [0.05, 0.0, 0.06]},
+    },
+    {
+        (*CLOTH, "mesh"): {"type": "unstructured", "size": [0.1, 0.1], "spacing": 0.01},
+        HOLDERS: {"a": {"edge": "left"}, "b": {"low": [-0.03, -0.05], "high": [0.03, -0.04]}},
+    },
+]
+
+
+@pytest.mark.parametrize("changes", CAN_START)
 def test_it_can_start(changes: dict[tuple[str, ...], Any]) -> None:
     assert faults_of(changes) == []
 

@@ -105,6 +105,19 @@ double cell_of(const ClothMesh& mesh) {
   return out;
 }
 
+std::vector<double> cells_of_vertices(const ClothMesh& mesh) {
+  const Eigen::Index vertices = mesh.rest.rows();
+  std::vector<double> out(vertices, 0.0), triangles(vertices, 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    for (int c = 0; c < 3; ++c) {
+      out[mesh.triangles(t, c)] += mesh.area[t];
+      triangles[mesh.triangles(t, c)] += 1.0;
+    }
+  }
+  for (Eigen::Index i = 0; i < vertices; ++i) out[i] = std::sqrt(2.0 * out[i] / triangles[i]);
+  return out;
+}
+
 ContactMaterials with_capsules(ContactMaterials materials,
                                const std::vector<MedialAxis>& medial_axes,
                                const std::vector<Body>& bodies, double cell) {

@@ -33,8 +33,11 @@ struct ClothSolver::Impl {
         newton(stepper.newton),
         numbering(assembly.numbering) {
     stepper.sheets = mesh.sheets;
-    for (int i = 0; i < numbering.free_nodes; ++i)
+    const std::vector<double> cells = cells_of_vertices(mesh);
+    for (int i = 0; i < numbering.free_nodes; ++i) {
       newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
+      newton.contact.cell[i] = cells[numbering.vertex[i]];
+    }
     if ((materials.mu.array() >= 0.0).any()) {
       newton.pairs =
           contact_set_of(mesh, numbering, materials, surfaces, medial_axes, setup.constants);

@@ -33,6 +33,8 @@ struct SurfaceMeshes {
 //
 // Side of a cell of the coarsest sheet, m.
 double cell_of(const ClothMesh& mesh);
+// Side of a cell around each vertex, m: that of a square of two of its triangles.
+std::vector<double> cells_of_vertices(const ClothMesh& mesh);
 // The materials with medial axes of these bodies.
 ContactMaterials with_capsules(ContactMaterials materials,
                                const std::vector<MedialAxis>& medial_axes,

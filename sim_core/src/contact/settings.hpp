@@ -164,9 +164,9 @@ struct SmoothSettings {
 };
 
 struct CapsuleSettings {
-  // Radius over the side of a cell below which a body has a medial axis. From there on vertices
-  // suffice: a triangle between them sinks by a sixteenth of a cell at most.
-  double radius_max = 2.0;
+  // Radius over the side of a cell below which a body has a medial axis. From there on a strip over
+  // a box edge bears its force within 2 % (mu 0.6), and at 0.75 within 7 %.
+  double radius_max = 0.9;
   // Half of the shortest edge of a box over the side of a cell below which its medial axis is all
   // that cloth feels: it then has faces, too, which cost more than those that vertices touch, but
   // nothing jumps over it.

@@ -6,6 +6,7 @@
 #include <limits>
 #include <utility>
 
+#include "contact/capstan.hpp"
 #include "contact/rows.hpp"
 
 namespace sim_core {
@@ -68,6 +69,7 @@ ContactState::ContactState(int free_nodes, const ContactSettings& settings)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
       sheet(free_nodes, 0),
+      cell(free_nodes, 0.0),
       stiffness(free_nodes, 0.0),
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
@@ -219,11 +221,34 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
   const Vector3d force = at_node(residual, node);
   if (on.body >= static_cast<int>(at_end.size())) {
     const Vector3d u = surfaces->slip(node, before, p);
-    return {on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
+    Contact out{on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
+    out.mu = corrected_mu(out, node, p,
+                          [&](const Vector3d& near) { return surfaces->normal_near(node, near); });
+    return out;
   }
   const double mu_here = on.mean([&](int b) { return at_end[b].mu_of(sheet[node]); });
-  return {on.gap.distance, n,       slip(on, before, p, at_start, at_end),
-          force,           mu_here, stiffness[node]};
+  Contact out{on.gap.distance, n,       slip(on, before, p, at_start, at_end),
+              force,           mu_here, stiffness[node]};
+  // Planes are flat, and fillets hollow: there cloth does not turn at nodes.
+  const Body& body = at_end[on.body];
+  if (body.shape != Body::plane && on.others[0] < 0) {
+    out.mu =
+        corrected_mu(out, node, p, [&](const Vector3d& near) { return gap_of(body, near).normal; });
+  }
+  return out;
+}
+
+// Half a cell before and behind along friction, which is what the law asks for at the iterate.
+template <class NormalAt>
+double ContactState::corrected_mu(const Contact& contact, int node, const Vector3d& p,
+                                  const NormalAt& normal_at) const {
+  const Vector3d friction = contact.friction() - contact.stiffness * contact.slip;
+  const double size = friction.norm();
+  if (!(contact.mu > 0.0 && size > 0.0)) return contact.mu;
+  const Vector3d along = friction / size;
+  const Vector3d half_cell = 0.5 * cell[node] * along;
+  return mu_between_cells(
+      contact.mu, {normal_at(p - half_cell), contact.normal, normal_at(p + half_cell)}, along);
 }
 
 void ContactState::write(int node, const NodeRow& row) {

@@ -123,6 +123,7 @@ class ContactState {
   std::vector<int> mode,
       touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<int> sheet;         // (free nodes): to which they belong
+  std::vector<double> cell;       // (free nodes): side of a cell, m
   std::vector<double> stiffness;  // (free nodes): k of the law, N/m
   Buffer<float> normal, direction, coupling, turning;
   Buffer<float> force,
@@ -173,6 +174,11 @@ class ContactState {
   Contact contact_at(int node, const BodyContact& on, const Buffer<double>& x,
                      const Buffer<double>& start, const Buffer<double>& residual,
                      const std::vector<Body>& at_start, const std::vector<Body>& at_end) const;
+  // Coefficient of friction of a contact at p, see capstan.hpp; `normal_at`: of the face near a
+  // point.
+  template <class NormalAt>
+  double corrected_mu(const Contact& contact, int node, const Eigen::Vector3d& p,
+                      const NormalAt& normal_at) const;
   void write(int node, const NodeRow& row);
 
   struct History {

@@ -87,7 +87,8 @@ class TestCarries:
             body_forces(cloth).sum(axis=0), abs=2e-3 * weight(cloth)
         )
         assert cloth.positions[:, 2].max() == pytest.approx(cells * CELL, abs=0.4 * CELL)
-        assert cloth.total.sharpest == pytest.approx(cells, rel=1e-3)
+        expected = cells if cells < 0.9 else np.inf
+        assert cloth.total.sharpest == pytest.approx(expected, rel=1e-3)
         assert cloth.total.unconverged <= 1
 
     def test_a_blade_lifts(self) -> None:

@@ -25,18 +25,20 @@ using Triangles = Input<std::int32_t, nb::shape<-1, 3>>;
 using Seen = Input<std::int32_t, nb::shape<-1, -1>>;
 using Texels = Input<float, nb::shape<-1, -1, -1>>;
 using Halves = Input<std::uint16_t, nb::shape<-1, -1, 3>>;
+using Values = Input<float, nb::shape<-1>>;
 using Plane = Input<float, nb::shape<-1, -1>>;
 using Colors = Input<float, nb::shape<-1, -1, -1>>;
-using Doubles = Input<double, nb::shape<-1, -1>>;
+using Floor = Input<float, nb::shape<-1, -1, 3>>;
 using Pictures = nb::ndarray<std::uint8_t, nb::shape<-1, -1, -1, 3>, nb::device::cpu>;
 using WindowTuple = std::tuple<int, int, int, int>;
 
+// Hand a vector over to Python as an array.
 template <class Scalar, class Shape>
-nb::ndarray<nb::numpy, Scalar, Shape, nb::c_contig> handed_over(
+nb::ndarray<nb::numpy, Scalar, Shape, nb::c_contig> to_array(
     std::vector<Scalar> values, std::initializer_list<std::size_t> shape) {
-  auto held = std::make_unique<std::vector<Scalar>>(std::move(values));
-  Scalar* data = held->data();
-  nb::capsule owner(held.release(),
+  auto heap = std::make_unique<std::vector<Scalar>>(std::move(values));
+  Scalar* data = heap->data();
+  nb::capsule owner(heap.release(),
                     [](void* p) noexcept { delete static_cast<std::vector<Scalar>*>(p); });
   return {data, shape, owner};
 }
@@ -46,21 +48,61 @@ std::span<const Item> rows_of(const Array& array) {
   return {reinterpret_cast<const Item*>(array.data()), array.shape(0)};
 }
 
-void check(const Points& points, const Triangles& triangles, const WindowTuple& window, int grid) {
-  const auto [left, top, width, height] = window;
-  if (width < 1 || height < 1 || grid < 1 || grid > 64)
-    throw std::invalid_argument("window and grid: sizes must be at least 1, and grid at most 64");
+template <class Array>
+auto span_of(const Array& array) {
+  return std::span(array.data(), array.size());
+}
+
+// ---- Checks
+// --------------------------------------------------------------------------------------
+
+void require(bool is_true, const std::string& message) {
+  if (!is_true) throw std::invalid_argument(message);
+}
+
+void check_triangles(const Triangles& triangles, std::size_t point_count) {
+  const auto count = static_cast<std::int32_t>(point_count);
+  const auto is_index = [=](std::int32_t index) { return index >= 0 && index < count; };
+  const auto indices = span_of(triangles);
+  require(std::all_of(indices.begin(), indices.end(), is_index),
+          "triangles: indices must be from 0 to " + std::to_string(count - 1));
+}
+
+void check_points(const Points& points) {
   for (std::size_t i = 0; i < points.shape(0); ++i) {
-    if (!(points(i, 2) > 0.0))
-      throw std::invalid_argument("points: depth must be above 0, and is not at point " +
-                                  std::to_string(i));
+    require(points(i, 2) > 0.0,
+            "points: depth must be above 0, and is not at point " + std::to_string(i));
   }
-  const auto count = static_cast<std::int32_t>(points.shape(0));
-  const std::int32_t* indices = triangles.data();
-  if (std::any_of(indices, indices + triangles.size(),
-                  [=](std::int32_t v) { return v < 0 || v >= count; }))
-    throw std::invalid_argument("triangles: indices must be from 0 to " +
-                                std::to_string(count - 1));
+}
+
+void check_window(raster::Window window, int grid) {
+  require(window.width >= 1 && window.height >= 1 && grid >= 1 && grid <= 64,
+          "window and grid: sizes must be at least 1, and grid at most 64");
+}
+
+void check_seen(const Seen& seen, const raster::VisibleTriangles& visible,
+                std::size_t triangle_count) {
+  const auto height = static_cast<std::size_t>(visible.window.height);
+  const auto width = static_cast<std::size_t>(visible.window.width);
+  require(seen.shape(0) == height * visible.grid && seen.shape(1) == width * visible.grid,
+          "seen: must have grid x grid samples a pixel of the window");
+  const auto count = static_cast<std::int32_t>(triangle_count);
+  const auto is_triangle = [=](std::int32_t number) { return number < count; };
+  require(std::all_of(visible.numbers.begin(), visible.numbers.end(), is_triangle),
+          "seen: triangles must be below " + std::to_string(count));
+}
+
+void check_texels(const Texels& texels, int count) {
+  require(texels.shape(0) == texels.shape(1) && texels.shape(0) >= 2 && count >= 1 &&
+              texels.shape(2) >= static_cast<std::size_t>(3 * count),
+          "texels: must be of shape (size, size, channels), channels at least 3 count");
+}
+
+void check_radii(const Plane& radii, const Colors& values) {
+  const auto all = span_of(radii);
+  const bool is_positive = std::all_of(all.begin(), all.end(), [](float r) { return r >= 0.0f; });
+  require(radii.shape(0) == values.shape(0) && radii.shape(1) == values.shape(1) && is_positive,
+          "down and across: radii must be at least 0, and one for each pixel");
 }
 
 raster::Window as_window(const WindowTuple& window) {
@@ -68,133 +110,129 @@ raster::Window as_window(const WindowTuple& window) {
   return {left, top, width, height};
 }
 
-auto visible(const Points& points, const Triangles& triangles, const WindowTuple& window,
-             int grid) {
-  check(points, triangles, window, grid);
-  const raster::Window part = as_window(window);
+raster::Mesh as_mesh(const Points& points, const Triangles& triangles) {
+  check_points(points);
+  check_triangles(triangles, points.shape(0));
+  return {rows_of<raster::Projected>(points), rows_of<raster::Triangle>(triangles)};
+}
+
+raster::Part as_part(const Colors& albedo, const WindowTuple& tuple, std::size_t colors) {
+  const raster::Window window = as_window(tuple);
+  require(window.width >= 0 && window.height >= 0 &&
+              albedo.shape(0) == static_cast<std::size_t>(window.height) &&
+              albedo.shape(1) == static_cast<std::size_t>(window.width) &&
+              albedo.shape(2) == colors,
+          "albedo: must be of the shape of its window, and of three colours a picture");
+  return {window, span_of(albedo)};
+}
+
+// ---- Functions
+// -----------------------------------------------------------------------------------
+
+auto visible(const Points& points, const Triangles& triangles, const WindowTuple& tuple, int grid) {
+  const raster::Window window = as_window(tuple);
+  check_window(window, grid);
+  const raster::Mesh mesh = as_mesh(points, triangles);
   std::vector<std::int32_t> seen;
   {
     nb::gil_scoped_release release;
-    seen = raster::visible(rows_of<raster::Projected>(points), rows_of<raster::Triangle>(triangles),
-                           part, grid);
+    seen = raster::visible(mesh, window, grid);
   }
-  const auto height = static_cast<std::size_t>(part.height * grid),
-             width = static_cast<std::size_t>(part.width * grid);
-  return handed_over<std::int32_t, nb::shape<-1, -1>>(std::move(seen), {height, width});
+  const auto height = static_cast<std::size_t>(window.height * grid);
+  const auto width = static_cast<std::size_t>(window.width * grid);
+  return to_array<std::int32_t, nb::shape<-1, -1>>(std::move(seen), {height, width});
 }
 
 auto albedo(const Seen& seen, const Points& points, const Triangles& triangles,
             const Coordinates& coordinates, int end, const Texels& texels, int count,
-            const WindowTuple& window, int grid) {
-  check(points, triangles, window, grid);
-  const raster::Window part = as_window(window);
-  const auto height = static_cast<std::size_t>(part.height),
-             width = static_cast<std::size_t>(part.width);
-  if (seen.shape(0) != height * grid || seen.shape(1) != width * grid)
-    throw std::invalid_argument("seen: must have grid x grid samples a pixel of the window");
-  const auto triangle_count = static_cast<std::int32_t>(triangles.shape(0));
-  if (std::any_of(seen.data(), seen.data() + seen.size(),
-                  [=](std::int32_t t) { return t >= triangle_count; }))
-    throw std::invalid_argument("seen: triangles must be below " + std::to_string(triangle_count));
-  if (coordinates.shape(0) != points.shape(0) || end < 0 || end > triangle_count)
-    throw std::invalid_argument("coordinates and end: must be those of the points and triangles");
-  if (texels.shape(0) != texels.shape(1) || texels.shape(0) < 2 || count < 1 ||
-      texels.shape(2) < static_cast<std::size_t>(3 * count))
-    throw std::invalid_argument(
-        "texels: must be of shape (size, size, channels), channels at least 3 count");
-  const raster::Textures textures{{texels.data(), texels.size()},
-                                  static_cast<int>(texels.shape(0)),
-                                  static_cast<int>(texels.shape(2)),
-                                  count};
+            const WindowTuple& tuple, int grid) {
+  const raster::Window window = as_window(tuple);
+  check_window(window, grid);
+  const raster::Mesh mesh = as_mesh(points, triangles);
+  const raster::VisibleTriangles visible{span_of(seen), window, grid};
+  check_seen(seen, visible, triangles.shape(0));
+  const bool is_end = end >= 0 && static_cast<std::size_t>(end) <= triangles.shape(0);
+  require(coordinates.shape(0) == points.shape(0) && is_end,
+          "coordinates and end: must be those of the points and triangles");
+  check_texels(texels, count);
+  const raster::Textures textures{.texels = span_of(texels),
+                                  .size = static_cast<int>(texels.shape(0)),
+                                  .channels = static_cast<int>(texels.shape(2)),
+                                  .count = count};
   raster::Albedo result;
   {
     nb::gil_scoped_release release;
-    result =
-        raster::albedo({seen.data(), seen.size()}, rows_of<raster::Projected>(points),
-                       rows_of<raster::Triangle>(triangles),
-                       rows_of<raster::TextureCoordinate>(coordinates), end, textures, part, grid);
+    const auto uv = rows_of<raster::TextureCoordinate>(coordinates);
+    result = raster::albedo(visible, mesh, uv, end, textures);
   }
+  const auto height = static_cast<std::size_t>(window.height);
+  const auto width = static_cast<std::size_t>(window.width);
+  const auto pictures = static_cast<std::size_t>(count);
+  const auto triangle_count = static_cast<std::size_t>(end);
   return std::make_tuple(
-      handed_over<float, nb::shape<-1, -1>>(std::move(result.coverage), {height, width}),
-      handed_over<float, nb::shape<-1, -1, -1, 3>>(
-          std::move(result.mean), {height, width, static_cast<std::size_t>(count), 3}),
-      handed_over<std::int32_t, nb::shape<-1>>(std::move(result.hits),
-                                               {static_cast<std::size_t>(end)}),
-      handed_over<float, nb::shape<-1, 3>>(std::move(result.overall),
-                                           {static_cast<std::size_t>(count), 3}),
-      result.area);
+      to_array<float, nb::shape<-1, -1>>(std::move(result.coverage), {height, width}),
+      to_array<float, nb::shape<-1, -1, -1, 3>>(std::move(result.mean),
+                                                {height, width, pictures, 3}),
+      to_array<std::int32_t, nb::shape<-1>>(std::move(result.hits), {triangle_count}),
+      to_array<float, nb::shape<-1, 3>>(std::move(result.overall), {pictures, 3}), result.area);
 }
 
-raster::Part part(const Colors& albedo, const WindowTuple& window, std::size_t colors) {
-  const raster::Window place = as_window(window);
-  if (place.width < 0 || place.height < 0 ||
-      albedo.shape(0) != static_cast<std::size_t>(place.height) ||
-      albedo.shape(1) != static_cast<std::size_t>(place.width) || albedo.shape(2) != colors)
-    throw std::invalid_argument(
-        "albedo: must be of the shape of its window, and of three colours a picture");
-  return {place, {albedo.data(), albedo.size()}};
-}
-
-void compose(const Halves& shading, std::tuple<float, float, float> albedos,
-             const Input<float, nb::shape<-1>>& overall, const Plane& coverage, const Colors& mean,
-             const WindowTuple& window, const Colors& reflected,
-             const WindowTuple& reflected_window, const Input<float, nb::shape<-1, -1, 3>>& floor,
+void compose(const Halves& shading, std::tuple<float, float, float> albedos, const Values& overall,
+             const Plane& coverage, const Colors& mean, const WindowTuple& window,
+             const Colors& reflected, const WindowTuple& reflected_window, const Floor& floor,
              Pictures pictures) {
-  const std::size_t height = pictures.shape(1), width = pictures.shape(2), colors = overall.size();
+  const std::size_t height = pictures.shape(1);
+  const std::size_t width = pictures.shape(2);
+  const std::size_t colors = overall.size();
+  // Pixels of the light across one of a picture.
   const std::size_t fine = height > 0 ? shading.shape(0) / height : 0;
-  if (colors != 3 * pictures.shape(0) || shading.shape(0) != fine * height ||
-      shading.shape(1) != fine * width || floor.shape(0) != height || floor.shape(1) != width)
-    throw std::invalid_argument(
-        "shading, overall, floor and pictures: must be of one size, or a multiple of it, and "
-        "colours");
-  if (pictures.stride(3) != 1 || pictures.stride(2) != 3 ||
-      pictures.stride(1) != static_cast<std::int64_t>(3 * width))
-    throw std::invalid_argument("pictures: each must be contiguous");
-  const raster::Part cloth = part(mean, window, colors),
-                     mirrored = part(reflected, reflected_window, colors);
-  if (coverage.shape(0) != mean.shape(0) || coverage.shape(1) != mean.shape(1))
-    throw std::invalid_argument("coverage: must be of the shape of its window");
-  const raster::Shading light{{shading.data(), shading.size()},
-                              static_cast<int>(width),
-                              static_cast<int>(height),
-                              static_cast<int>(fine),
-                              std::get<0>(albedos),
-                              std::get<1>(albedos),
-                              std::get<2>(albedos)};
+  require(colors == 3 * pictures.shape(0) && shading.shape(0) == fine * height &&
+              shading.shape(1) == fine * width && floor.shape(0) == height &&
+              floor.shape(1) == width,
+          "shading, overall, floor and pictures: must be of one size, or a multiple of it, and "
+          "colours");
+  require(pictures.stride(3) == 1 && pictures.stride(2) == 3 &&
+              pictures.stride(1) == static_cast<std::int64_t>(3 * width),
+          "pictures: each must be contiguous");
+  const raster::Layers layers{.overall = span_of(overall),
+                              .cloth = as_part(mean, window, colors),
+                              .coverage = span_of(coverage),
+                              .reflected = as_part(reflected, reflected_window, colors),
+                              .floor = span_of(floor)};
+  require(coverage.shape(0) == mean.shape(0) && coverage.shape(1) == mean.shape(1),
+          "coverage: must be of the shape of its window");
+  const auto [camera, bright, dark] = albedos;
+  const raster::Shading light{.light = span_of(shading),
+                              .width = static_cast<int>(width),
+                              .height = static_cast<int>(height),
+                              .fine = static_cast<int>(fine),
+                              .camera = camera,
+                              .bright = bright,
+                              .dark = dark};
   nb::gil_scoped_release release;
-  raster::compose(light, {overall.data(), overall.size()}, cloth,
-                  {coverage.data(), coverage.size()}, mirrored, {floor.data(), floor.size()},
-                  pictures.data(), static_cast<std::size_t>(pictures.stride(0)));
+  raster::compose(light, layers, {pictures.data(), static_cast<std::size_t>(pictures.stride(0))});
 }
 
 auto blurred(const Colors& values, const Plane& down, const Plane& across) {
-  const std::size_t height = values.shape(0), width = values.shape(1), count = values.shape(2);
-  for (const Plane* radius : {&down, &across})
-    if (radius->shape(0) != height || radius->shape(1) != width ||
-        std::any_of(radius->data(), radius->data() + radius->size(),
-                    [](float r) { return !(r >= 0.0f); }))
-      throw std::invalid_argument(
-          "down and across: radii must be at least 0, and one for each pixel");
+  check_radii(down, values);
+  check_radii(across, values);
+  const raster::Image image{.values = span_of(values),
+                            .width = static_cast<int>(values.shape(1)),
+                            .height = static_cast<int>(values.shape(0)),
+                            .count = static_cast<int>(values.shape(2))};
   std::vector<float> result;
   {
     nb::gil_scoped_release release;
-    result = raster::blurred({values.data(), values.size()}, {down.data(), down.size()},
-                             {across.data(), across.size()}, static_cast<int>(width),
-                             static_cast<int>(height), static_cast<int>(count));
+    result = raster::blurred(image, span_of(down), span_of(across));
   }
-  return handed_over<float, nb::shape<-1, -1, -1>>(std::move(result), {height, width, count});
+  return to_array<float, nb::shape<-1, -1, -1>>(
+      std::move(result), {values.shape(0), values.shape(1), values.shape(2)});
 }
 
 auto normals(const Points& points, const Triangles& triangles) {
-  const auto count = static_cast<std::int32_t>(points.shape(0));
-  const std::int32_t* indices = triangles.data();
-  if (std::any_of(indices, indices + triangles.size(),
-                  [=](std::int32_t v) { return v < 0 || v >= count; }))
-    throw std::invalid_argument("triangles: indices must be from 0 to " +
-                                std::to_string(count - 1));
-  return handed_over<double, nb::shape<-1, 3>>(
-      raster::normals({points.data(), points.size()}, rows_of<raster::Triangle>(triangles)),
-      {points.shape(0), 3});
+  check_triangles(triangles, points.shape(0));
+  return to_array<double, nb::shape<-1, 3>>(
+      raster::normals(span_of(points), rows_of<raster::Triangle>(triangles)), {points.shape(0), 3});
 }
 
 }  // namespace

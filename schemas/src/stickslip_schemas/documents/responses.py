@@ -61,7 +61,10 @@ class Progress(Document):
     planned: int = Field(description="planned samples; `done` and `total` count only their tasks")
     stages: dict[Stage, StageProgress]
     eta: Eta | None = Field(
-        description="null before the first measurement, and when nothing remains"
+        description=(
+            "null before the first measurement, when nothing remains, and in the answer to a "
+            "submission"
+        )
     )
 
 

@@ -102,10 +102,11 @@ def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) ->
 
     Each picture lasts 120 ms.
 
-    With `side`, pictures are reduced to that width [px].
+    With `side`, larger pictures are reduced until their longer side has so many pixels.
     """
-    width = pictures.shape[2] if side is None else side
-    height = round(width * pictures.shape[1] / pictures.shape[2])
+    height, width = pictures.shape[1:3]
+    if side is not None:
+        width, height = _reduced_size((width, height), side)
     frames = [_reduced(picture, (width, height)) for picture in pictures]
     file = io.BytesIO()
     frames[0].save(
@@ -122,14 +123,34 @@ def moving(pictures: Pictures, *, side: int | None = None, quality: int = 75) ->
 
 
 def labelled(pictures: Pictures, text: str, side: int) -> Pictures:
-    """Return pictures (n, height, width, 3) as squares of `side` pixels with a text above."""
+    """Return pictures (n, height, width, 3) as squares of `side` pixels with a text above.
+
+    A picture of another shape has white beside it.
+    """
     from PIL import Image, ImageDraw
 
-    small = [np.asarray(_reduced(picture, (side, side))) for picture in pictures]
+    height, width = pictures.shape[1:3]
+    reduced_width, reduced_height = _reduced_size((width, height), side)
+    left = (side - reduced_width) // 2
+    top = (side - reduced_height) // 2
+    small = np.full((len(pictures), side, side, 3), 255, dtype=np.uint8)
+    for square, picture in zip(small, pictures, strict=True):
+        reduced = _reduced(picture, (reduced_width, reduced_height))
+        square[top : top + reduced_height, left : left + reduced_width] = np.asarray(reduced)
     label = Image.new("RGB", (side, _LABEL_HEIGHT), (255, 255, 255))
     ImageDraw.Draw(label).text((2, 0), text, fill=(0, 0, 0), font_size=9)
     strip = np.broadcast_to(np.asarray(label), (len(small), _LABEL_HEIGHT, side, 3))
-    return np.concatenate([strip, np.stack(small)], axis=1)
+    return np.concatenate([strip, small], axis=1)
+
+
+def _reduced_size(size: tuple[int, int], side: int) -> tuple[int, int]:
+    """Return the size (width, height) of a reduced picture whose longer side is `side` [px].
+
+    A picture that is smaller keeps its size.
+    """
+    width, height = size
+    scale = min(1.0, side / max(size))
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _reduced(picture: Pictures, size: tuple[int, int]) -> "Image.Image":

@@ -37,7 +37,7 @@ from stickslip_schemas.spec.axes import (
     SobolAxis,
     quantity,
 )
-from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.cameras import Camera, load_rig, rig_cameras, rig_digest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, SeedRule, Simulation
 from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, name_schema
 
@@ -239,7 +239,10 @@ class ClothDragSpec(ClipSpec):
         return (super().render_settings() or {}) | {"rig": RIG, "rig_digest": rig_digest(RIG)}
 
     def cameras(self) -> tuple[Camera, ...]:
-        return (*load_rig(RIG), *(camera.camera(name) for name, camera in self.viewpoints.items()))
+        return (
+            *rig_cameras(RIG, self.resolution),
+            *(camera.camera(name, self.resolution) for name, camera in self.viewpoints.items()),
+        )
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         # Labels of factors say what their axes say.

@@ -61,7 +61,7 @@ from stickslip_schemas.spec.axes import (
     extremes,
     quantity,
 )
-from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_digest
+from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_cameras, rig_digest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, SeedRule, Simulation, StartFault
 from stickslip_schemas.spec.names import CustomName, FloorNumbers, LampNumbers, did_you_mean
 
@@ -375,9 +375,11 @@ class ClothSceneSpec(ClipSpec):
         Cameras that frame all that moves differ from sample to sample and are not among them.
         """
         looks_cameras = self.stage.looks.cameras
-        rig = load_rig(looks_cameras) if isinstance(looks_cameras, str) else ()
+        rig: tuple[Camera, ...] = ()
+        if isinstance(looks_cameras, str):
+            rig = rig_cameras(looks_cameras, self.resolution)
         views = {**self._scene_definitions["viewpoint"], **self.viewpoints}
-        return (*rig, *(view.camera(name) for name, view in views.items()))
+        return (*rig, *(view.camera(name, self.resolution) for name, view in views.items()))
 
     @property
     def artifacts(self) -> dict[str, Sha256]:

@@ -1,10 +1,11 @@
 """Rods that hang from a clamp under their own weight, seen by four cameras."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from stickslip_schemas.base import Document, Float, Sha256
+from stickslip_schemas.base import Document, Float, Sha256, Stage
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import (
     SHORTHAND,
@@ -16,8 +17,14 @@ from stickslip_schemas.spec.axes import (
     SobolAxis,
     quantity,
 )
-from stickslip_schemas.spec.cameras import Camera, load_rig, rig_digest
+from stickslip_schemas.spec.cameras import Camera, rig_cameras, rig_digest
 from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render, SeedRule, Simulation
+from stickslip_schemas.spec.resolution import (
+    DEFAULT_RESOLUTION,
+    Resolution,
+    is_default,
+    resolution_field,
+)
 
 ROD_PRESET = "rods"
 """Stands for the rod solver, which has no presets to choose from."""
@@ -88,6 +95,13 @@ class RodHangSpec(JobSpec):
     views: Literal["rod-4"] | None = Field(
         default="rod-4", description="camera rig; null renders nothing"
     )
+    resolution: Resolution = resolution_field(
+        "width and height of the pictures [px], 64 to 1,920 each; the cameras of the rig show the "
+        "whole rod in all of them",
+        json_schema_extra={
+            "x-cost": "CPU time of a view grows with the square of the shorter side"
+        },
+    )
     quality: Quality = Field(
         default=Quality.standard,
         description="quality of the pictures",
@@ -115,17 +129,31 @@ class RodHangSpec(JobSpec):
         # Shapes alone are a dataset, too.
         if self.views is None:
             return None
-        return {"rig": self.views, "rig_digest": rig_digest(self.views), "quality": self.quality}
+        return {
+            "rig": self.views,
+            "rig_digest": rig_digest(self.views),
+            "quality": self.quality,
+            "resolution": self.resolution,
+        }
 
     @property
     def default_costs(self) -> Costs:
         """CPU times of the packaged records."""
         # CPU time of a view by quality [s], fitted to `benchmarks/job_costs.py`; there are four.
         view = {"preview": 0.016, "draft": 0.026, "standard": 0.055, "high": 0.18}[self.quality]
+        # The rod, and so its window, grows with the shorter side.
+        view *= (min(self.resolution) / min(DEFAULT_RESOLUTION)) ** 2
         return Costs(simulate=0.001, render=4 * view, renderer_start=0.3)
 
+    def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
+        group = super().cost_group(stage, point)
+        if stage is not Stage.render or is_default(self.resolution):
+            return group
+        width, height = self.resolution
+        return f"{group}, {width} x {height}"
+
     def cameras(self) -> tuple[Camera, ...]:
-        return () if self.views is None else load_rig(self.views)
+        return () if self.views is None else rig_cameras(self.views, self.resolution)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         # Curves are sampled at as many points as the simulation document says.
@@ -136,7 +164,8 @@ class RodHangSpec(JobSpec):
             ("frame", {"xyz": 3, "director": 3}, "columns d1 (tangent), d2, d3"),
         )
         # One picture for each camera of the rig.
-        pixels = {"view": len(self.cameras()), "y": 224, "x": 224, "rgb": 3}
+        width, height = self.resolution
+        pixels = {"view": len(self.cameras()), "y": height, "x": width, "rgb": 3}
         pictures = (
             array("views", "sRGB pictures", "uint8", pixels, per_sample=True),
             array("color", "colour of the rod, linear RGB, 0 to 1", "float32", {"rgb": 3}),

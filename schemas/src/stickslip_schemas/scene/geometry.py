@@ -1,4 +1,4 @@
-"""Geometry of triangles: which cross, and which points lie on them.
+"""Geometry of triangles: which cross, which points lie on them, and which a ray meets first.
 
 Candidates come from two trees of boxes, so that the cost grows with the number of triangles, not
 with its square.
@@ -6,6 +6,8 @@ with its square.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +18,15 @@ Integers = npt.NDArray[np.int64]
 CANDIDATES_AT_ONCE = 100_000
 """Candidates that are compared in one operation: bounds the memory to about 100 MB."""
 
+EDGE_SLACK = 1e-12
+"""Share of a triangle beyond its edge at which a ray still meets it: rounding leaves no gap there.
+"""
+
 MORTON_BITS = 10
 """Bits of each coordinate of a Morton code: boxes that are neighbours in it are near each other."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """Triangles of one sheet or body."""
 
@@ -30,10 +36,15 @@ class TriangleMesh:
     triangles: Integers
     """(T, 3)"""
 
-    @property
+    @cached_property
     def corners(self) -> Floats:
         """(T, 3, 3) [m]: the positions of the corners of each triangle."""
         return self.vertices[self.triangles]
+
+    @cached_property
+    def tree(self) -> "BoxTree":
+        """The boxes of the triangles."""
+        return BoxTree(self.corners.min(axis=1), self.corners.max(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,19 +133,19 @@ def overlapping_boxes(one: BoxTree, other: BoxTree) -> Iterator[tuple[Integers, 
             waiting.append((i[begin:end], j[begin:end], level_one, level_other))
 
 
-def _tree_of(mesh: TriangleMesh, margin: float = 0.0) -> BoxTree:
-    corners = mesh.corners
-    return BoxTree(corners.min(axis=1) - margin, corners.max(axis=1) + margin)
-
-
 # ---- Crossings
 
 
-def find_crossing(one: TriangleMesh, other: TriangleMesh) -> Crossing | None:
-    """Return two triangles of two meshes that cross; None if none do."""
+def find_crossing(
+    one: TriangleMesh, other: TriangleMesh, *, batches: int | None = None
+) -> Crossing | None:
+    """Return two triangles of two meshes that cross; None if none do.
+
+    `batches` ends the search after so many batches of candidates, where another fault is known.
+    """
     corners_one = one.corners
     corners_other = other.corners
-    for i, j in overlapping_boxes(_tree_of(one), _tree_of(other)):
+    for i, j in islice(overlapping_boxes(one.tree, other.tree), batches):
         crosses = _cross(corners_one[i], corners_other[j])
         if crosses.any():
             return _crossing(i, j, crosses, corners_one)
@@ -144,8 +155,7 @@ def find_crossing(one: TriangleMesh, other: TriangleMesh) -> Crossing | None:
 def find_self_crossing(mesh: TriangleMesh) -> Crossing | None:
     """Return two triangles of one mesh that cross and share no vertex; None if none do."""
     corners = mesh.corners
-    tree = _tree_of(mesh)
-    for i, j in overlapping_boxes(tree, tree):
+    for i, j in overlapping_boxes(mesh.tree, mesh.tree):
         # Neighbours meet at the vertices that they share, which is no crossing.
         pairs = mesh.triangles[i][:, :, None] == mesh.triangles[j][:, None, :]
         apart = (i < j) & ~pairs.any(axis=(1, 2))
@@ -167,35 +177,47 @@ def _crossing(
 def _cross(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an edge of either triangle pierces the other: (N,), of corners (N, 3, 3)."""
     pierces = np.zeros(len(one), dtype=bool)
-    for triangle, cutter in ((one, other), (other, one)):
+    for triangles, cutters in ((one, other), (other, one)):
+        # Most neighbours lie on one side of each other's plane, and are done with here.
+        sides = _sides(cutters, triangles)
+        straddling = np.flatnonzero((sides.min(axis=1) < 0.0) & (sides.max(axis=1) > 0.0))
         for corner in range(3):
-            begin = cutter[:, corner]
-            end = cutter[:, (corner + 1) % 3]
-            pierces |= _pierces(begin, end, triangle)
+            after = (corner + 1) % 3
+            through = straddling[sides[straddling, corner] * sides[straddling, after] < 0.0]
+            begin = cutters[through, corner]
+            pierces[through] |= _passes(begin, cutters[through, after] - begin, triangles[through])
     return pierces
 
 
-def _pierces(begin: Floats, end: Floats, triangle: Floats) -> npt.NDArray[np.bool_]:
-    """Return whether segments (N, 3) go through triangles (N, 3, 3), or through their borders."""
-    a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
-    normal = np.cross(b - a, c - a)
-    side_begin = _dot(begin - a, normal)
-    side_end = _dot(end - a, normal)
+def _sides(points: Floats, triangles: Floats) -> Floats:
+    """Return on which side of the planes of triangles (N, 3, 3) points (N, 3, 3) are: (N, 3)."""
+    first = triangles[:, :1]
+    normals = _cross_product(triangles[:, 1] - first[:, 0], triangles[:, 2] - first[:, 0])
+    return np.asarray(np.einsum("nij,nj->ni", points - first, normals))
+
+
+def _passes(begin: Floats, way: Floats, triangles: Floats) -> npt.NDArray[np.bool_]:
+    """Return whether lines from `begin` along `way`, (N, 3) each, pass through triangles (N, 3, 3).
+
+    The border counts.
+    """
     # The line passes on the same side of all three edges if it passes through the triangle.
-    way = end - begin
-    volumes = np.stack(
-        [
-            _dot(way, np.cross(a - begin, b - begin)),
-            _dot(way, np.cross(b - begin, c - begin)),
-            _dot(way, np.cross(c - begin, a - begin)),
-        ]
-    )
-    inside = (volumes >= 0.0).all(axis=0) | (volumes <= 0.0).all(axis=0)
-    return inside & (side_begin * side_end < 0.0)
+    a, b, c = (triangles[:, corner] - begin for corner in range(3))
+    volumes = np.stack([_dot(way, _cross_product(p, q)) for p, q in ((a, b), (b, c), (c, a))])
+    return np.asarray((volumes >= 0.0).all(axis=0) | (volumes <= 0.0).all(axis=0))
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.einsum("ij,ij->i", a, b))
+
+
+def _cross_product(a: Floats, b: Floats) -> Floats:
+    """Return a x b of rows (N, 3); `np.cross` copies more than it computes."""
+    out = np.empty_like(a)
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        out[:, axis] = a[:, after] * b[:, last] - a[:, last] * b[:, after]
+    return out
 
 
 # ---- Distances
@@ -208,7 +230,7 @@ def find_touch(points: Floats, mesh: TriangleMesh, reach: float) -> Touch | None
     """
     corners = mesh.corners
     tree_of_points = BoxTree(points - reach, points + reach)
-    for i, j in overlapping_boxes(tree_of_points, _tree_of(mesh)):
+    for i, j in overlapping_boxes(tree_of_points, mesh.tree):
         distances = _distances(points[i], corners[j])
         near = distances < reach
         if near.any():
@@ -220,7 +242,7 @@ def find_touch(points: Floats, mesh: TriangleMesh, reach: float) -> Touch | None
 def _distances(points: Floats, triangles: Floats) -> Floats:
     """Return the distances (N,) [m] of points (N, 3) from triangles (N, 3, 3)."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normal = np.cross(b - a, c - a)
+    normal = _cross_product(b - a, c - a)
     length = np.sqrt(_dot(normal, normal))
     height = np.abs(_dot(points - a, normal)) / np.maximum(length, 1e-300)
     # Where the foot is outside of the triangle, the nearest point is on an edge.
@@ -229,8 +251,53 @@ def _distances(points: Floats, triangles: Floats) -> Floats:
     for begin, end in ((a, b), (b, c), (c, a)):
         edge = end - begin
         offset = points - begin
-        inside &= _dot(np.cross(edge, offset), normal) >= 0.0
+        inside &= _dot(_cross_product(edge, offset), normal) >= 0.0
         fraction = _dot(offset, edge) / np.maximum(_dot(edge, edge), 1e-300)
         foot = begin + np.clip(fraction, 0.0, 1.0)[:, None] * edge
         nearest = np.minimum(nearest, np.linalg.norm(points - foot, axis=1))
     return np.where(inside, height, nearest)
+
+
+# ---- Rays
+
+
+def ray_lengths(mesh: TriangleMesh, points: Floats, direction: Floats, farthest: float) -> Floats:
+    """Return how far rays from points (N, 3) go until they meet a mesh, (N,) [m]; inf: never.
+
+    Args:
+        mesh: The triangles.
+        points: Where the rays begin [m].
+        direction: Of all rays, of length 1: (3,).
+        farthest: Length at which rays end [m].
+    """
+    # In axes of which the last is along the rays, a ray meets what it meets seen from its end.
+    axes = np.linalg.svd(direction[None])[2][[1, 2, 0]]
+    axes[2] = direction
+    seen = TriangleMesh(mesh.vertices @ axes.T, mesh.triangles)
+    starts = points @ axes.T
+    lengths = np.full(len(points), np.inf)
+    rays = BoxTree(starts, starts + np.array([0.0, 0.0, farthest]))
+    for i, j in overlapping_boxes(rays, seen.tree):
+        heights = _heights(starts[i, :2], seen.corners[j])
+        ahead = heights >= starts[i, 2]
+        np.minimum.at(lengths, i[ahead], heights[ahead] - starts[i[ahead], 2])
+    return np.where(lengths <= farthest, lengths, np.inf)
+
+
+def _heights(places: Floats, triangles: Floats) -> Floats:
+    """Return the height of triangles (N, 3, 3) at places (N, 2); NaN beside them, or upright."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    doubled = _turn(b - a, c - a)
+    # The weight of a corner is the share of the triangle that the place cuts off opposite of it.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight_b = _turn(places - a[:, :2], c - a) / doubled
+        weight_c = _turn(b - a, places - a[:, :2]) / doubled
+        weight_a = 1.0 - weight_b - weight_c
+        height = weight_a * a[:, 2] + weight_b * b[:, 2] + weight_c * c[:, 2]
+    inside = np.minimum(np.minimum(weight_a, weight_b), weight_c) >= -EDGE_SLACK
+    return np.where(inside, height, np.nan)
+
+
+def _turn(a: Floats, b: Floats) -> Floats:
+    """Return the cross product of the first two coordinates of rows: (N,)."""
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

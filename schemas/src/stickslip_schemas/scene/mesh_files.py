@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from stickslip_schemas.scene.errors import UnfitFileError
+from stickslip_schemas.scene.plain_obj import read_tables
 from stickslip_schemas.scene.polygons import Floats, Indices
 
 FARTHEST = 100.0
@@ -161,6 +162,20 @@ def obj_text(data: bytes) -> bytes:
 
 def _read_obj(data: bytes, *, with_pattern: bool) -> Polygons:
     text = obj_text(data)
+    tables = read_tables(text, with_pattern=with_pattern, farthest=FARTHEST)
+    if tables is None:
+        return _read_obj_lines(text, with_pattern=with_pattern)
+    if not with_pattern:
+        return Polygons(tables.positions, tables.corners, tables.sizes)
+    pattern = np.full((len(tables.positions), 2), np.nan)
+    contradiction = _fill_pattern(pattern, tables.texture, tables.corners, tables.corner_textures)
+    # Only lines can name the one with the second texture coordinate.
+    if contradiction is not None:
+        return _read_obj_lines(text, with_pattern=True)
+    return Polygons(tables.positions, tables.corners, tables.sizes, pattern)
+
+
+def _read_obj_lines(text: bytes, *, with_pattern: bool) -> Polygons:
     positions: list[list[float]] = []
     texture: list[list[float]] = []
     corners: list[int] = []
@@ -190,7 +205,12 @@ def _read_obj(data: bytes, *, with_pattern: bool) -> Polygons:
     pattern = None
     if with_pattern and sizes:
         pattern = np.full((len(positions), 2), np.nan)
-        wrong_corner = _fill_pattern(pattern, np.array(texture), corners, corner_textures)
+        wrong_corner = _fill_pattern(
+            pattern,
+            np.array(texture),
+            np.array(corners, dtype=np.int64),
+            np.array(corner_textures, dtype=np.int64),
+        )
         if wrong_corner is not None:
             face = int(np.searchsorted(np.cumsum(sizes), wrong_corner, side="right"))
             raise UnfitFileError(
@@ -241,14 +261,13 @@ def _texture_index(word: bytes, count: int) -> int:
 
 
 def _fill_pattern(
-    pattern: Floats, texture: Floats, corners: list[int], corner_textures: list[int]
+    pattern: Floats, texture: Floats, vertices: Indices, indices: Indices
 ) -> int | None:
     """Write the flat pattern (N, 2) of a file; return a corner that contradicts another one.
 
-    Raises UnfitFileError if a vertex has no texture coordinate.
+    `vertices` and `indices` (C,) are the vertex and the texture coordinate of each corner, -1
+    without one. Raises UnfitFileError if a vertex has no texture coordinate.
     """
-    vertices = np.array(corners, dtype=np.int64)
-    indices = np.array(corner_textures, dtype=np.int64)
     with_texture = np.flatnonzero(indices >= 0)
     if len(with_texture):
         coordinates = texture[indices[with_texture]]

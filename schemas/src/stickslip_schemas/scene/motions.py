@@ -106,30 +106,37 @@ class Track:
             + slope_end * s * s * (s - 1.0)
         )
 
-    def unevenness(self, step: float, radius: float) -> tuple[float, float]:
+    def unevenness(self, step: float, radius: float, end: float) -> tuple[float, float]:
         """Return the time and size of the largest distance from an even motion within a step.
 
         Args:
             step: Length of the step [s].
             radius: Distance of what moves from the middle that it turns about [m].
+            end: When the scene ends [s]; later steps do not count.
 
         Returns:
             The time at which it begins [s], and the distance [m].
         """
         if self._spin is not None:
-            # A turn by an angle w h leaves the chord by r (1 - cos(w h / 2)).
-            angle = min(abs(self._spin["speed"]) * step, np.pi)
-            return float(self._spin["begin"]), radius * (1.0 - float(np.cos(0.5 * angle)))
+            begin = float(self._spin["begin"])
+            angle = abs(self._spin["speed"]) * step if begin < end else 0.0
+            return begin, radius * float(_arc_height(np.array(angle)))
         half = step / SAMPLES_PER_STEP
         reach = SAMPLED_STEPS * SAMPLES_PER_STEP
         offsets = half * np.arange(-reach, reach + 1)
-        windows = np.maximum(self.times[:, None] + offsets, 0.0)
+        # Cubics bend most at the keys, and turn fastest in the middle between two.
+        instants = np.concatenate([self.times, 0.5 * (self.times[1:] + self.times[:-1])])
+        windows = np.maximum(instants[instants < end, None] + offsets, 0.0)
+        if not windows.size:
+            return 0.0, 0.0
         samples = self.at(windows.ravel()).reshape(*windows.shape, 6)
         # The second difference: how far the middle of a step is from that of its ends.
         bends = 0.5 * np.abs(samples[:, 2:] - 2.0 * samples[:, 1:-1] + samples[:, :-2])
         moved = np.linalg.norm(bends[..., :3], axis=-1)
-        turned = np.minimum(np.linalg.norm(bends[..., 3:], axis=-1), 1.0) * radius
-        size = np.maximum(moved, turned)
+        turned = np.minimum(np.linalg.norm(bends[..., 3:], axis=-1), 1.0)
+        # What turns evenly leaves the straight line between the ends of a step all the same.
+        angles = np.linalg.norm(samples[:, 2:, 3:] - samples[:, :-2, 3:], axis=-1)
+        size = np.maximum(moved, np.maximum(turned, _arc_height(angles)) * radius)
         key, sample = np.unravel_index(int(np.argmax(size)), size.shape)
         return float(windows[key, sample]), float(size[key, sample])
 
@@ -152,6 +159,11 @@ class Track:
         if self._spin is not None or np.any(self.values[:, 3:]):
             return np.empty((0, 3)), np.empty(0)
         return self.values[:, :3] - self.values[0, :3], self.times + self._ramp
+
+
+def _arc_height(angles: Floats) -> Floats:
+    """Return the height of arcs of the unit circle over their chords: 1 - cos(angle / 2)."""
+    return np.asarray(1.0 - np.cos(0.5 * np.minimum(angles, np.pi)))
 
 
 def _monotone_slopes(times: Floats, values: Floats) -> Floats:

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from stickslip_schemas.base import ARTIFACT, Bool, Document, Float, Int, is_sha256
-from stickslip_schemas.spec.arrays import CLIP_SIZE
-from stickslip_schemas.spec.cameras import Camera, rig_names, square
+from stickslip_schemas.spec.cameras import Camera, central, rig_names
 from stickslip_schemas.spec.names import (
     FARTHEST,
     LOWEST,
@@ -22,6 +21,7 @@ from stickslip_schemas.spec.names import (
     Substrate,
     did_you_mean,
 )
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
 
 SMALLEST = 1e-3
 """Least extent of a sheet or of a mesh [m]: anything smaller is taken for another unit."""
@@ -39,6 +39,22 @@ def unit_hint(extent: float) -> str:
 
 
 Length = Annotated[Float, Field(gt=0, le=100)]
+
+THINNEST = 1e-4
+"""Least radius or side of a body [m]: thinner than any needle is taken for another unit."""
+
+
+def _of_a_body(value: Any) -> Any:
+    """Return the radius or side of a body [m]; raise ValueError if it is one of another unit."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and value > 0 and not THINNEST <= value <= LARGEST:
+        raise ValueError(f"must be {THINNEST:g} to {LARGEST:g} m{unit_hint(value)}")
+    return value
+
+
+BodyLength = Annotated[Float, Field(ge=THINNEST, le=LARGEST), BeforeValidator(_of_a_body)]
+"""A radius or side of a body [m]."""
+
 Place = Annotated[Float, Field(ge=-100, le=100)]
 Vector = tuple[Place, Place, Place]
 Angle = Annotated[Float, Field(ge=-6.2832, le=6.2832, description="at most a full turn [rad]")]
@@ -187,21 +203,21 @@ class Sphere(_Placed):
     """A ball."""
 
     type: Literal["sphere"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
 
 
 class Cylinder(_Placed):
     """A cylinder without ends, whose axis is z before it is turned."""
 
     type: Literal["cylinder"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
 
 
 class Capsule(_Placed):
     """A cylinder with round ends, whose axis is z before it is turned."""
 
     type: Literal["capsule"]
-    radius: Length = Field(description="[m]")
+    radius: BodyLength = Field(description="[m]")
     length: Length = Field(description="between the middles of its ends [m]")
 
 
@@ -209,7 +225,7 @@ class Box(_Placed):
     """A box."""
 
     type: Literal["box"]
-    size: tuple[Length, Length, Length] = Field(description="of its edges [m]")
+    size: tuple[BodyLength, BodyLength, BodyLength] = Field(description="of its edges [m]")
     rounding: Float | None = Field(
         default=None,
         gt=0,
@@ -455,7 +471,10 @@ class View(Document):
     position: Vector = Field(description="[m]")
     target: Vector = Field(description="the point in the middle of the picture [m]")
     focal_length: Float = Field(
-        default=50.0, ge=10, le=400, description="for a film 36 mm wide [mm]"
+        default=50.0,
+        ge=10,
+        le=400,
+        description="for a film whose shorter side is 36 mm [mm]",
     )
 
     @model_validator(mode="after")
@@ -481,7 +500,7 @@ class View(Document):
         x, y, z = (b - a for a, b in zip(self.position, self.target, strict=True))
         return x, y, z
 
-    def camera(self, name: str) -> Camera:
+    def camera(self, name: str, resolution: tuple[int, int] = DEFAULT_RESOLUTION) -> Camera:
         """Return the calibrated camera: upright, with the principal point in the middle."""
         # Rows of the rotation are the axes of the camera: right, which is level, down and forward.
         x, y, z = (value / math.hypot(*self._forward) for value in self._forward)
@@ -489,7 +508,8 @@ class View(Document):
         rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
         # t = -R p, for the camera itself is at the origin of its axes.
         a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
-        return square(name, CLIP_SIZE, self.focal_length / FILM * CLIP_SIZE, rotation, (a, b, c))
+        focal = self.focal_length / FILM * min(resolution)
+        return central(name, resolution, focal, rotation, (a, b, c))
 
 
 class SheetLook(Document):

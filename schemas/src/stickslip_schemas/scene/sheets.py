@@ -131,9 +131,8 @@ def _least_height(rest: Floats, triangles: Integers) -> float:
     """
     edges = np.concatenate([triangles[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
     opposite = np.concatenate([triangles[:, corner] for corner in (2, 0, 1)])
-    _, group, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    _, group, counts = np.unique(low * len(rest) + high, return_inverse=True, return_counts=True)
     is_shared = counts[group.ravel()] > 1
     if not is_shared.any():
         return float("inf")
@@ -175,5 +174,8 @@ def held_vertices(
 
 def _rim(triangles: Integers) -> Integers:
     edges = np.concatenate([triangles[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0))])
-    unique, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    return np.unique(unique[counts == 1])
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    # One number for each edge, of both vertices.
+    count = int(triangles.max()) + 1
+    unique, counts = np.unique(low * count + high, return_counts=True)
+    return np.unique(np.divmod(unique[counts == 1], count))

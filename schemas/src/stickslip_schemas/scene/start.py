@@ -10,10 +10,11 @@ without the core refuses a scene before anything is queued:
     motions     no faster than the shortest steps of the preset can follow
     holders     do not tear the cloth between them
     presses     leave room for the cloth between two bodies (`presses`)
+
+A hung sheet is compared with bodies where geometry tells how it hangs (`hanging`).
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,9 @@ from stickslip_schemas.scene.geometry import (
     find_self_crossing,
     find_touch,
 )
-from stickslip_schemas.scene.motions import SHORTEST_STEPS, Track
+from stickslip_schemas.scene.hanging import hung_positions, uncertainty
+from stickslip_schemas.scene.mesh_bodies import surface_at_start
+from stickslip_schemas.scene.motion_faults import motion_faults, stretch_faults
 from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.presses import press_faults
 from stickslip_schemas.scene.shapes import start_gap
@@ -38,6 +41,11 @@ Floats = npt.NDArray[np.float64]
 MAX_EXTENT = 20.0
 """Largest length and width of all sheets, side by side [m]: `EXTENT_MAX` of the solver."""
 
+MAX_SIZE_RATIO = 3.0
+"""Lengths at the start over those of the flat pattern, or the inverse, from which units differ.
+
+The solver brings sheets of 1.4 times their size back into shape, and those of 3 times never."""
+
 MAX_DEPTH = 1e-6
 """Depth of a free vertex in a body from which the solver refuses a start [m]."""
 
@@ -46,19 +54,6 @@ LEAST_DISTANCE = 1e-7
 
 At 1 um the solver starts and pushes them apart. At 0 it has no direction, and never ends.
 """
-
-MAX_UNEVENNESS = 4.0
-"""Distance from an even motion within the shortest step, over the step error of the preset.
-
-The solver rejects a run from 1 on. It may halve a step twice more where that step does not
-converge, so only from 4 on is the end certain."""
-
-
-MAX_STRETCH = 1.25
-"""Largest stretch of a triangle in a valid run: the solver's check `stretch`."""
-
-COMPARED_VERTICES = 12
-"""Vertices of each of two holders whose distances are compared."""
 
 
 def check_start(document: Mapping[str, Any]) -> None:
@@ -80,16 +75,17 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     sheets = [start_of(name, sheet) for name, sheet in sorted(document["sheets"].items())]
     faults = list(_sheet_faults(document, sheets))
     faults += _holder_faults(document, sheets)
-    faults += _motion_faults(document, sheets)
+    end = document_end(document)
+    faults += motion_faults(document, sheets, end)
     # Geometry of a wrong unit or shape would only repeat these faults in many other words.
     if not faults:
         faults += _body_faults(document, sheets)
     if not faults:
         faults += _contact_faults(document, sheets)
     if not faults:
-        faults += _stretch_faults(document, sheets)
+        faults += stretch_faults(document, sheets, end)
     if not faults:
-        faults += press_faults(document, sheets, document_end(document))
+        faults += press_faults(document, sheets, end)
     return faults
 
 
@@ -115,6 +111,14 @@ def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iter
                 "thickness"
             )
             yield StartFault(location, rule, sheet.least_height)
+        ratio = _size_ratio(sheet)
+        if given["start"]["type"] == "file" and not 1.0 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
+            rule = (
+                "must have edges about as long as in the flat pattern, and they are "
+                f"{ratio:.3g} times as long: give both in metres (texture coordinates of most "
+                "programs go from 0 to 1)"
+            )
+            yield StartFault(("sheets", sheet.name, "start"), rule, "file")
     total = sum(float(np.ptp(sheet.rest[:, 0])) for sheet in sheets)
     if len(sheets) > 1 and total > MAX_EXTENT:
         rule = (
@@ -122,6 +126,15 @@ def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iter
             "a scene of each"
         )
         yield StartFault(("sheets",), rule, total)
+
+
+def _size_ratio(sheet: SheetStart) -> float:
+    """Return how many times as long as in the flat sheet the edges are at the start: the median."""
+    edges = sheet.mesh.triangles[:, :2]
+    begin, end = edges.T
+    lengths = np.linalg.norm(sheet.positions[end] - sheet.positions[begin], axis=1)
+    flat_lengths = np.linalg.norm(sheet.rest[end] - sheet.rest[begin], axis=1)
+    return float(np.median(lengths / np.maximum(flat_lengths, 1e-300)))
 
 
 # ---- Holders
@@ -165,43 +178,6 @@ def _area_of(holder: Mapping[str, Any]) -> Any:
     return {name: holder[name] for name in chosen if holder[name] is not None}
 
 
-# ---- Motions
-
-
-def _motion_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
-    shortest, error = SHORTEST_STEPS[document["preset"]]
-    motions: list[tuple[Location, Any, float]] = []
-    for sheet in sheets:
-        holders = document["sheets"][sheet.name]["holders"]
-        for key, holder in sorted(holders.items()):
-            points = sheet.positions[held_vertices(sheet, holder)]
-            location: Location = ("sheets", sheet.name, "holders", key, "motion")
-            motions.append((location, holder["motion"], _radius(points)))
-    for name, body in sorted(document["bodies"].items()):
-        # A plane does not move. How far a body reaches does not matter to how fast it travels.
-        motions.append((("bodies", name, "motion"), body.get("motion"), 0.0))
-    for path, motion, radius in motions:
-        if motion is None:
-            continue
-        track = Track(motion)
-        time, unevenness = track.unevenness(shortest, radius)
-        if time > document_end(document) or unevenness <= MAX_UNEVENNESS * error:
-            continue
-        rule = (
-            f"must be one that steps of {shortest:g} s follow to {error:g} m, as the preset "
-            f"{document['preset']} asks, and at {time:g} s it is {unevenness:.2g} m off an even "
-            "motion; give it more time, or a ramp"
-        )
-        yield StartFault(path, rule, {"time": time})
-
-
-def _radius(points: Floats) -> float:
-    """Return the distance of the farthest of points (K, 3) from their middle [m]."""
-    if not len(points):
-        return 0.0
-    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
-
-
 def document_end(document: Mapping[str, Any]) -> float:
     """Return the time at which a scene ends at the latest [s]."""
     end = document["end"]
@@ -214,23 +190,32 @@ def document_end(document: Mapping[str, Any]) -> float:
 def _body_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
     """Yield sheets with a free vertex inside a body that has an inside."""
     for sheet in sheets:
-        if sheet.is_hung:
+        positions = _known_positions(document, sheet)
+        if positions is None:
             continue
         free = ~_held_at_start(document, sheet)
+        least_depth = uncertainty(sheet) if sheet.is_hung else max(MAX_DEPTH, sheet.jitter)
         for name, body in sorted(document["bodies"].items()):
             if body["type"] == "mesh":
                 continue
-            depth = np.where(free, -start_gap(body, sheet.positions), -np.inf)
+            depth = np.where(free, -start_gap(body, positions), -np.inf)
             vertex = int(np.argmax(depth))
-            if depth[vertex] <= max(MAX_DEPTH, sheet.jitter):
+            if depth[vertex] <= least_depth:
                 continue
+            hangs = "where it hangs, " if sheet.is_hung else ""
             rule = (
-                f"must start outside of all bodies, and vertex {vertex} of the sheet is "
-                f"{1e3 * depth[vertex]:.3g} mm inside {name}, near {_point(sheet, vertex)}; move "
-                "the sheet or the body by more than that"
+                f"must start outside of all bodies, and {hangs}vertex {vertex} of the sheet is "
+                f"{1e3 * depth[vertex]:.3g} mm inside {name}, near "
+                f"{_coordinates(positions[vertex].tolist())}; move the sheet or the body by more "
+                "than that"
             )
             yield StartFault(("sheets", sheet.name, "origin"), rule, _origin(document, sheet))
             break
+
+
+def _known_positions(document: Mapping[str, Any], sheet: SheetStart) -> Floats | None:
+    """Return where the vertices of a sheet start (V, 3) [m]; None if only a simulation tells."""
+    return hung_positions(document, sheet) if sheet.is_hung else sheet.positions
 
 
 def _held_at_start(document: Mapping[str, Any], sheet: SheetStart) -> npt.NDArray[np.bool_]:
@@ -245,7 +230,7 @@ def _contact_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> It
     """Yield sheets that cross themselves, other sheets or triangles of bodies, or lie in them."""
     standing = [sheet for sheet in sheets if not sheet.is_hung]
     surfaces = [
-        (name, _surface_at_start(body))
+        (name, surface_at_start(body))
         for name, body in sorted(document["bodies"].items())
         if body["type"] == "mesh"
     ]
@@ -270,11 +255,42 @@ def _contact_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> It
                 location = ("sheets", sheet.name, "origin")
                 yield StartFault(location, rule, _origin(document, sheet))
                 break
+    for sheet in sheets:
+        if sheet.is_hung:
+            yield from _hung_faults(document, sheet, surfaces)
+
+
+def _hung_faults(
+    document: Mapping[str, Any], sheet: SheetStart, surfaces: list[tuple[str, TriangleMesh]]
+) -> Iterator[StartFault]:
+    """Yield the body of triangles that a hung sheet crosses wherever in its plane it may be."""
+    positions = hung_positions(document, sheet)
+    if positions is None or not surfaces:
+        return
+    # The sheet hangs in an upright plane, and crosses for certain what it crosses on both sides.
+    level = np.cross(positions[-1] - positions[0], [0.0, 0.0, 1.0])
+    shift = uncertainty(sheet) * level / max(float(np.linalg.norm(level)), 1e-300)
+    sides = [
+        TriangleMesh(positions + side * shift, sheet.mesh.triangles) for side in (0.0, -1.0, 1.0)
+    ]
+    for name, mesh in surfaces:
+        crossings = [find_crossing(side, mesh) for side in sides]
+        if crossings[0] is None or None in crossings:
+            continue
+        rule = (
+            f"must not cross body {name} where it hangs, and triangle {crossings[0].first} of the "
+            f"sheet crosses triangle {crossings[0].second} of it, near "
+            f"{_coordinates(crossings[0].point)}; move them apart"
+        )
+        yield StartFault(("sheets", sheet.name, "origin"), rule, _origin(document, sheet))
+        return
 
 
 def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh) -> str:
     """Return the rule that a sheet breaks with another thing; an empty text if it breaks none."""
-    crossing = find_crossing(sheet.mesh, mesh)
+    touch = find_touch(sheet.mesh.vertices, mesh, LEAST_DISTANCE)
+    # Two meshes that lie in each other have millions of candidates, and a fault already.
+    crossing = find_crossing(sheet.mesh, mesh, batches=None if touch is None else 1)
     if crossing is not None:
         return (
             f"must not cross {name} at the start, and triangle {crossing.first} of the sheet "
@@ -282,7 +298,6 @@ def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh) -> str:
             "them apart"
         )
     remedy = "leave half of both thicknesses between them"
-    touch = find_touch(sheet.mesh.vertices, mesh, LEAST_DISTANCE)
     if touch is not None:
         return (
             f"must not lie in {name} at the start, and vertex {touch.vertex} of the sheet is at "
@@ -300,21 +315,6 @@ def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh) -> str:
     return ""
 
 
-def _surface_at_start(body: Mapping[str, Any]) -> TriangleMesh:
-    """Return the triangles of a body where they are at 0 s."""
-    file = body["file"]
-    if "bones" in file:
-        homogeneous = np.column_stack([file["rest"], np.ones(len(file["rest"]))])
-        by_bone = np.einsum("bij,nj->nbi", file["bones"][0], homogeneous)
-        vertices = np.einsum("nb,nbi->ni", file["weights"], by_bone)
-    else:
-        vertices = np.asarray(file["positions"][0], float)
-    if body["motion"] is not None:
-        pose = Track(body["motion"]).pose_at_start(vertices.mean(axis=0))
-        vertices = vertices @ pose[:, :3].T + pose[:, 3]
-    return TriangleMesh(np.asarray(vertices, float), np.asarray(file["triangles"], np.int64))
-
-
 def _origin(document: Mapping[str, Any], sheet: SheetStart) -> Any:
     return document["sheets"][sheet.name]["origin"]
 
@@ -325,61 +325,3 @@ def _point(sheet: SheetStart, vertex: int) -> str:
 
 def _coordinates(point: Any) -> str:
     return "({}) m".format(", ".join(f"{value:.4g}" for value in point))
-
-
-# ---- Holders that tear
-
-
-def _stretch_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
-    """Yield holders that pull two vertices further apart than the cloth between them reaches."""
-    end = document_end(document)
-    for sheet in sheets:
-        holders = document["sheets"][sheet.name]["holders"]
-        always = [key for key, holder in sorted(holders.items()) if holder["grasp"] is None]
-        for key, other in combinations(always, 2):
-            time, stretch = _largest_stretch(sheet, holders[key], holders[other], end)
-            if stretch <= MAX_STRETCH:
-                continue
-            rule = (
-                f"must not stretch the cloth between it and the holder {key} to more than "
-                f"{MAX_STRETCH:g} times its length, and at {time:g} s it is {stretch:.3g} times as "
-                "long; bring the two nearer to each other, or let one go with grasp"
-            )
-            location = ("sheets", sheet.name, "holders", other, "motion")
-            yield StartFault(location, rule, {"time": time})
-
-
-def _largest_stretch(
-    sheet: SheetStart, one: Mapping[str, Any], other: Mapping[str, Any], end: float
-) -> tuple[float, float]:
-    """Return when two holders stretch the cloth between them most [s], and the stretch there.
-
-    It is a lower bound: the cloth between two vertices is no shorter than the distance of both.
-    """
-    held = [_some(np.flatnonzero(held_vertices(sheet, holder))) for holder in (one, other)]
-    if sheet.jitter or not len(held[0]) or not len(held[1]):
-        return 0.0, 0.0
-    tracks = [None if h["motion"] is None else Track(h["motion"]) for h in (one, other)]
-    times = {time for track in tracks if track for time in track.times.tolist() if time <= end}
-    # The flat sheet is the longest that the cloth between two vertices can be without a stretch.
-    lengths = np.linalg.norm(sheet.rest[held[0]][:, None] - sheet.rest[held[1]][None], axis=2)
-    largest = (0.0, 0.0)
-    for time in sorted(times):
-        points = []
-        for vertices, track, holder in zip(held, tracks, (one, other), strict=True):
-            at_start = sheet.positions[vertices]
-            middle = sheet.positions[held_vertices(sheet, holder)].mean(axis=0)
-            points.append(at_start if track is None else track.moved(at_start, middle, time))
-        distances = np.linalg.norm(points[0][:, None] - points[1][None], axis=2)
-        stretch = float((distances / np.maximum(lengths, 1e-300)).max())
-        if stretch > largest[1]:
-            largest = (time, stretch)
-    return largest
-
-
-def _some(vertices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return at most `COMPARED_VERTICES` of some vertices, evenly spread."""
-    count = min(len(vertices), COMPARED_VERTICES)
-    if not count:
-        return vertices
-    return vertices[np.linspace(0, len(vertices) - 1, count).astype(np.int64)]

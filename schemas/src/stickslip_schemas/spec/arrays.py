@@ -21,9 +21,6 @@ LABEL_CHUNK_BYTES = 2**21
 
 SAMPLE_KEY_BYTES = 32
 
-CLIP_SIZE = 224
-"""Width and height of a clip [px]."""
-
 REGIONS = {
     "cloth": "all cloth",
     "landed": "cloth within 40 mm of the floor",

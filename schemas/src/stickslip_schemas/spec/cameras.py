@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field, FiniteFloat, TypeAdapter, field_validator
 
 from stickslip_schemas.base import Document, content_key
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
 
 if TYPE_CHECKING:
     import numpy as np
@@ -194,6 +195,29 @@ class Camera(Document):
         }
         return self.straight.model_copy(update=size)
 
+    def resized(self, size: tuple[int, int]) -> Camera:
+        """Return the camera at the same place for pictures of another size (width, height) [px].
+
+        All that this camera sees stays in the picture, as large as fits. A picture of another shape
+        shows more at two of its sides.
+        """
+        width, height = size
+        if size == (self.width, self.height):
+            return self
+        scale = min(width / self.width, height / self.height)
+        # Places about the middle of the frame, where the pixel centres are whole numbers less 1/2.
+        x = self.cx - (self.width - 1) / 2
+        y = self.cy - (self.height - 1) / 2
+        intrinsics = {
+            "width": width,
+            "height": height,
+            "fx": self.fx * scale,
+            "fy": self.fy * scale,
+            "cx": (width - 1) / 2 + x * scale,
+            "cy": (height - 1) / 2 + y * scale,
+        }
+        return self.model_copy(update=intrinsics)
+
     @property
     def numbers(self) -> list[float]:
         """The numbers of the label: fx, fy, cx, cy, R by rows, t."""
@@ -232,20 +256,22 @@ class Camera(Document):
         return float(max((low - (pixels - disc)).max(), (pixels + disc - high).max()))
 
 
-def square(name: str, size: int, focal: float, rotation: Any, translation: Vector3) -> Camera:
-    """Return a camera with a square frame whose axis meets the middle of the frame.
+def central(
+    name: str, size: tuple[int, int], focal: float, rotation: Any, translation: Vector3
+) -> Camera:
+    """Return a camera whose axis meets the middle of its frame.
 
-    `size` and `focal` are in pixels.
+    `size` (width and height) and `focal` are in pixels.
     """
-    middle = (size - 1) / 2
+    width, height = size
     return Camera(
         name=name,
-        width=size,
-        height=size,
+        width=width,
+        height=height,
         fx=focal,
         fy=focal,
-        cx=middle,
-        cy=middle,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
         rotation=rotation,
         translation=translation,
     )
@@ -255,16 +281,19 @@ FRAMING = {"front": (-90.0, 15.0), "side": (-20.0, 25.0), "high": (-60.0, 50.0)}
 """Azimuth, from +x towards +y, and elevation of each camera that frames, seen from the framed
 points [degree]."""
 
-_FRAMED_FOCAL = 560.0  # [px] at 224 pixels: a lens of 90 mm, as the rigs have
-_FRAMED_MARGIN = 10.0  # [px] at 224 pixels
+DEFAULT_SIDE = min(DEFAULT_RESOLUTION)
+"""Shorter side of the pictures that lengths in pixels are given for [px]."""
+
+_FRAMED_FOCAL = 560.0  # [px] at the default side: a lens of 90 mm, as the rigs have
+_FRAMED_MARGIN = 10.0  # [px] at the default side
 
 
-def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) -> Camera:
-    """Return the nearest upright camera that has all points (n, 3) in its square frame.
+def framed(name: str, points: npt.ArrayLike, *, size: tuple[int, int], turn: float = 0.0) -> Camera:
+    """Return the nearest upright camera that has all points (n, 3) in its frame.
 
     A point (X, Y, Z) in the camera's directions is in the frame if |X + t_x| <= k (Z + t_z), and
-    the same of Y. So t_z is the larger of (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of
-    Y, and t_x centres the points.
+    the same of Y with the k of the height. So t_z is the larger of
+    (max(X - k Z) + max(-X - k Z)) / 2 k and of the same of Y, and t_x centres the points.
 
     Args:
         name: One of `FRAMING`.
@@ -281,12 +310,15 @@ def framed(name: str, points: npt.ArrayLike, *, size: int, turn: float = 0.0) ->
     R = np.stack([right, np.cross(forward, right), forward])
     # The points along these axes, and the narrowest frame around them.
     x, y, z = R @ np.asarray(points, dtype=np.float64).reshape(-1, 3).T
-    scale = size / 224.0
+    # The lens is that of the shorter side: a longer side sees more.
+    scale = min(size) / DEFAULT_SIDE
     focal = _FRAMED_FOCAL * scale
-    k = (size / 2.0 - 0.5 - _FRAMED_MARGIN * scale) / focal
-    (left, right_), (top, bottom) = (((-w - k * z).max(), (w - k * z).max()) for w in (x, y))
-    t = ((left - right_) / 2.0, (top - bottom) / 2.0, max(left + right_, top + bottom) / (2.0 * k))
-    return square(name, size, focal, R.tolist(), t)
+    slope_x, slope_y = ((side / 2.0 - 0.5 - _FRAMED_MARGIN * scale) / focal for side in size)
+    left, right_ = (-x - slope_x * z).max(), (x - slope_x * z).max()
+    top, bottom = (-y - slope_y * z).max(), (y - slope_y * z).max()
+    distance = max((left + right_) / (2.0 * slope_x), (top + bottom) / (2.0 * slope_y))
+    t = ((left - right_) / 2.0, (top - bottom) / 2.0, distance)
+    return central(name, size, focal, R.tolist(), t)
 
 
 class _Rig(Document):
@@ -324,6 +356,11 @@ def load_rig(name: str) -> tuple[Camera, ...]:
     if name not in rig_names():
         raise ValueError(f"rig must be one of {', '.join(rig_names())}; got {name!r}")
     return read_rigs(RIGS / f"{name}.toml")[name]
+
+
+def rig_cameras(name: str, size: tuple[int, int]) -> tuple[Camera, ...]:
+    """Return the cameras of a shipped rig for pictures of a size (width, height) [px]."""
+    return tuple(camera.resized(size) for camera in load_rig(name))
 
 
 @cache

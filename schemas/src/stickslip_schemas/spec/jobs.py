@@ -29,6 +29,7 @@ from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed, axis_values
 from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.resolution import Resolution, resolution_field
 
 D = TypeVar("D", bound=Document)
 
@@ -127,6 +128,12 @@ class Render(Document):
     rig: str | None = Field(description="null: the cameras are of the document or of the sample")
     rig_digest: Sha256 | None
     quality: Quality
+    resolution: Resolution = resolution_field("of pictures by cameras of a rig or of the sample")
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels are rendered together; memory grows with them."""
+        return 0
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Self
 from pydantic import BeforeValidator, Field, Strict, WithJsonSchema, model_validator
 
 from stickslip_schemas.base import WHOLE, Document, Float
-from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import NO_LENS, Camera, distorted
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION, Resolution
 
 
 class Material(StrEnum):
@@ -331,8 +331,9 @@ class Calibration(Document):
     """A custom camera, with the numbers that OpenCV's `calibrateCamera` and `solvePnP` give.
 
     The world's z axis points up from the floor, which is z = 0. A dragged cloth stays within x =
-    -0.1 to 0.4, y = -0.1 to 0.1 and z = 0 to 0.25 m. A clip shows the largest square in the middle
-    of the image, scaled to 224 x 224 pixels.
+    -0.1 to 0.4, y = -0.1 to 0.1 and z = 0 to 0.25 m. A clip shows the largest part in the middle of
+    the image that has the shape of its resolution, scaled to it: all of the image if the resolution
+    is that of the image.
     """
 
     image_size: tuple[Pixels, Pixels] = Field(
@@ -353,6 +354,12 @@ class Calibration(Document):
     )
     tvec: Annotated[Row, FLATTENED] = Field(
         description="the world's origin in the camera's axes [m]"
+    )
+    resolution: Resolution | None = Field(
+        default=None,
+        exclude_if=lambda size: size is None,
+        description="width and height of the pictures of this camera [px], 64 to 1,920 each; by "
+        "default the `resolution` of the spec",
     )
 
     @model_validator(mode="after")
@@ -387,7 +394,7 @@ class Calibration(Document):
                         f"it is {value:g} px"
                     )
         # The lens is checked with the camera of the clip, which is cut from the image.
-        self._check_lens()
+        self.check_lens(DEFAULT_RESOLUTION)
         x, y, z = self.camera("own").position
         if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and LOWEST <= z <= FARTHEST):
             raise ValueError(
@@ -397,14 +404,14 @@ class Calibration(Document):
             )
         return self
 
-    def _check_lens(self) -> None:
-        """Raise ValueError for a lens that no clip can be rendered with.
+    def check_lens(self, resolution: tuple[int, int]) -> None:
+        """Raise ValueError for a lens that no clip of a resolution can be rendered with.
 
-        A lens must not show a point twice within the square, nor see farther than any camera may.
+        A lens must not show a point twice within the picture, nor see farther than any camera may.
         """
-        camera = self.camera("own")
+        camera = self.camera("own", resolution)
         border = camera.border()
-        # s = x^2 + y^2 of the corner of the box around all that the square shows.
+        # s = x^2 + y^2 of the corner of the box around all that the picture shows.
         farthest = max(abs(x) for x, _ in border) ** 2 + max(abs(y) for _, y in border) ** 2
         # Points must move outwards in their order: d(r g) / dr > 0 at all radii.
         k1, k2, _, _, k3 = camera.distortion
@@ -415,34 +422,43 @@ class Calibration(Document):
         for x, y in border:
             u, v = distorted(x, y, camera.distortion)
             pixel = (camera.fx * u + camera.cx, camera.fy * v + camera.cy)
-            gaps = [min(abs(p + 0.5), abs(p - CLIP_SIZE + 0.5)) for p in pixel]
+            sides = (camera.width, camera.height)
+            gaps = [
+                min(abs(p + 0.5), abs(p - side + 0.5)) for p, side in zip(pixel, sides, strict=True)
+            ]
             is_inverted = is_inverted and min(gaps) < _BORDER_TOLERANCE
         widest = 2.0 * math.tan(math.radians(0.5 * FIELD_OF_VIEW[1])) ** 2
         if not (is_rising and is_inverted and farthest <= widest):
             raise ValueError(
-                "distortion must move places outwards in their order over the whole square of the "
-                "clip, for a field of "
-                f"view of up to {FIELD_OF_VIEW[1]:g} degrees; it is {list(self.distortion)}"
+                "distortion must move places outwards in their order over the whole picture of "
+                f"{camera.width} x {camera.height} pixels, for a field of view of up to "
+                f"{FIELD_OF_VIEW[1]:g} degrees; it is {list(self.distortion)}"
             )
 
-    def camera(self, name: str) -> Camera:
-        """Return the camera of the clip.
+    def camera(self, name: str, resolution: tuple[int, int] = DEFAULT_RESOLUTION) -> Camera:
+        """Return the camera of a clip.
 
-        It shows the square in the middle of the image, scaled to `CLIP_SIZE`.
+        It shows the largest part in the middle of the image that has the shape of the picture,
+        scaled to the picture. The resolution of this camera goes before the given one.
         """
-        # The clip is the largest square in the middle, scaled.
+        picture_width, picture_height = self.resolution or resolution
         width, height = self.image_size
-        side = min(width, height)
-        scale = CLIP_SIZE / side
+        # The part has the whole height of the image if the image is the wider one, or its whole
+        # width.
+        part_width, part_height = height * picture_width / picture_height, float(height)
+        scale = picture_height / height
+        if part_width > width:
+            part_width, part_height = float(width), width * picture_height / picture_width
+            scale = picture_width / width
         (fx, _, cx), (_, fy, cy), _ = self.camera_matrix
-        # Pixel centres are whole numbers: the left edge of the square is at (width - side) / 2 -
-        # 1/2.
-        left = (width - side) / 2
-        top = (height - side) / 2
+        # Pixel centres are whole numbers: the left edge of the part is at (width - part_width) / 2
+        # - 1/2.
+        left = (width - part_width) / 2
+        top = (height - part_height) / 2
         return Camera(
             name=name,
-            width=CLIP_SIZE,
-            height=CLIP_SIZE,
+            width=picture_width,
+            height=picture_height,
             fx=fx * scale,
             fy=fy * scale,
             cx=(cx - left + 0.5) * scale - 0.5,

@@ -27,25 +27,6 @@ _NOT_RESOLVED = (
 )
 
 
-def standing_certificate(
-    connection: Connection, preset: str, sim_core: Sha256
-) -> tuple[Sha256, list[str]] | None:
-    """Return digest and protocols of the newest full certificate of a preset and a build.
-
-    None if there is none, or if it did not pass.
-    """
-    columns = certificates.c
-    row = connection.execute(
-        select(columns.digest, columns.passed, columns.protocols)
-        .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
-        .order_by(columns.created_at.desc(), columns.seq.desc())
-        .limit(1)
-    ).one_or_none()
-    if row is None or not row.passed:
-        return None
-    return row.digest, row.protocols.split()
-
-
 def register_certificate(
     database: Database, store: Store, certificate: Certificate, now: float
 ) -> CertificateEntry:

@@ -13,6 +13,7 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.library import built_in_files
+from stickslip_schemas.scene.reading import reading_files_once
 from stickslip_schemas.spec.cameras import FRAMING, load_rig
 
 from stickslip_services.cli.common import FILE, CommandGroup, field_line, json_option, shows_errors
@@ -50,6 +51,7 @@ scene_argument = click.argument(
 @click.option("--obj", is_flag=True, help="write an OBJ file for each sheet and frame, too")
 @json_option
 @shows_errors
+@reading_files_once()
 def simulate(
     scene: str,
     out: Path,
@@ -93,6 +95,7 @@ def scene() -> None:
 @scene_argument
 @json_option
 @shows_errors
+@reading_files_once()
 def check(scene: str, as_json: bool) -> None:
     """Check a scene, its start and the files that it names.
 

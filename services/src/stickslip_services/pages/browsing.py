@@ -12,6 +12,9 @@ from stickslip_schemas.spec.jobs import JobSpec
 from stickslip_services.pages.rendering import grid_maps
 from stickslip_services.pages.samples import SampleData
 
+THUMB_SIDE = 112
+"""Least shorter side of a picture that a page shows small [px]."""
+
 SHOWN_THUMBS = 48
 """Samples that a page shows at once."""
 
@@ -73,6 +76,7 @@ def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, 
         "has_psnr": "psnr_cloth" in data.arrays,
         "pictured": pictured,
         "picture_index": middle,
+        "picture_step": 1 if pictures is None else max(1, min(pictures.shape[1:3]) // THUMB_SIDE),
     }
 
 

@@ -1,6 +1,6 @@
 """Frames of pictures and of ground truth as sRGB, and clips as MP4."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 
 import numpy as np
@@ -21,22 +21,46 @@ CONSTANT_RATE_FACTOR = "18"
 """Quality of H.264, at which the eye sees no loss."""
 
 
-def coloured(array: ArrayLayout, values: npt.NDArray[np.generic], index: int) -> Picture:
-    """Return a frame of pictures or of ground truth (y, x, 3) as sRGB.
+def coloured(
+    array: ArrayLayout, values: npt.NDArray[np.generic], indices: Iterable[int]
+) -> Iterator[Picture]:
+    """Yield frames of pictures or of ground truth (y, x, 3) as sRGB.
 
     Codes get a colour each. Numbers are scaled by their range over the clip.
     """
-    frame = values[index]
-    if array.dimensions[-1] == "rgb":
-        return np.asarray(frame)
-    if "categories" in array.attributes:
-        return np.asarray(_PALETTE[frame % len(_PALETTE)])
-    finite = values[np.isfinite(values)].astype(np.float32)
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    # The range is that of all frames, so it is looked up once.
+    is_number = array.dimensions[-1] != "rgb" and "categories" not in array.attributes
+    low, high = _range(values) if is_number else (0.0, 0.0)
+    for index in indices:
+        frame = values[index]
+        if is_number:
+            yield _scaled(frame, low, high)
+        elif array.dimensions[-1] == "rgb":
+            yield np.asarray(frame)
+        else:
+            yield np.asarray(_PALETTE[frame % len(_PALETTE)])
+
+
+def _range(values: npt.NDArray[np.generic]) -> tuple[float, float]:
+    """Return the least and the largest finite number of a clip; of two signs, they are opposite."""
+    low, high = np.inf, -np.inf
+    # Frame by frame, for a clip of large pictures has gigabytes.
+    for frame in values:
+        finite = frame[np.isfinite(frame)]
+        if finite.size:
+            low = min(low, float(finite.min()))
+            high = max(high, float(finite.max()))
+    if high < low:
+        return 0.0, 0.0
     if low < 0.0:
         # Of two signs: grey is 0.
         high = max(-low, high)
         low = -high
+    return low, high
+
+
+def _scaled(frame: npt.NDArray[np.generic], low: float, high: float) -> Picture:
+    """Return numbers of a frame (y, x, ...) from `low` to `high` as sRGB."""
     fraction = (frame.astype(np.float32) - low) / ((high - low) or 1.0)
     fraction = np.nan_to_num(fraction, nan=0.0, posinf=0.0, neginf=0.0)
     planes = _three_planes(fraction.reshape(*fraction.shape[:2], -1))
@@ -54,10 +78,24 @@ def _three_planes(planes: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return planes
 
 
-def mp4(frames: Sequence[Picture]) -> bytes:
-    """Return pictures (y, x, rgb) of even sizes as H.264 in MP4, 10 a second.
+def shown_part(
+    array: ArrayLayout, values: npt.NDArray[np.generic], size: npt.NDArray[np.generic] | None
+) -> npt.NDArray[np.generic]:
+    """Return the part of the frames (frame, y, x, ...) of a sample that its picture covers.
 
-    Raise ImportError without PyAV.
+    `size` is the label `picture_size` of the sample, or None if pictures fill their frames.
+    """
+    if size is None or array.dimensions[1:3] != ("y", "x"):
+        return values
+    width, height = (int(side) for side in size)
+    return values[:, :height, :width]
+
+
+def mp4(frames: Iterable[Picture]) -> bytes:
+    """Return pictures (y, x, rgb) as H.264 in MP4, 10 a second.
+
+    H.264 for browsers stores colours of 2 x 2 pixels, so a film has even sides: the last row or
+    column of an odd picture is there twice. Raise ImportError without PyAV.
     """
     import av
 
@@ -65,10 +103,13 @@ def mp4(frames: Sequence[Picture]) -> bytes:
     with av.open(file, "w", format="mp4") as film:
         options = {"crf": CONSTANT_RATE_FACTOR}
         stream = film.add_stream("libx264", rate=FRAMES_PER_SECOND, options=options)
-        stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = "yuv420p"
-        for frame in frames:
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        for number, frame in enumerate(frames):
+            rows, columns = frame.shape[:2]
+            even = np.pad(frame, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
+            if number == 0:
+                stream.height, stream.width = even.shape[:2]
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             film.mux(stream.encode(picture))
         film.mux(stream.encode())  # what the encoder has held back
     return file.getvalue()

@@ -55,7 +55,7 @@ def _environment() -> Environment:
     )
     # Curves keep their order, and a script of the page could not read NaN.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    filters = (duration, size, percent, number, moment, ago, words)
+    filters = (duration, size, percent, number, moment, ago, words, plain)
     environment.globals |= {"root": prefix, "service_url": url}
     environment.filters |= {function.__name__: function for function in filters}
     return environment
@@ -96,6 +96,11 @@ def ago(value: datetime) -> str:
 def words(value: object) -> str:
     """Return the name of a state or reason as words, without underscores."""
     return str(value).replace("_", " ")
+
+
+def plain(text: str) -> str:
+    """Return a text without the marks of code, which pages do not show."""
+    return text.replace("`", "")
 
 
 def table(

@@ -85,9 +85,11 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "slot": slot,
         "shard": shard,
         "pictures": [
-            {"name": name, "count": data.arrays[name].shape[0]} for name in names[View.picture]
+            {"name": name, "count": data.arrays[name].shape[0], "size": _size(data, name, slot)}
+            for name in names[View.picture]
         ],
         "layers": layers,
+        "size": _size(data, layers[0], slot) if layers else None,
         "frames": shown_instants,
         "instants": timed[0].shape[0] if timed else len(frames),
         "rate": timed[0].attributes.get("instants_per_second", 0) if timed else 0,
@@ -96,6 +98,13 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "has_contact": any(name.endswith(".contact") for name in data.arrays),
         "groups": _labels(data, names[View.label], slot),
     }
+
+
+def _size(data: SampleData, name: str, slot: int) -> tuple[int, int]:
+    """Return width and height of the pictures of a sample in an array (n, y, x, ...) [px]."""
+    height, width = data.arrays[name].shape[1:3]
+    size = data.picture_size(slot)
+    return (width, height) if size is None else (int(size[0]), int(size[1]))
 
 
 def _labels(

@@ -13,10 +13,14 @@ from stickslip_schemas.format.codecs import (
     shard_index_size,
 )
 from stickslip_schemas.format.manifest import Contents, FileEntry, Rejection, layout
+from stickslip_schemas.kinds.cloth.arrays import PICTURE_SIZE
 from stickslip_schemas.spec.arrays import ArrayLayout
 from stickslip_schemas.store import Store
 
 Array = npt.NDArray[np.generic]
+
+CACHED_BYTES = 2**26
+"""Largest value of a sample that is kept for the next request [bytes]."""
 
 
 class SampleData:
@@ -38,10 +42,16 @@ class SampleData:
         number, position = divmod(slot, samples_per_file)
         file = self._file(array, number)
         if array.per_sample:
-            return _chunk(self.store, file, array, position, samples_per_file)
+            # Large pictures are not kept, or a few of them would fill the memory.
+            read = _chunk if array.sample_bytes <= CACHED_BYTES else _decoded
+            return read(self.store, file, array, position, samples_per_file)
         # A label has one file for many samples, which is cached as a whole.
         column = _column(self.store, file.sha256, array, samples_per_file)
         return np.asarray(column[position])
+
+    def picture_size(self, slot: int) -> Array | None:
+        """Return width and height of the pictures of a sample [px], or None if they fill frames."""
+        return self.read(PICTURE_SIZE.name, slot) if PICTURE_SIZE.name in self.arrays else None
 
     def label(self, name: str) -> Array:
         """Return the values of a label for all samples, by slot."""
@@ -77,8 +87,7 @@ class SampleData:
         return file
 
 
-@lru_cache(maxsize=4)
-def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slots: int) -> Array:
+def _decoded(store: Store, file: FileEntry, array: ArrayLayout, position: int, slots: int) -> Array:
     """Return the value of the sample at `position` of a shard.
 
     Raise KeyError if the sample was rejected.
@@ -94,6 +103,10 @@ def _chunk(store: Store, file: FileEntry, array: ArrayLayout, position: int, slo
     value = np.empty(array.shape, dtype=array.dtype)
     decode_sample(array, chunk, value)
     return value
+
+
+_chunk = lru_cache(maxsize=4)(_decoded)
+"""The same, with the last values kept: a page asks for one frame after the other."""
 
 
 @lru_cache(maxsize=256)

@@ -42,7 +42,6 @@ from stickslip_services.queue.plan import Plan, PlannedTask
 from stickslip_services.queue.ready import add_ready
 from stickslip_services.queue.rerun import RESET_ATTEMPTS, reset_tasks, wait_for
 from stickslip_services.queue.rows import HAS_RESULT, PlanInputs, SampleRow, task_columns
-from stickslip_services.queue.totals import add_planned
 from stickslip_services.queue.transaction import QueueTransaction
 
 
@@ -94,9 +93,9 @@ def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
     known = _insert_plan(tx, job, piece)
     own = jobs.c.seq == job
     tx.connection.execute(update(jobs).where(own).values(planned=piece.end))
-    if not piece.is_last:
-        return
     key = piece.publish_key
+    if key is None:
+        return
     publish_task = tx.connection.scalar(select(tasks.c.seq).where(tasks.c.key == key))
     # The plan is complete, so the claim of the planner ends with it.
     planned = {"publish_task": publish_task, "planner": None, "planner_until": None}
@@ -200,7 +199,8 @@ def _insert_plan(tx: QueueTransaction, job: int, plan: Plan) -> dict[bytes, _Kno
 
     # Shared tasks that can run now enter the queue of this job too.
     shared_seqs = [task.seq for task in known.values() if task.seq not in earlier]
-    add_ready(connection, shared_seqs)
+    if shared_seqs:
+        add_ready(connection, shared_seqs)
     return known
 
 
@@ -398,7 +398,47 @@ def _insert_links(
         links.append((job, seq, state in HAS_RESULT))
         counts[stage, cost_group, state] += 1
     insert_rows(connection, job_tasks, ("job", "task", "cached"), links)
-    add_planned(connection, job, counts)
+    _add_to_totals(connection, job, counts)
+
+
+_ADD_TO_TOTALS = Statement(
+    "INSERT INTO job_totals (job, stage, cost_group, total, cached, succeeded, rejected, failed) "
+    "VALUES (:b_job, :b_stage, :b_group, :b_total, :b_cached, :b_succeeded, :b_rejected, "
+    ":b_failed) "
+    "ON CONFLICT (job, stage, cost_group) DO UPDATE SET "
+    "total = job_totals.total + excluded.total, cached = job_totals.cached + excluded.cached, "
+    "succeeded = job_totals.succeeded + excluded.succeeded, "
+    "rejected = job_totals.rejected + excluded.rejected, "
+    "failed = job_totals.failed + excluded.failed"
+)
+
+
+def _add_to_totals(
+    connection: Connection, job: int, counts: Mapping[tuple[str, str, str], int]
+) -> None:
+    """Add planned tasks to the totals of a job: counts by stage, cost group and state."""
+    totals: dict[tuple[str, str], Counter[str]] = {}
+    for (stage, cost_group, state), count in counts.items():
+        total = totals.setdefault((stage, cost_group), Counter())
+        total["total"] += count
+        total[state] += count
+    rows: list[dict[str, object]] = []
+    for (stage, cost_group), total in totals.items():
+        succeeded = total[TaskState.succeeded]
+        rejected = total[TaskState.rejected]
+        rows.append(
+            {
+                "b_job": job,
+                "b_stage": stage,
+                "b_group": cost_group,
+                "b_total": total["total"],
+                "b_cached": succeeded + rejected,
+                "b_succeeded": succeeded,
+                "b_rejected": rejected,
+                "b_failed": total[TaskState.failed],
+            }
+        )
+    _ADD_TO_TOTALS.run_all(connection, rows)
 
 
 def _insert_samples(

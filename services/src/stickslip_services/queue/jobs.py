@@ -1,7 +1,7 @@
 """Jobs as the API shows them: lists, details, samples, previews and events."""
 
 import json
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -77,10 +77,33 @@ def find_job(connection: Connection, job_id: str) -> Row[tuple[object, ...]]:
 
 def show_job(context: Context, connection: Connection, job: int) -> JobDetail:
     """Return a job with its spec, as a transaction sees it."""
-    row = connection.execute(select(jobs).where(jobs.c.seq == job)).one()
+    row = _job_row(connection, job)
+    slots = _slots_by_job([row], alive_workers(context, connection))
+    return _detail(context, connection, row, slots, context.frames)
+
+
+def show_new_job(context: Context, connection: Connection, job: int) -> JobDetail:
+    """Return a job as the answer to its submission, without the time left.
+
+    The answer is stored for repeated requests, and the workers may differ by then.
+    """
+    return _detail(context, connection, _job_row(connection, job), slots={}, frames={})
+
+
+def _job_row(connection: Connection, job: int) -> Row[tuple[object, ...]]:
+    return connection.execute(select(jobs).where(jobs.c.seq == job)).one()
+
+
+def _detail(
+    context: Context,
+    connection: Connection,
+    row: Row[tuple[object, ...]],
+    slots: Mapping[int, int],
+    frames: Frames,
+) -> JobDetail:
+    """Return a row of `jobs` as the API shows a single job."""
     spec = spec_of(row)
-    workers = alive_workers(context, connection)
-    (entry,) = _entries(connection, [row], workers, context.frames)
+    (entry,) = _entries(connection, [row], slots, frames)
     detail = JobDetail(**dict(entry), spec=spec)
     # While the store takes no results, the database may not be writable either.
     if context.store_watch.trouble and detail.state in SCHEDULABLE:
@@ -114,7 +137,10 @@ def list_jobs(
         query = query.where(jobs.c.state == state)
     if project:
         query = query.where(jobs.c.project == project)
-    entries = partial(_entries, connection, workers=workers, frames={})
+
+    def entries(rows: Sequence[Row[tuple[object, ...]]]) -> list[Job]:
+        return _entries(connection, rows, _slots_by_job(rows, workers), frames={})
+
     return read_page(connection, query, page, jobs.c.seq, entries, newest_first=newest_first)
 
 
@@ -306,14 +332,13 @@ def is_preview(connection: Connection, digest: str) -> bool:
 def _entries(
     connection: Connection,
     rows: Sequence[Row[tuple[object, ...]]],
-    workers: Collection[RegisteredWorker],
+    slots: Mapping[int, int],
     frames: Frames,
 ) -> list[Job]:
-    """Return rows of `jobs` as the API shows them."""
-    slots: dict[int, int] = {}
-    for row in rows:
-        if row.state in (JobState.queued, JobState.running):
-            slots[row.seq] = _slots_of(row, workers)
+    """Return rows of `jobs` as the API shows them.
+
+    `slots` is the number of tasks that can run at once, of the jobs whose time left is estimated.
+    """
     progress = read_progress(connection, rows, slots, frames)
     entries: list[Job] = []
     for row in rows:
@@ -328,6 +353,20 @@ def _entries(
             )
         )
     return entries
+
+
+_HAS_ETA = (JobState.queued, JobState.running)
+"""States of a job whose time left is estimated.
+
+In other states the work is not known, or rests.
+"""
+
+
+def _slots_by_job(
+    rows: Sequence[Row[tuple[object, ...]]], workers: Collection[RegisteredWorker]
+) -> dict[int, int]:
+    """Return the number of tasks that can run at once, of each job with an estimated time left."""
+    return {row.seq: _slots_of(row, workers) for row in rows if row.state in _HAS_ETA}
 
 
 def _slots_of(row: Row[tuple[object, ...]], workers: Collection[RegisteredWorker]) -> int:

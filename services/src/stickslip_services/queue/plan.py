@@ -12,16 +12,17 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
 
-from sqlalchemy import Connection
-from stickslip_schemas.base import Stage
+from sqlalchemy import Connection, select
+from stickslip_schemas.base import Sha256, Stage
 from stickslip_schemas.kinds import registered
 from stickslip_schemas.plan.points import Shard, publish_key, shards
 from stickslip_schemas.spec.jobs import JobSpec
 
-from stickslip_services.catalog.inputs import standing_certificate
+from stickslip_services.database.tables import certificates
 from stickslip_services.errors import PresetNotCertifiedError
 from stickslip_services.queue.rows import PlanInputs
 from stickslip_services.queue.workers import builds_for
+from stickslip_services.settings import Settings
 
 # Plain strings: sqlite3 binds them three times as fast as members of Stage.
 _SIMULATE, _RENDER, _PACK, _PUBLISH = (stage.value for stage in Stage)
@@ -37,16 +38,42 @@ def plan_inputs_for(connection: Connection, spec: JobSpec) -> PlanInputs | None:
     builds = builds_for(connection, registered(spec).kind)
     if builds is None:
         return None
-    standing = standing_certificate(connection, spec.certified_preset, builds.sim_core)
+    standing = _standing_certificate(connection, spec.certified_preset, builds.sim_core)
     missing: list[str] = []
     certificate = None
     if standing is not None:
-        missing = [name for name in spec.certified_protocols if name not in standing[1]]
+        missing = [name for name in spec.certified_protocols if name not in standing.protocols]
         if not missing:
-            certificate = standing[0]
+            certificate = standing.digest
     if certificate is None and spec.needs_certificate:
         raise PresetNotCertifiedError(spec.certified_preset, builds.sim_core, missing)
     return PlanInputs(builds, certificate)
+
+
+class _StandingCertificate(NamedTuple):
+    """The newest full certificate of a preset and a build, which passed."""
+
+    digest: Sha256
+    protocols: list[str]
+
+
+def _standing_certificate(
+    connection: Connection, preset: str, sim_core: Sha256
+) -> _StandingCertificate | None:
+    """Return the newest full certificate of a preset and a build.
+
+    None if there is none, or if it did not pass.
+    """
+    columns = certificates.c
+    row = connection.execute(
+        select(columns.digest, columns.passed, columns.protocols)
+        .where(columns.preset == preset, columns.sim_core == sim_core, columns.extent == "full")
+        .order_by(columns.created_at.desc(), columns.seq.desc())
+        .limit(1)
+    ).one_or_none()
+    if row is None or not row.passed:
+        return None
+    return _StandingCertificate(row.digest, row.protocols.split())
 
 
 class PlannedTask(NamedTuple):
@@ -78,23 +105,19 @@ class Plan:
     spec: JobSpec
     first: int
     """The first slot."""
+    end: int
+    """The slot after the last one."""
     tasks: dict[bytes, PlannedTask] = field(default_factory=dict)
     samples: list[PlannedSample] = field(default_factory=list)
+    publish_key: bytes | None = None
+    """Key of the task that publishes, in the last piece of a job."""
 
-    @property
-    def end(self) -> int:
-        """The slot after the last one."""
-        return self.first + len(self.samples)
 
-    @property
-    def is_last(self) -> bool:
-        """Whether the piece ends with the task that publishes."""
-        return self.end == self.spec.sample_count
-
-    @property
-    def publish_key(self) -> bytes:
-        """Key of the last task, of the last piece."""
-        return next(reversed(self.tasks))
+def plan_at_once(settings: Settings, spec: JobSpec, inputs: PlanInputs) -> Plan | None:
+    """Return the plan of a job of few samples, or None if the planner plans it piece by piece."""
+    if spec.sample_count > settings.plan_samples:
+        return None
+    return expand(spec, inputs, previews=settings.previews_per_job)
 
 
 def expand(spec: JobSpec, inputs: PlanInputs, *, previews: int = 0) -> Plan:
@@ -139,7 +162,8 @@ class _Piece:
 
     def plan(self, batch: Sequence[Shard], pack_keys: list[str]) -> Plan:
         """Return the plan; add the keys of its pack tasks to `pack_keys`."""
-        plan = Plan(self._spec, batch[0].points[0].slot)
+        first = batch[0].points[0].slot
+        plan = Plan(self._spec, first, first + sum(len(shard.points) for shard in batch))
         packs: dict[bytes, PlannedTask] = {}
         for shard in batch:
             dependencies = self._add_samples(plan, shard)
@@ -150,7 +174,7 @@ class _Piece:
         for group in self._renders.values():
             plan.tasks.update(group)
         plan.tasks.update(packs)
-        if plan.is_last:
+        if plan.end == self._spec.sample_count:
             self._add_publish_task(plan, pack_keys)
         return plan
 
@@ -192,8 +216,8 @@ class _Piece:
     def _add_publish_task(self, plan: Plan, pack_keys: Sequence[str]) -> None:
         builds = self._inputs.builds
         certificate = self._inputs.certificate
-        key = publish_key(self._spec, pack_keys, builds, certificate)
+        key = bytes.fromhex(publish_key(self._spec, pack_keys, builds, certificate))
         payload = json.dumps({} if certificate is None else {"certificate": certificate})
         dependencies = tuple(bytes.fromhex(pack_key) for pack_key in pack_keys)
-        task = PlannedTask(_PUBLISH, builds.digest, payload, dependencies)
-        plan.tasks[bytes.fromhex(key)] = task
+        plan.tasks[key] = PlannedTask(_PUBLISH, builds.digest, payload, dependencies)
+        plan.publish_key = key

@@ -13,7 +13,6 @@ from typing import NamedTuple
 from sqlalchemy import Connection, bindparam, or_, select, text, update
 from sqlalchemy.exc import SQLAlchemyError
 from stickslip_schemas.base import JobState, Reason
-from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.database.statements import RowQuery, ValueQuery
 from stickslip_services.database.tables import jobs
@@ -27,8 +26,8 @@ from stickslip_services.queue.ids import new_id
 from stickslip_services.queue.insertion import begin_planning, insert_piece
 from stickslip_services.queue.integrity import plan_inputs_of, spec_of
 from stickslip_services.queue.job_states import end_job
-from stickslip_services.queue.plan import Plan, expand, pieces, plan_inputs_for
-from stickslip_services.queue.rows import JobRow, PlanInputs, job_columns
+from stickslip_services.queue.plan import Plan, pieces, plan_at_once, plan_inputs_for
+from stickslip_services.queue.rows import JobRow, job_columns
 from stickslip_services.queue.transaction import QueueTransaction
 from stickslip_services.queue.workers import present_workers
 
@@ -74,13 +73,6 @@ def release_claims(connection: Connection) -> None:
     connection.execute(claimed.values(planner=None, planner_until=None))
 
 
-def plan_at_once(context: Context, spec: JobSpec, inputs: PlanInputs) -> Plan | None:
-    """Return the plan of a job of few samples, or None if the planner plans it piece by piece."""
-    if spec.sample_count > context.settings.plan_samples:
-        return None
-    return expand(spec, inputs, previews=context.settings.previews_per_job)
-
-
 def plan_waiting_jobs(context: Context) -> None:
     """Plan the jobs that were submitted before the first worker registered.
 
@@ -112,7 +104,7 @@ def _plan_waiting_job(context: Context, tx: QueueTransaction, row: JobRow) -> No
         end_job(tx, row.seq, JobState.failed, Reason.waiting_for_worker, str(error))
     else:
         if inputs is not None:
-            begin_planning(tx, row.seq, inputs, plan_at_once(context, spec, inputs))
+            begin_planning(tx, row.seq, inputs, plan_at_once(context.settings, spec, inputs))
 
 
 class Planner:
@@ -205,7 +197,8 @@ class Planner:
             insert_piece(tx, job, piece)
         self._end = piece.end
         # The tables have grown by half: the database must know that to choose plans.
-        if piece.is_last or piece.end.bit_length() > piece.first.bit_length():
+        is_last = piece.publish_key is not None
+        if is_last or piece.end.bit_length() > piece.first.bit_length():
             self._context.database.analyse()
 
     def _fail(self, row: JobRow, reason: Reason, message: str) -> None:

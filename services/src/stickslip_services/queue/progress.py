@@ -25,12 +25,6 @@ from stickslip_services.queue.totals import GroupTotals, InFlight, count_in_flig
 Frames = Mapping[str, tuple[int, int]]
 """Progress of running simulations by task: (frames done, frames total)."""
 
-_HAS_ETA = (JobState.queued, JobState.running)
-"""States of a job whose time left is estimated.
-
-In other states the work is not known, or rests.
-"""
-
 
 class ShownJob(Protocol):
     """A row of `jobs`."""
@@ -88,7 +82,8 @@ def read_progress(
 ) -> dict[int, Progress]:
     """Return the progress of jobs by `seq`.
 
-    `slots` is the number of tasks that can run at once.
+    `slots` is the number of tasks of a job that can run at once. A job without slots has no
+    estimate of the time left.
     """
     seqs = [row.seq for row in rows]
     open_jobs = [row.seq for row in rows if JobState(row.state).is_open]
@@ -96,7 +91,7 @@ def read_progress(
         totals=read_totals(connection, seqs),
         in_flight=count_in_flight(connection, open_jobs) if open_jobs else (),
         frames=_read_frames(connection, seqs, frames),
-        costs=read_costs(connection),
+        costs=read_costs(connection) if slots else {},
         slots=slots,
     )
     return {row.seq: _progress_of(row, numbers) for row in rows}
@@ -161,7 +156,8 @@ def _frames_of(row: ShownJob, stage: Stage, numbers: _Numbers) -> tuple[int, int
 
 
 def _eta_of(row: ShownJob, totals: Sequence[GroupTotals], numbers: _Numbers) -> Eta | None:
-    if row.state not in _HAS_ETA or row.builds is None:
+    slots = numbers.slots.get(row.seq, 0)
+    if slots == 0:
         return None
     work: dict[Stage, list[StageWork]] = {stage: [] for stage in Stage}
     for group in totals:
@@ -170,7 +166,7 @@ def _eta_of(row: ShownJob, totals: Sequence[GroupTotals], numbers: _Numbers) -> 
         finished = 0.0 if running is None else running.finished
         timings = timings_of(numbers.costs, stage, row.kind, group.cost_group)
         work[stage].append(StageWork(group.unfinished - finished, timings))
-    return estimate(work, slots=numbers.slots.get(row.seq, 0))
+    return estimate(work, slots=slots)
 
 
 class _RunningTask(NamedTuple):

@@ -19,9 +19,8 @@ from stickslip_services.errors import IdempotencyKeyReusedError
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.insertion import begin_planning, insert_job
 from stickslip_services.queue.job_states import set_job_state
-from stickslip_services.queue.jobs import show_job
-from stickslip_services.queue.plan import plan_inputs_for
-from stickslip_services.queue.planner import plan_at_once
+from stickslip_services.queue.jobs import show_new_job
+from stickslip_services.queue.plan import plan_at_once, plan_inputs_for
 from stickslip_services.queue.workers import NO_WORKER
 
 
@@ -58,9 +57,9 @@ def submit_job(
             reason = Reason.waiting_for_worker
             set_job_state(tx, job, JobState.queued, reason=reason, message=NO_WORKER)
         else:
-            begin_planning(tx, job, inputs, plan_at_once(context, spec, inputs))
+            begin_planning(tx, job, inputs, plan_at_once(context.settings, spec, inputs))
 
-        detail = show_job(context, connection, job)
+        detail = show_new_job(context, connection, job)
         details = {"name": spec.name, "samples": spec.sample_count, "priority": priority}
         audit_log.append(connection, "job.submit", detail.id, tx.now, **details)
         if idempotency_key:

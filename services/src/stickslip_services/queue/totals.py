@@ -8,7 +8,7 @@ The totals of a job that has ended stay as they were. Its pending tasks are show
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 from sqlalchemy import Connection, bindparam, text
@@ -64,16 +64,6 @@ _REMOVE_RESULTS = Statement(
     "rejected = rejected - :b_rejected, "
     "failed = failed - :b_failed WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
 )
-_ADD_PLANNED = Statement(
-    "INSERT INTO job_totals (job, stage, cost_group, total, cached, succeeded, rejected, failed) "
-    "VALUES (:b_job, :b_stage, :b_group, :b_total, :b_cached, :b_succeeded, :b_rejected, "
-    ":b_failed) "
-    "ON CONFLICT (job, stage, cost_group) DO UPDATE SET "
-    "total = job_totals.total + excluded.total, cached = job_totals.cached + excluded.cached, "
-    "succeeded = job_totals.succeeded + excluded.succeeded, "
-    "rejected = job_totals.rejected + excluded.rejected, "
-    "failed = job_totals.failed + excluded.failed"
-)
 
 
 def add_results(connection: Connection, tasks: Collection[int]) -> None:
@@ -88,34 +78,6 @@ def remove_results(connection: Connection, tasks: Collection[int]) -> None:
     for batch in batches(tasks):
         rows = _RESULTS_BY_JOB.rows(connection, {"b_tasks": batch})
         _REMOVE_RESULTS.run_all(connection, [row._asdict() for row in rows])
-
-
-def add_planned(
-    connection: Connection, job: int, counts: Mapping[tuple[str, str, str], int]
-) -> None:
-    """Add planned tasks to the totals of a job: counts by stage, cost group and state."""
-    totals: dict[tuple[str, str], Counter[str]] = {}
-    for (stage, cost_group, state), count in counts.items():
-        total = totals.setdefault((stage, cost_group), Counter())
-        total["total"] += count
-        total[state] += count
-    rows: list[dict[str, object]] = []
-    for (stage, cost_group), total in totals.items():
-        succeeded = total[TaskState.succeeded]
-        rejected = total[TaskState.rejected]
-        rows.append(
-            {
-                "b_job": job,
-                "b_stage": stage,
-                "b_group": cost_group,
-                "b_total": total["total"],
-                "b_cached": succeeded + rejected,
-                "b_succeeded": succeeded,
-                "b_rejected": rejected,
-                "b_failed": total[TaskState.failed],
-            }
-        )
-    _ADD_PLANNED.run_all(connection, rows)
 
 
 # ---- Reading -------------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
     geometry = Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage)
     given = [Camera.model_validate(camera) for camera in scene["cameras"]]
     cameras = [scaled(camera, SIDE / camera.width) for camera in given] or [
-        stage.camera(name, geometry, SIDE) for name in FRAMING
+        stage.camera(name, geometry, (SIDE, SIDE)) for name in FRAMING
     ]
     colors = _colors(geometry)
     rows = []

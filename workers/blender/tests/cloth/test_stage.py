@@ -170,7 +170,9 @@ def test_bodies_are_where_the_record_has_them_and_a_little_inside(usual: Any) ->
 def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
     stage, geometry, track = usual
     names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
-    camera = framed("high", np.concatenate([track[-1], *stage.placed(2, track[-1])]), size=224)
+    camera = framed(
+        "high", np.concatenate([track[-1], *stage.placed(2, track[-1])]), size=(224, 224)
+    )
     points = geometry.points(track[-1], 2)
     truth = ground_truth(geometry, points, points, camera)
     seen = {names[code] for code in np.unique(truth["segmentation"])}
@@ -194,7 +196,7 @@ def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
 @pytest.mark.parametrize("name", FRAMING)
 def test_cameras_frame_what_moves_and_nothing_else(usual: Any, name: str) -> None:
     stage, geometry, track = usual
-    camera = stage.camera(name, geometry, 224)
+    camera = stage.camera(name, geometry, (224, 224))
     assert camera.position[1] < -0.2  # front: nothing hides the cloth there
     assert camera.overflow(track) == pytest.approx(camera.overflow(stage.moving()))
     assert -14.0 < camera.overflow(stage.moving()) < -6.0
@@ -204,7 +206,7 @@ def test_cameras_frame_what_moves_and_nothing_else(usual: Any, name: str) -> Non
 
 def test_a_camera_goes_around_what_hides_the_cloth() -> None:
     stage, geometry, _ = staged(screen=-0.15)
-    assert stage.camera("front", geometry, 224).position[1] > -0.05
+    assert stage.camera("front", geometry, (224, 224)).position[1] > -0.05
 
 
 def test_a_scene_without_a_plane_has_no_floor() -> None:
@@ -214,7 +216,7 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
     stage, geometry = set_up(scene, record)
     points = geometry.points(record["towel.positions"][0], 0)
     truth = ground_truth(
-        geometry, points, points, framed("front", record["towel.positions"], size=224)
+        geometry, points, points, framed("front", record["towel.positions"], size=(224, 224))
     )
     assert stage.floor is None
     assert np.isinf(truth["depth"][truth["segmentation"] == 0]).all()
@@ -247,7 +249,7 @@ def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
     result = TaskResult.model_validate(actor.render(task))
     assert isinstance(result.output, RenderOutput), result.message
     assert set(result.output.chunks) == {"video", "segmentation"}
-    camera = staged()[0].camera("high", staged()[1], 224)
+    camera = staged()[0].camera("high", staged()[1], (224, 224))
     np.testing.assert_allclose(result.output.labels["camera"], camera.numbers)
 
     chunk = result.output.chunks["segmentation"]
@@ -288,7 +290,7 @@ def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None
     _, geometry = set_up(scene, record)
     now, then = (geometry.points(record["towel.positions"][0], k) for k in (0, 1))
     middle, radius = np.array([0.3, 0.0, 0.04]), 0.04 - SUNK
-    camera = framed("high", corners_about(middle, 0.06), size=224)
+    camera = framed("high", corners_about(middle, 0.06), size=(224, 224))
     truth = ground_truth(geometry, now, then, camera)
     rows, columns = np.nonzero(
         truth["segmentation"] == scene_segments(scene["sheets"], scene["bodies"]).index("ball")
@@ -326,7 +328,7 @@ def test_normals_of_bodies_are_those_of_their_depth(
 ) -> None:
     _, geometry, track = usual
     names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
-    camera = framed("high", corners_about(middle, half), size=224)
+    camera = framed("high", corners_about(middle, half), size=(224, 224))
     points = geometry.points(track[0], 0)
     truth = ground_truth(geometry, points, points, camera)
     place = truth["depth"][..., None].astype(float) * rays(camera)

@@ -7,7 +7,7 @@ from typing import Any
 
 from stickslip_schemas.kinds.cloth.spec import ClipSpec, GroundTruth
 from stickslip_schemas.scene.document import Scene
-from stickslip_schemas.spec.arrays import CLIP_SIZE, REGIONS, ArrayLayout, array
+from stickslip_schemas.spec.arrays import REGIONS, ArrayLayout, array
 from stickslip_schemas.spec.names import Material
 
 KERNELS = ("baseline", "x86-64-v3", "x86-64-v4")
@@ -48,10 +48,20 @@ def over_time(
     )
 
 
+PICTURE_SIZE = array(
+    "picture_size",
+    "width and height of the picture of the sample, in the upper left of its frames [px]",
+    "int32",
+    {"side": 2},
+)
+"""Label of a dataset whose viewpoints have several resolutions."""
+
+
 def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
     """Return the arrays of clips and the labels of looks, which all kinds of cloth have."""
     # A clip shows some instants of the motion; the attribute says which.
-    pixels = {"frame": spec.frames, "y": CLIP_SIZE, "x": CLIP_SIZE}
+    width, height = spec.frame_size
+    pixels = {"frame": spec.frames, "y": height, "x": width}
     instants = {"instants": list(spec.shown_instants)}
     light = "azimuth and elevation of the lamp [degree], its power over the nominal"
     floor = (
@@ -69,6 +79,7 @@ def clip_arrays(spec: ClipSpec) -> tuple[ArrayLayout, ...]:
             attributes=instants,
         ),
         *_ground_truth_arrays(spec, pixels),
+        *((PICTURE_SIZE,) if spec.canvas else ()),
         *(
             codes(axis, spec.names(axis))
             for axis in ("texture", "viewpoint", "lighting", "substrate")

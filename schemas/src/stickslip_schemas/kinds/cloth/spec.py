@@ -1,7 +1,8 @@
 """Specs and documents that the kinds of cloth share: names that users add, presets, clips."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
+from math import prod
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 from pydantic import Field, ValidationError, model_validator
@@ -19,7 +20,7 @@ from stickslip_schemas.base import (
 )
 from stickslip_schemas.scene.parts import View
 from stickslip_schemas.spec.arrays import shown_frames
-from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, Seed, quantity
+from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, Seed, axis_values, quantity
 from stickslip_schemas.spec.cameras import Camera
 from stickslip_schemas.spec.jobs import Costs, JobSpec, Quality, Render
 from stickslip_schemas.spec.names import (
@@ -32,6 +33,14 @@ from stickslip_schemas.spec.names import (
     Texture,
     did_you_mean,
     name_schema,
+)
+from stickslip_schemas.spec.resolution import (
+    CLIP_PIXELS_MAX,
+    DEFAULT_RESOLUTION,
+    Resolution,
+    enclosing,
+    is_default,
+    resolution_field,
 )
 
 # Names of axes are checked by `_known_names`, which knows the definitions of the spec. The
@@ -57,6 +66,11 @@ LampAxis = Annotated[
 SubstrateAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Substrate"), name_schema(Substrate)]], SHORTHAND
 ]
+
+
+FRAME_COST = 0.1
+"""Share of the cost of a shading that is that of the whole frame: fitted to frames of 128 x 128 to
+640 x 480 (`benchmarks/clip_psnr.py`)."""
 
 
 class Custom(NamedTuple):
@@ -126,6 +140,21 @@ class ClipRender(Render):
     measured: float = 0.0
     light_seed: Seed
     crease_seed: Seed
+    canvas: Resolution | None = Field(
+        default=None,
+        exclude_if=lambda size: size is None,
+        description="width and height of the frames [px] if pictures of several sizes share a "
+        "dataset: a picture is in their upper left; null: frames have the size of the picture",
+    )
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of the pictures [px]."""
+        return (self.camera.width, self.camera.height) if self.camera else self.resolution
+
+    @property
+    def pixels(self) -> int:
+        return len(self.instants) * prod(self.picture_size)
 
     @property
     def shading(self) -> dict[str, Any]:
@@ -207,6 +236,15 @@ class ClipSpec(JobSpec):
             )
         },
     )
+    resolution: Resolution = resolution_field(
+        "width and height of the pictures [px], 64 to 1,920 each; a custom viewpoint may have "
+        "another one. Cameras of rigs and of scenes show at least what they show in a square "
+        "picture",
+        json_schema_extra={
+            "x-cost": "CPU time of rendering and sizes of files grow with the number of pixels: "
+            "640 x 480 takes 5 times as much as the default, 1,280 x 720 takes 11 times"
+        },
+    )
     creases: Float = Field(
         default=0.0,
         ge=0,
@@ -222,7 +260,8 @@ class ClipSpec(JobSpec):
         settings = {
             name: getattr(self, name) for name in ("quality", "creases", "ground_truth", "measured")
         }
-        return settings | {"instants": self.shown_instants}
+        sizes = {"resolution": self.resolution, "canvas": self.canvas}
+        return settings | sizes | {"instants": self.shown_instants}
 
     def clip_costs(self, simulate: float, uncertainty_factor: float) -> Costs:
         """Return CPU times of clips.
@@ -231,17 +270,59 @@ class ClipSpec(JobSpec):
         """
         # CPU time of shading a frame [s], fitted to `benchmarks/job_costs.py`.
         frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 3.3}
-        shade = frame_seconds[self.quality] * self.frames
+        # Most of it is in the window of the cloth, which grows with the shorter side; the rest is
+        # that of the whole frame.
+        area = self._mean_over_pictures(prod)
+        window = self._mean_over_pictures(lambda size: min(size) ** 2)
+        enlargement = (1.0 - FRAME_COST) * window + FRAME_COST * area
+        shade = frame_seconds[self.quality] * self.frames * enlargement
         # Composing a texture is cheap. Measuring its quality renders some frames again.
-        render = 0.01 * self.frames + self.measured * shade / 8
-        return Costs(simulate, render, shade, pack=0.02, uncertainty_factor=uncertainty_factor)
+        render = 0.01 * self.frames * enlargement + self.measured * shade / 8
+        return Costs(
+            simulate,
+            render,
+            shade,
+            pack=0.02 * area,
+            uncertainty_factor=uncertainty_factor,
+        )
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:
-        return f"{self.quality}, {self.frames} frames" if stage is Stage.render else ""
+        if stage is not Stage.render:
+            return ""
+        size = self.picture_size(point["viewpoint"])
+        pixels = "" if is_default(size) else f", {size[0]} x {size[1]}"
+        return f"{self.quality}, {self.frames} frames{pixels}"
 
     @property
     def segments(self) -> tuple[str, ...]:
         return SEGMENTS
+
+    def picture_size(self, viewpoint: str) -> tuple[int, int]:
+        """Return width and height of the pictures of a viewpoint [px]."""
+        meaning = self.meaning("viewpoint", viewpoint)
+        of_camera = meaning.resolution if isinstance(meaning, Calibration) else None
+        return of_camera or self.resolution
+
+    @property
+    def _picture_sizes(self) -> tuple[tuple[int, int], ...]:
+        """Different sizes of the pictures of a dataset [px]."""
+        viewpoints = axis_values(self.named_axes["viewpoint"])
+        return tuple(dict.fromkeys(self.picture_size(name) for name in viewpoints))
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """Width and height of the frames of all clips, the largest of the pictures [px]."""
+        return enclosing(self._picture_sizes)
+
+    def _mean_over_pictures(self, measure: Callable[[tuple[int, int]], int]) -> float:
+        """Return the mean of a measure of sizes over the pictures, over that of the default."""
+        values = [measure(size) for size in self._picture_sizes]
+        return sum(values) / len(values) / measure(DEFAULT_RESOLUTION)
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """The frame size if pictures of several sizes share it."""
+        return self.frame_size if len(self._picture_sizes) > 1 else None
 
     @property
     def shown_instants(self) -> tuple[int, ...]:
@@ -257,7 +338,7 @@ class ClipSpec(JobSpec):
         # The document has the name and its meaning, for two specs may define one name differently.
         meaning = self.meaning(axis, value)
         if isinstance(meaning, Calibration | View):
-            meaning = meaning.camera(value)
+            meaning = meaning.camera(value, self.resolution)
         return {
             axis: value,
             self.custom[axis].field: meaning.model_dump(mode="json")
@@ -336,10 +417,42 @@ class ClipSpec(JobSpec):
         return self
 
     @model_validator(mode="after")
+    def _lenses_show_their_pictures(self) -> Self:
+        # A calibration alone was checked with its own resolution or with the default.
+        errors = []
+        for name, meaning in self.viewpoints.items():
+            try:
+                meaning.check_lens(self.resolution)
+            except ValueError as error:
+                errors.append(
+                    InitErrorDetails(
+                        type=PydanticCustomError("value_error", "{rule}", {"rule": str(error)}),
+                        loc=("viewpoints", name),
+                        input=meaning.model_dump(mode="json"),
+                    )
+                )
+        if errors:
+            raise ValidationError.from_exception_data(type(self).__name__, errors)
+        return self
+
+    @model_validator(mode="after")
     def _frames_there_are(self) -> Self:
         if self.frames > self.instants:
             raise ValueError(
                 f"frames must be at most {self.instants}, the instants of the motion; got "
                 f"{self.frames}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _clip_fits_in_memory(self) -> Self:
+        width, height = self.frame_size
+        most = CLIP_PIXELS_MAX // (width * height)
+        if self.frames > most:
+            raise ValueError(
+                f"a clip must have at most {CLIP_PIXELS_MAX} pixels in all frames, because its "
+                f"shading is held in memory: {self.frames} frames of {width} x {height} have "
+                f"{self.frames * width * height}. Set frames to {most} or fewer, or choose a "
+                "smaller resolution"
             )
         return self

@@ -16,6 +16,24 @@ from stickslip_blender.cloth.geometry import BACKGROUND, Geometry
 from stickslip_blender.cycles.pixels import encode
 from stickslip_blender.raster import Window, _raster, decoded, projected, see
 
+NOTHING = {"depth": np.inf, "segmentation": BACKGROUND, "normals": 0.0, "uv": np.nan, "flow": 0.0}
+"""Values of pixels that show nothing, by name of the ground truth."""
+
+
+def on_canvas(
+    frames: npt.NDArray[Any], canvas: tuple[int, int] | None, nothing: float = 0
+) -> npt.NDArray[Any]:
+    """Return frames (n, height, width, ...) in the upper left of a canvas (width, height) [px].
+
+    The rest of the canvas shows `nothing`. Without a canvas, frames stay as they are.
+    """
+    if canvas is None:
+        return frames
+    width, height = canvas
+    widened = np.full((len(frames), height, width, *frames.shape[3:]), nothing, frames.dtype)
+    widened[:, : frames.shape[1], : frames.shape[2]] = frames
+    return widened
+
 
 def apply_lens_distortion(video: npt.NDArray[np.uint8], camera: Camera) -> npt.NDArray[np.uint8]:
     """Return a video (frames, height, width, 3) as its camera shows it, 8-bit sRGB.

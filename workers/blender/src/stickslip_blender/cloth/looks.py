@@ -196,6 +196,7 @@ def drawn_light(name: str, seed: int, custom: LampNumbers | None = None) -> Ligh
 GRAIN_SIZE = 512  # side of the picture of a floor's grain [texels]
 GRAIN_EXTENT = 0.5  # side of the square that the picture covers [m]; the picture repeats
 _SUBSAMPLES = 3
+_FACTOR_PIXELS = 2**17  # pixels whose rays are traced at once: they take 200 MB of memory
 HARD = (
     "aluminium",
     "aluminium-pet",
@@ -278,10 +279,25 @@ def floor_factor(
     """
     if height is None:
         return np.ones((camera.height, camera.width, 3), dtype=np.float32)
+    marks = _marks(substrate)
+    rows_at_once = max(_FACTOR_PIXELS // camera.width, 1)
+    bands = []
+    for top in range(0, camera.height, rows_at_once):
+        band = range(top, min(top + rows_at_once, camera.height))
+        bands.append(_factor_of_rows(marks, camera, height, band))
+    factor = np.concatenate(bands)
+    return np.asarray(factor[..., None] * substrate.tint, dtype=np.float32)
+
+
+def _factor_of_rows(
+    marks: npt.NDArray[np.float64], camera: Camera, height: float, band: range
+) -> npt.NDArray[np.float64]:
+    """Return the factor of the marks in some rows of the frame, (rows, width)."""
     # Trace several rays through each pixel, because marks far away are finer than a pixel.
     step = (np.arange(_SUBSAMPLES) + 0.5) / _SUBSAMPLES - 0.5
     rows, columns = (
-        (np.arange(size)[:, None] + step).ravel() for size in (camera.height, camera.width)
+        (np.arange(pixels.start, pixels.stop)[:, None] + step).ravel()
+        for pixels in (band, range(camera.width))
     )
     across, down = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
     ray = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.asarray(camera.rotation)
@@ -290,17 +306,16 @@ def floor_factor(
     place = (camera.position[:2] + reach * ray[..., :2]) * (GRAIN_SIZE / GRAIN_EXTENT)
     low = np.floor(place).astype(int)
     right, lower = np.moveaxis(place - low, -1, 0)
-    marks = _marks(substrate)
 
     # Marks repeat over the floor. Interpolate between the four marks around each sample.
     (i, j), (k, m) = (np.moveaxis(corner % GRAIN_SIZE, -1, 0) for corner in (low, low + 1))
     upper_row = marks[j, i] + right * (marks[j, k] - marks[j, i])
     lower_row = marks[m, i] + right * (marks[m, k] - marks[m, i])
     samples = upper_row + lower * (lower_row - upper_row)
-    factor = samples.reshape(camera.height, _SUBSAMPLES, camera.width, _SUBSAMPLES).mean(
-        axis=(1, 3)
-    )
-    return np.asarray(factor[..., None] * substrate.tint, dtype=np.float32)
+    factor: npt.NDArray[np.float64] = samples.reshape(
+        len(band), _SUBSAMPLES, camera.width, _SUBSAMPLES
+    ).mean(axis=(1, 3))
+    return factor
 
 
 def _marks(substrate: Substrate) -> npt.NDArray[np.float64]:

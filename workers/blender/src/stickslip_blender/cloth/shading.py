@@ -35,10 +35,13 @@ from stickslip_blender.cloth.geometry import Geometry, mirrored
 from stickslip_blender.cloth.looks import Substrate
 from stickslip_blender.raster import (
     GRID,
+    Albedo,
     Seen,
     Textures,
     Window,
     _raster,
+    albedo_of_window,
+    coverage_of_window,
     projected,
     scaled,
     see,
@@ -63,7 +66,8 @@ _PROP_GRID = 3
 # value comes from a comparison with Cycles.
 _LOBE = 1.9
 _SURE_COVERAGE = 0.02  # coverage by mirrored cloth from which its colour counts in full
-_PATH_BLUR = 6.0  # width of the mean of the lengths of mirrored paths [px]
+_PATH_BLUR = 6.0  # width of the mean of the lengths of mirrored paths [px of the default size]
+_MIRROR_MARGIN = 12  # about a mirror image, for its blur [px of the default size]
 
 Floats = npt.NDArray[np.float32]
 
@@ -83,12 +87,15 @@ class Composer:
         floor: Floats,
         textures: Textures,
         pictures: npt.NDArray[np.uint8],
+        *,
+        enlargement: float = 1.0,
     ) -> tuple[float, float]:
         """Compose a frame's shading with all textures, into `pictures`.
 
         The shading is (FINE height, FINE width, 3). `points` are all vertices of the scene at that
         instant (V, 3) [m], and `floor` has the form that `floor_factor` returns. `pictures` has the
         pictures of the frame before, or zeros, 8-bit sRGB, shape (textures, height, width, 3).
+        `enlargement` is the shorter side of the pictures over that of the default resolution.
 
         Returns the share of the frame that is cloth, and the share of the cloth that is visible.
         The area of the cloth is its area as the camera sees it, with nothing in front.
@@ -97,8 +104,7 @@ class Composer:
         # each texture.
         window = self._window(points, camera).times(FINE)
         parts = scaled(camera, FINE)
-        seen = see(projected(parts, points), self._geometry.triangles, window, GRID // FINE)
-        sight = see_albedo(seen, self._geometry.uv, textures, self._geometry.cloth_triangles)
+        sight = self._albedo(projected(parts, points), window, GRID // FINE, textures)
         colors = 3 * textures.count
 
         # On a floor that mirrors, the light from the cloth has the colour of its mirror image. On
@@ -106,14 +112,16 @@ class Composer:
         reflected = np.empty((0, 0, colors), dtype=np.float32)
         around = Window(0, 0, 0, 0)
         if substrate.mirrors and self._geometry.surroundings.floor is not None:
-            reflected, around = self._mirror(sight.overall, points, camera, substrate, textures)
+            reflected, around = self._mirror(
+                sight.overall, points, camera, substrate, textures, enlargement
+            )
         _raster.compose(
             np.ascontiguousarray(shading).view(np.uint16),
             (SHOWN[1], *ELSEWHERE[1:]),
             sight.overall.ravel(),
             sight.coverage,
             sight.mean.reshape(*sight.coverage.shape, colors),
-            seen.window.place,
+            window.place,
             reflected,
             around.place,
             self._tinted(floor, points, camera),
@@ -121,7 +129,7 @@ class Composer:
         )
         # Divide the samples of visible cloth by the samples of its projected area.
         frame = parts.width * parts.height
-        visible = sight.hits.sum() / seen.grid**2 / max(sight.area, 1e-9)
+        visible = sight.hits.sum() / (GRID // FINE) ** 2 / max(sight.area, 1e-9)
         return float(sight.coverage.sum()) / frame, float(min(visible, 1.0))
 
     def floor_factor(
@@ -133,11 +141,17 @@ class Composer:
         """
         window = self._window(points, camera).times(fine)
         parts = scaled(camera, fine)
-        seen = see(projected(parts, points), self._geometry.triangles, window, GRID // fine)
         # The direct rendering has the cloth's own colours. The factor is 1 as far as cloth covers a
         # pixel.
         cover = np.zeros((parts.height, parts.width), dtype=np.float32)
-        cover[window.slices] = seen.share_below(self._geometry.cloth_triangles)
+        geometry = self._geometry
+        cover[window.slices] = coverage_of_window(
+            projected(parts, points),
+            geometry.triangles,
+            window,
+            GRID // fine,
+            geometry.cloth_triangles,
+        )
         marks = (
             (self._tinted(floor, points, camera) - 1.0).repeat(fine, axis=0).repeat(fine, axis=1)
         )
@@ -186,6 +200,21 @@ class Composer:
         )
         return factor
 
+    def _albedo(
+        self, points: npt.NDArray[np.float64], window: Window, grid: int, textures: Textures
+    ) -> Albedo:
+        """Return the cloth in a window, from projected vertices (V, 3)."""
+        geometry = self._geometry
+        return albedo_of_window(
+            points,
+            geometry.triangles,
+            window,
+            grid,
+            uv=geometry.uv,
+            textures=textures,
+            cloth=geometry.cloth_triangles,
+        )
+
     def _window(self, points: npt.NDArray[np.float64], camera: Camera) -> Window:
         return window_about(projected(camera, points[: self._geometry.cloth_vertices]), camera)
 
@@ -196,20 +225,20 @@ class Composer:
         camera: Camera,
         substrate: Substrate,
         textures: Textures,
+        enlargement: float,
     ) -> tuple[Floats, Window]:
         """Return the albedo of the cloth that the floor mirrors, (height, width, 3 textures)."""
-        cloth = self._geometry.cloth_triangles
         floor = self._geometry.surroundings.floor
         assert floor is not None
         below = projected(camera, mirrored(points, floor))
-        window = window_about(below[: self._geometry.cloth_vertices], camera, margin=12)
+        margin = round(_MIRROR_MARGIN * enlargement)
+        window = window_about(below[: self._geometry.cloth_vertices], camera, margin)
         nothing = np.empty((0, 0, 3 * textures.count), dtype=np.float32), Window(0, 0, 0, 0)
         if not window.area:
             return nothing
 
         # Make the mirror image of the cloth, as if the floor were a window.
-        seen = see(below, self._geometry.triangles, window, _MIRROR_GRID)
-        sight = see_albedo(seen, self._geometry.uv, textures, cloth)
+        sight = self._albedo(below, window, _MIRROR_GRID, textures)
         if not sight.coverage.any():
             return nothing
 
@@ -217,7 +246,7 @@ class Composer:
         # edge of the cloth has no depth, so take the mean around it.
         beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
         shown = sight.coverage[..., None]
-        wide = np.full(beyond.shape, _PATH_BLUR, dtype=np.float32)
+        wide = np.full(beyond.shape, _PATH_BLUR * enlargement, dtype=np.float32)
         around = _raster.blurred(
             np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide
         )

@@ -48,7 +48,7 @@ _TURNS = (0.0, *(sign * 30.0 * step for step in range(1, 6) for sign in (1, -1))
 _ENOUGH = 0.6
 _WATCHED = 60  # instants for finding the moving vertices
 _TURN_INSTANTS = 5  # instants for measuring the visible cloth of a turn
-_THUMB = 56  # side of the pictures for turns [px]
+_THUMB = 56  # shorter side of the pictures for turns [px]
 
 Array = npt.NDArray[Any]
 
@@ -131,8 +131,8 @@ class Stage:
             parts.append(places[:, moves].reshape(-1, 3))
         return np.concatenate(parts)
 
-    def camera(self, name: str, geometry: Geometry, size: int) -> Camera:
-        """Return the camera that frames everything that moves.
+    def camera(self, name: str, geometry: Geometry, size: tuple[int, int]) -> Camera:
+        """Return the camera that frames everything that moves in pictures of a size [px].
 
         It is turned until enough of the sheet is visible.
         """
@@ -142,9 +142,10 @@ class Stage:
         scenes = [geometry.points(track[instant], int(instant)) for instant in instants]
         # Take the first turn that shows nearly as much as the best one. A camera from far around
         # would surprise.
+        reduction = _THUMB / min(size)
+        thumb = (round(reduction * size[0]), round(reduction * size[1]))
         shown = [
-            _shown(framed(name, points, size=_THUMB, turn=turn), geometry, scenes)
-            for turn in _TURNS
+            _shown(framed(name, points, size=thumb, turn=turn), geometry, scenes) for turn in _TURNS
         ]
         turn = next(
             turn for turn, seen in zip(_TURNS, shown, strict=True) if seen >= _ENOUGH * max(shown)

@@ -7,7 +7,7 @@ compiled part is `_raster`. raster/raster.hpp defines the places of the samples 
 textures.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -23,6 +23,9 @@ GRID = 12
 
 Silhouettes are then within 0.0005 of their coverage.
 """
+
+_BAND_SAMPLES = 2**24
+"""Samples of a window that are looked up at once: they take 200 MB of memory."""
 
 _LANES = 8  # channels are padded to a multiple of this
 
@@ -53,6 +56,16 @@ class Window:
     def times(self, fine: int) -> "Window":
         """Return the same part of a frame with fine x fine pixels for each pixel."""
         return Window(fine * self.left, fine * self.top, fine * self.right, fine * self.bottom)
+
+    def bands(self, grid: int) -> Iterator["Window"]:
+        """Yield the window in bands of rows, each of at most `_BAND_SAMPLES` samples or one row.
+
+        A pixel has grid x grid samples.
+        """
+        samples = max(self.right - self.left, 1) * grid**2
+        rows = max(_BAND_SAMPLES // samples, 1)
+        for top in range(self.top, max(self.bottom, self.top + 1), rows):
+            yield replace(self, top=top, bottom=min(top + rows, self.bottom))
 
     @property
     def place(self) -> tuple[int, int, int, int]:
@@ -233,3 +246,47 @@ def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, clot
     """
     packed = textures.texels, textures.count, seen.window.place, seen.grid
     return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))
+
+
+def albedo_of_window(
+    points: Points,
+    triangles: Indices,
+    window: Window,
+    grid: int,
+    *,
+    uv: npt.NDArray[np.float64],
+    textures: Textures,
+    cloth: int,
+) -> Albedo:
+    """Look up what a window sees of the first `cloth` triangles, band by band.
+
+    The arguments are those of `see` and `see_albedo`. Bands bound the memory.
+    """
+    sights: list[Albedo] = []
+    for band in window.bands(grid):
+        seen = see(points, triangles, band, grid)
+        sights.append(see_albedo(seen, uv, textures, cloth))
+    if len(sights) == 1:
+        return sights[0]
+    # The mean of all visible cloth is that of the bands, by the samples that see cloth.
+    weights = np.array([float(sight.hits.sum()) for sight in sights])
+    share = weights / max(weights.sum(), 1.0)
+    overall = sum(
+        (part * sight.overall for part, sight in zip(share, sights, strict=True)),
+        np.zeros_like(sights[0].overall, dtype=np.float64),
+    )
+    return Albedo(
+        coverage=np.concatenate([sight.coverage for sight in sights]),
+        mean=np.concatenate([sight.mean for sight in sights]),
+        hits=np.sum([sight.hits for sight in sights], axis=0, dtype=np.int32),
+        overall=np.asarray(overall, dtype=np.float32),
+        area=sights[0].area,
+    )
+
+
+def coverage_of_window(
+    points: Points, triangles: Indices, window: Window, grid: int, end: int
+) -> npt.NDArray[np.float32]:
+    """Return the share of each pixel that sees a triangle before `end`, band by band."""
+    bands = window.bands(grid)
+    return np.concatenate([see(points, triangles, band, grid).share_below(end) for band in bands])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stickslip_schemas.spec.arrays import CLIP_SIZE
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry
@@ -26,7 +25,7 @@ def render(look: ClothSceneRender, task: RenderTask, context: RenderContext) -> 
 
     def frame(geometry: Geometry) -> Camera:
         return (
-            stage.camera(look.viewpoint, geometry, CLIP_SIZE)
+            stage.camera(look.viewpoint, geometry, look.resolution)
             if look.rig is None
             else rig_camera(look)
         )

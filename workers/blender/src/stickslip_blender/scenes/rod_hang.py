@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
 from stickslip_schemas.format.pictures import png
-from stickslip_schemas.spec.cameras import Camera, load_rig
+from stickslip_schemas.spec.cameras import Camera, rig_cameras
 from stickslip_schemas.spec.jobs import Quality
 
 from stickslip_blender.cycles.engine import SAMPLING, Sampling, new_scene, set_sampling
@@ -238,7 +238,7 @@ class RodRenderer:
 
 def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> TaskResult:
     """Render the views of a rod."""
-    cameras = load_rig(look.rig)
+    cameras = rig_cameras(look.rig, look.resolution)
     line = context.record(task.record)["centerline"]
     if rejected := why_unfit("rod", line, look.radius, cameras):
         return rejected

@@ -31,7 +31,7 @@ from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import histograms, losses, sliders, thumbs
 from stickslip_services.pages.motion import motion
-from stickslip_services.pages.pictures import coloured, mp4
+from stickslip_services.pages.pictures import coloured, mp4, shown_part
 from stickslip_services.pages.rendering import html_page, plot, spec_text, table
 from stickslip_services.pages.sample_page import sample_view
 from stickslip_services.pages.samples import Array, SampleData
@@ -50,7 +50,7 @@ PICTURE_SECONDS = 24 * 3600
 """Time for which a browser keeps a picture [s]."""
 
 Slot = Annotated[int, Path(ge=0)]
-Step = Annotated[int, Query(ge=1, le=8)]
+Step = Annotated[int, Query(ge=1, le=32)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +174,8 @@ def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
         raise NotFoundError(f"{array[:50]} is no clip")
-    frames = [coloured(data.arrays[array], values, index) for index in range(len(values))]
-    return Response(mp4(frames), media_type="video/mp4")
+    film = mp4(coloured(data.arrays[array], values, range(len(values))))
+    return Response(film, media_type="video/mp4")
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
@@ -206,7 +206,8 @@ def get_picture(
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
         raise NotFoundError(f"{array[:50]} has no picture {index}")
-    content = png(coloured(data.arrays[array], values, index)[::step, ::step])
+    (picture,) = coloured(data.arrays[array], values, [index])
+    content = png(picture[::step, ::step])
     return Response(content, media_type="image/png", headers=headers)
 
 
@@ -228,7 +229,8 @@ def _value(data: SampleData, array: str, slot: int) -> Array:
     if array not in data.arrays or slot >= data.manifest.sample_count:
         raise NotFoundError(f"the dataset has no {array[:50]!r} of sample {slot}")
     try:
-        return data.read(array, slot)
+        size = data.picture_size(slot)
+        return shown_part(data.arrays[array], data.read(array, slot), size)
     except KeyError as error:
         raise NotFoundError(f"sample {slot} has no {array[:50]!r}") from error
 
