@@ -92,7 +92,7 @@ def ball_of_a_cell(cells: int) -> str:
 
 
 def rod_of_a_quarter(cells: int) -> str:
-    """A rod with a radius of a quarter of a cell is too sharp."""
+    """A rod with a radius of a quarter of a cell carries the napkin, or is too sharp."""
     return _caught(cells, lambda _: [cylinder(1.0, 0.25 * SIDE / cells, rotation=ALONG_Y)])
 
 
@@ -324,7 +324,7 @@ EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingPr
             (napkin_on_floor, ("right",)),
             (rod_of_a_cell, ("right",)),
             (ball_of_a_cell, ("right",)),
-            (rod_of_a_quarter, ("sharpness",)),
+            (rod_of_a_quarter, ("right", "friction_error")),
             (rod_of_half, ("right",)),
             (wide_rod, ("right",)),
             (table_corner, ("right",)),

@@ -46,6 +46,11 @@ class Seen:
     """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact.
     """
 
+    uneven_end: float | None = None
+    """Distance of what drives the cloth from an even motion in the last step, up to the last frame
+    [m]. None: the last step ends there, or all of it counts.
+    """
+
     others: Sequence[str] = ()
     """Names of all bodies, then of all surfaces, then of all sheets; without them, numbers."""
 
@@ -88,7 +93,7 @@ CHECKS = (
         "jumps",
         "distance of a body, holder or surface from an even motion within a step, over the "
         "preset's step error",
-        lambda seen: seen.total.uneven / (seen.cloth.preset.step_error or STEP_ERROR),
+        lambda seen: _uneven(seen) / (seen.cloth.preset.step_error or STEP_ERROR),
         1.0,
         "steps are halved until it is 0.25; where the shortest are not enough, something "
         "jumps or is shaken by 40 g",
@@ -167,13 +172,15 @@ CHECKS = (
     ),
     Check(
         "friction_error",
-        "bound on the error of the coefficient of friction with one body, surface or sheet, where "
-        "friction does the work that lifts the cloth by a cell: mean over this work of e, where "
-        "cloth that turns by an angle a along a cell has e = a^4/100 at vertices, which are "
+        "relative error of the coefficient of friction with one body, surface or sheet by the size "
+        "of cells: mean of e over the work of friction, where this work lifts the cloth by a cell. "
+        "Cloth that turns by an angle a along a cell has e = a^4/100 at vertices, which are "
         "corrected for cells, and a^2/8 elsewhere and over radii below 0.7 cells",
         lambda seen: max(_friction_errors(seen.cloth), default=0.0),
-        0.1,
-        "LIMIT",
+        0.03,
+        "18 strips pulled over box edges and creases of meshes of 0.25 to 2 cells, mu 0.1 to 0.6: "
+        "at most 0.013 where mu is right within 2 %, at least 0.053 where it is 5 % off or more, "
+        "and 0.24 to 0.93 where cells catch",
         advice=lambda seen: _sharpest(seen),
     ),
     Check(
@@ -191,6 +198,14 @@ CHECKS = (
     ),
 )
 """All checks. The first that fails is the reason, so causes come before their consequences."""
+
+
+def _uneven(seen: Seen) -> float:
+    uneven = seen.cloth.history.column("uneven")
+    # What happens after the last frame is not shown, and is no fault of what is.
+    if seen.uneven_end is not None:
+        uneven = np.append(uneven[:-1], seen.uneven_end)
+    return float(uneven.max(initial=0.0))
 
 
 def _unconverged(cloth: Cloth) -> float:
@@ -215,7 +230,7 @@ def _cell(cloth: Cloth) -> float:
 
 
 def _friction_errors(cloth: Cloth) -> list[float]:
-    """Return the bound on the error of friction with each body, surface and sheet."""
+    """Return the relative error of friction with each body, surface and sheet."""
     lift = _lift(cloth)
     friction = np.moveaxis(cloth.history.friction, 1, 0)
     return [worst_stretch(other[:, 1], other[:, 0], lift) for other in friction]

@@ -9,7 +9,7 @@ import numpy as np
 from stickslip_sim_core._sim_core import StepReport
 from stickslip_sim_core.arrays import Floats
 
-_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed")
+_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed", "uneven")
 
 
 class StepHistory:
@@ -23,7 +23,14 @@ class StepHistory:
         """Add a step of `duration` [s]."""
         extremes = report.seen
         self._rows.append(
-            (duration, extremes.contact_work, extremes.flow, report.unconverged, report.missed)
+            (
+                duration,
+                extremes.contact_work,
+                extremes.flow,
+                report.unconverged,
+                report.missed,
+                report.uneven,
+            )
         )
         self._friction.append(extremes.friction)
 
@@ -40,7 +47,7 @@ class StepHistory:
         """Return a number of each step: (steps,).
 
         `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
-        `missed`, both 0 or 1.
+        `missed`, both 0 or 1; `uneven` [m], see `StepReport`.
         """
         rows = np.array(self._rows, float).reshape(-1, len(_COLUMNS))
         return np.asarray(rows[:, _COLUMNS.index(name)])

@@ -15,6 +15,7 @@ from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.scenes.evenness import uneven_until
 from stickslip_sim_core.scenes.frames import frame_at
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
@@ -231,7 +232,13 @@ class Scene:
         for name, at in self.tracks.items():
             record[name] = np.stack([np.asarray(at(float(time))) for time in times])
         # Without self-contact cloth may pass through itself, so crossings are no fault.
-        evidence = checks.Seen(cloth, path, max(crossed) if self.self_contact else 0, self.others)
+        evidence = checks.Seen(
+            cloth,
+            path,
+            max(crossed) if self.self_contact else 0,
+            uneven_until(times[-1], cloth, hands.driving(self.motion)),
+            self.others,
+        )
         worst = checks.values(evidence)
         # A start that is no equilibrium spoils the run even if all checks pass.
         code, reason = (
