@@ -374,7 +374,11 @@ def expressions() -> list[str]:
     return [*found, scaled["spec"]["triggers"][0]["metadata"]["query"]]
 
 
-STATES: dict[str, set[str]] = {"stickslip_tasks": set(TaskState), "stickslip_jobs": set(JobState)}
+STATES: dict[str, set[str]] = {
+    "stickslip_tasks": set(TaskState),
+    "stickslip_jobs": set(JobState),
+    "stickslip_disk_bytes": {"free", "used"},
+}
 
 
 @pytest.mark.parametrize("expression", expressions())

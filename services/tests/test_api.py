@@ -453,7 +453,7 @@ def test_metrics_tell_how_tasks_ended_and_what_is_stored(
         'stickslip_task_failures_total{outcome="failed",reason="renderer_crash",stage="render"} 2.0'
         in text
     )
-    assert 'stickslip_store_disk_bytes{state="free"}' in text
+    assert 'stickslip_disk_bytes{place="store",state="free"}' in text
     assert "stickslip_dataset_versions 0.0" in text
     assert 'stickslip_info{version="' in text
 

@@ -1,9 +1,6 @@
 """The service below a path: links, answers and refusals with a prefix, and pages behind nginx."""
 
 import re
-import shutil
-import socket
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +11,8 @@ from stickslip_services.app import make_app
 from stickslip_services.errors import SettingsError
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import serving, wait_until
+from stickslip_testing.nginx import nginx
+from stickslip_testing.servers import serving
 from stickslip_testing.worker import DirectApi, PretendWorker
 
 
@@ -100,63 +98,22 @@ def test_a_prefix_opens_nothing_without_a_key(tmp_path: Path) -> None:
         assert httpx.get(f"{url}/lab/livez").status_code == 200
 
 
-NGINX = """
-daemon off;
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-events {{}}
-http {{
-  access_log off;
-  {temporary}
-  server {{
-    listen 127.0.0.1:{port};
-    location /stickslip/ {{
-      proxy_pass {service};
-      proxy_http_version 1.1;
-      proxy_set_header Host $http_host;
-      proxy_set_header X-Forwarded-Prefix /stickslip;
-      proxy_buffering off;
-    }}
-  }}
-}}
-"""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture
 def behind_nginx(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """The address of a service below /stickslip/ of nginx, and its own."""
-    program = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin")
-    if program is None:
-        pytest.skip("nginx is not installed: apt-get install nginx")
-    port = free_port()
     with serving(make_app(Settings(data=tmp_path / "data", durable=False))) as service:
-        kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-        temporary = " ".join(f"{kind}_temp_path {tmp_path}/{kind};" for kind in kinds)
-        configuration = tmp_path / "nginx.conf"
-        # The slash at the end makes nginx strip the prefix.
-        text = NGINX.format(folder=tmp_path, port=port, service=f"{service}/", temporary=temporary)
-        configuration.write_text(text)
-        process = subprocess.Popen([program, "-c", str(configuration), "-e", "stderr"])
-        try:
-            address = f"http://127.0.0.1:{port}/stickslip"
-            wait_until(lambda: is_answering(f"{address}/livez"))
-            yield address, service
-        finally:
-            process.terminate()
-            process.wait(20)
-
-
-def is_answering(url: str) -> bool:
-    try:
-        return httpx.get(url).status_code == 200
-    except httpx.TransportError:
-        return False
+        # The slash at the end of the service's address makes nginx strip the prefix.
+        location = f"""
+            location /stickslip/ {{
+              proxy_pass {service}/;
+              proxy_http_version 1.1;
+              proxy_set_header Host $http_host;
+              proxy_set_header X-Forwarded-Prefix /stickslip;
+              proxy_buffering off;
+            }}
+        """
+        with nginx(tmp_path, server=location) as address:
+            yield f"{address}/stickslip", service
 
 
 @pytest.mark.real

@@ -15,9 +15,13 @@ MAX_SLOTS = 100_000
 
 
 class WorkerCondition(Document):
-    """How a dispatcher is: `starting` until its Ray cluster answers."""
+    """How a dispatcher is.
 
-    state: Literal["starting", "ready"] = "ready"
+    It is `starting` until its Ray cluster answers, and `stopped` after a signal to stop, when its
+    silence is no fault.
+    """
+
+    state: Literal["starting", "ready", "stopped"] = "ready"
     slots: Int = Field(ge=0, le=MAX_SLOTS, description="number of tasks that run at once")
     reason: str = Field(
         default="", max_length=1000, description="why it is not ready, or what is wrong; for people"

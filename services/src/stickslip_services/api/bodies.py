@@ -41,6 +41,9 @@ LARGE_BYTES = 2**20
 """Larger documents are read one at a time [bytes]: a report of a worker of 16 MiB takes 0.3 GB and
 1 s, in which other requests wait for the interpreter."""
 
+MAX_DIGITS = 4000
+"""Digits of an integer: Python converts no more than 4,300, and its message is for programmers."""
+
 SHOWN_ERRORS = 20
 """Wrong fields that an answer lists."""
 
@@ -163,6 +166,13 @@ def _parse(body: bytes) -> tuple[Any, list[str]]:
     """
     not_finite: list[str] = []
 
+    def to_int(text: str) -> int:
+        if len(text) > MAX_DIGITS:
+            raise ValueError(
+                f"an integer must have at most {MAX_DIGITS} digits, and one has {len(text)}"
+            )
+        return int(text)
+
     def to_float(text: str) -> float:
         number = float(text)
         if not isfinite(number):
@@ -174,6 +184,7 @@ def _parse(body: bytes) -> tuple[Any, list[str]]:
         values = json.loads(
             text,
             object_pairs_hook=_object_without_duplicates,
+            parse_int=to_int,
             parse_float=to_float,
             parse_constant=to_float,
         )
@@ -182,10 +193,22 @@ def _parse(body: bytes) -> tuple[Any, list[str]]:
             json.dumps(values, ensure_ascii=False).encode("utf-8")
     except RecursionError as error:
         raise _too_deep() from error
-    # Bytes that are not UTF-8 are a ValueError, too, and integers of more than 4,300 digits.
     except ValueError as error:
-        raise malformed(str(error)) from error
+        raise malformed(_syntax_fault(error)) from error
     return values, not_finite
+
+
+def _syntax_fault(error: ValueError) -> str:
+    """Return what is wrong with the text of a body, without words for programmers."""
+    match error:
+        case UnicodeDecodeError():
+            return f"it must be text in UTF-8, and byte {error.start} is not"
+        case UnicodeEncodeError():
+            return f"it must not have the lone surrogate {error.object[error.start]!a}"
+        case json.JSONDecodeError():
+            return f"{error.msg}, line {error.lineno}, column {error.colno}"
+        case _:
+            return str(error)
 
 
 def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:

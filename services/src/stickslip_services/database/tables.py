@@ -226,6 +226,8 @@ job_totals = _table(
     sa.Column("wall_count", sa.Integer, nullable=False, server_default="0"),
     sa.Column("wall_sum", sa.Float, nullable=False, server_default="0"),
     sa.Column("wall_squares", sa.Float, nullable=False, server_default="0"),
+    # When the last result was added: a job without progress shows by it.
+    sa.Column("updated_at", sa.Float),
     sa.Index("ix_job_totals_failed", "job", **_partial("failed > 0")),
 )
 

@@ -180,7 +180,8 @@ def _setting(name: str, schema: Schema, whole: Schema) -> Setting | None:
     choices = _choices(schema)
     kind = "choice" if choices else _SCALARS.get(str(schema.get("type")))
     if schema.get("type") == "array":
-        choices = _choices(_resolved(schema["items"], whole))
+        # A tuple, such as a size, has no single kind of item, and no field.
+        choices = _choices(_resolved(schema.get("items", {}), whole))
         kind = "several" if choices else None
     if kind is None:
         return None

@@ -30,6 +30,7 @@ class _Results(NamedTuple):
     b_wall_count: int
     b_wall: float
     b_wall_squares: float
+    b_updated: float | None
 
 
 # The cost of a task is that of the jobs for which it ran: not of one that found the result.
@@ -44,7 +45,8 @@ _RESULTS_BY_JOB = RowQuery(
         "count(CASE WHEN job_tasks.cached THEN NULL ELSE tasks.wall_seconds END), "
         "coalesce(sum(CASE WHEN job_tasks.cached THEN 0 ELSE tasks.wall_seconds END), 0.0), "
         "coalesce(sum(CASE WHEN job_tasks.cached THEN 0 "
-        "ELSE tasks.wall_seconds * tasks.wall_seconds END), 0.0) "
+        "ELSE tasks.wall_seconds * tasks.wall_seconds END), 0.0), "
+        "max(tasks.finished_at) "
         "FROM tasks CROSS JOIN job_tasks CROSS JOIN jobs "
         "WHERE tasks.seq IN :b_tasks AND job_tasks.task = tasks.seq "
         "AND jobs.seq = job_tasks.job AND jobs.finished_at IS NULL "
@@ -56,7 +58,8 @@ _ADD_RESULTS = Statement(
     "rejected = rejected + :b_rejected, "
     "failed = failed + :b_failed, cpu_seconds = cpu_seconds + :b_cpu, "
     "wall_count = wall_count + :b_wall_count, wall_sum = wall_sum + :b_wall, "
-    "wall_squares = wall_squares + :b_wall_squares "
+    "wall_squares = wall_squares + :b_wall_squares, "
+    "updated_at = coalesce(:b_updated, updated_at) "
     "WHERE job = :b_job AND stage = :b_stage AND cost_group = :b_group"
 )
 _REMOVE_RESULTS = Statement(

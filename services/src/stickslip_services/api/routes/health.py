@@ -5,6 +5,7 @@ The queue and the store are read at each scrape; counters count since the start.
 
 from collections import Counter as Counts
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
@@ -21,8 +22,10 @@ from prometheus_client.registry import Collector
 from sqlalchemy import func, select, text
 from stickslip_schemas.base import Document
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
+from stickslip_schemas.store import DirectoryStore, Store
 
 from stickslip_services import __version__
+from stickslip_services.access.keys import keys_that_expire
 from stickslip_services.access.principals import refuse_projects
 from stickslip_services.api.routes.common import ContextDep, StrictRoute, problem_responses
 from stickslip_services.database.tables import dataset_versions, jobs
@@ -30,6 +33,7 @@ from stickslip_services.database.tables import tasks as tasks_
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.rows import IS_LEASED
 from stickslip_services.queue.totals import count_tasks
+from stickslip_services.queue.watch import MAX_IDLE_JOBS, idle_jobs, silent_workers
 from stickslip_services.queue.workers import alive_workers
 
 
@@ -55,10 +59,12 @@ class _QueueCollector(Collector):
             count, size, bad, read_at = connection.execute(
                 select(*sums).where(columns.manifest.is_not(None))
             ).one()
+            now = self._context.clock()
+            idle = idle_jobs(connection, now)
+            silent = silent_workers(connection, now)
+            expiring = keys_that_expire(connection, now)
         # Without a version there is nothing to scrub.
-        age = self._context.clock() - read_at if count else 0.0
-        usage = self._context.store.disk_usage()
-        disk = () if usage is None else (("free", usage.free), ("used", usage.used))
+        age = now - read_at if count else 0.0
         return [
             _gauge("tasks", "Tasks of jobs by stage and state", tasks, "stage", "state"),
             _gauge("jobs", "Jobs by state", by_state, "state"),
@@ -78,8 +84,54 @@ class _QueueCollector(Collector):
             _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),
             _gauge("damaged_files", "Files that scrubbing found damaged", [(bad or 0,)]),
             _gauge("unread_seconds", "Age of the oldest scrub of a version [s]", [(age,)]),
-            _gauge("store_disk_bytes", "Disk of the store", disk, "state"),
+            _gauge("disk_bytes", "Disks of store and database", self._disks(), "place", "state"),
+            _gauge(
+                "store_unavailable",
+                "Whether store or database take no results, and jobs are paused",
+                [(float(bool(self._context.store_watch.trouble)),)],
+            ),
+            _gauge(
+                "job_idle_seconds",
+                f"Time since the last progress of the {MAX_IDLE_JOBS} most idle active jobs [s]",
+                idle,
+                "job_id",
+            ),
+            _gauge(
+                "worker_silent_seconds",
+                "Time since the last message of workers that were not stopped [s]",
+                silent,
+                "worker",
+            ),
+            _gauge(
+                "key_seconds",
+                "Time until a key without a successor expires [s]",
+                [(key.id, key.name, key.expires_at - now) for key in expiring],
+                "key",
+                "name",
+            ),
         ]
+
+    def _disks(self) -> list[tuple[str, str, float]]:
+        """Return the free and used bytes of each disk, once if store and database share one."""
+        data = self._context.settings.data
+        places: dict[str, Store] = {"store": self._context.store}
+        store_directory = self._context.store.cache
+        if store_directory is None or not _on_one_disk(store_directory, data):
+            places["data"] = DirectoryStore(data)
+        rows: list[tuple[str, str, float]] = []
+        for name, place in places.items():
+            usage = place.disk_usage()
+            # A bucket has no limit that it knows.
+            if usage is not None:
+                rows += [(name, "free", usage.free), (name, "used", usage.used)]
+        return rows
+
+
+def _on_one_disk(store: Path, data: Path) -> bool:
+    # The first artifact makes the directory of the store.
+    while not store.exists():
+        store = store.parent
+    return store.stat().st_dev == data.stat().st_dev
 
 
 def _gauge(name: str, text: str, rows: Iterable[Sequence[Any]], *labels: str) -> Metric:
