@@ -50,8 +50,6 @@ PRIVATE = {
     "note_heard": "touch_workers",
     "note_seen": "record_condition",
     "note_stranded": "update_unschedulable_jobs",
-    "skeleton": "capsules",
-    "skeletons": "capsules",
     "sort_out": "reconcile_leases",
     "strained": "stalled",
     "take_back": "expire_leases",

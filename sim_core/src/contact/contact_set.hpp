@@ -28,9 +28,8 @@ struct Pair {
   Contact contact;
   ProximalStiffness proximal;
   double smoothing_energy;  // epsilon, J: 0 under the exact law
-  Eigen::Vector3d middle;   // of the two points, or with a medial axis that of the cloth, m
+  Eigen::Vector3d middle;   // of the two points, m
   double thickness;         // m: that it keeps apart
-  double scale;             // m: that of the cloth, which is less with a medial axis
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
@@ -61,7 +60,7 @@ struct PairPast {
   Candidate stencil;
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
-  double scale, penalty_scale;
+  double thickness, penalty_scale;
   double missed;  // violation of its row, m; see `violation`
 
   PairPast(const Pair& pair);
@@ -86,11 +85,9 @@ class ContactSet {
   // Forgets all forces.
   void restart();
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
-  // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m;
-  // `capsule_turns`: of the medial axes in the step.
+  // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m.
   void begin(const Buffer<double>& start, const Buffer<double>& ends,
-             const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own,
-             std::vector<Eigen::Matrix3d> capsule_turns);
+             const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own);
   // Keeps the forces at the end of a step for the next one.
   void store_history();
 
@@ -125,10 +122,6 @@ class ContactSet {
   Eigen::Matrix3d turn_of(const Candidate& stencil, const Eigen::Vector4d& weights);
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
-  // The medial axis of a pair, or null.
-  const Capsule* capsule_of(const Candidate& pair) const;
-  // Least radius over the side of a cell of a medial axis that bears; infinite where none does.
-  double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
   // Mean error of the forces by smoothing, N.
@@ -156,7 +149,7 @@ class ContactSet {
   std::vector<double> displacements_;  // of each node in the step but for a common one, m
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
-  std::vector<Eigen::Matrix3d> own_, capsule_turns_;
+  std::vector<Eigen::Matrix3d> own_;
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
   std::vector<int> nodes_;                       // of `rows`

@@ -42,20 +42,12 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
   return {first, second};
 }
 
-// How much farther than other pairs those with each sheet, surface and medial axis reach, m.
-std::vector<double> farther_of(const ContactMaterials& materials) {
-  std::vector<double> out(materials.thickness.size(), 0.0);
-  for (const Capsule& capsule : materials.capsules)
-    out.push_back(capsule.radius - materials.farthest());
-  return out;
-}
-
 }  // namespace
 
 ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
                        const ContactSettings& settings, const PathSettings& path, double margin,
                        int free_nodes)
-    : near(std::move(surface), materials_in.farthest(), margin, path, farther_of(materials_in)),
+    : near(std::move(surface), materials_in.farthest(), margin, path),
       materials(materials_in),
       settings_(settings),
       free_nodes_(free_nodes),
@@ -64,13 +56,11 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
       turns_(settings.turn_max) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
-                       const Buffer<double>& expected, std::vector<Matrix3d> own,
-                       std::vector<Matrix3d> capsule_turns) {
+                       const Buffer<double>& expected, std::vector<Matrix3d> own) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
-  capsule_turns_ = std::move(capsule_turns);
   base_ = history_;
 }
 
@@ -82,11 +72,6 @@ void ContactSet::find(const Buffer<double>& x) {
   least_distance_ = std::numeric_limits<double>::infinity();
   find_vertices(candidates, range, x);
   find_edges(candidates, range, x);
-}
-
-const Capsule* ContactSet::capsule_of(const Candidate& pair) const {
-  const std::vector<int>& sheet = near.surface.sheet_of_node;
-  return materials.capsule_of(sheet[pair.node[0]], sheet[pair.node[3]]);
 }
 
 // `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a
@@ -114,7 +99,7 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
     found.clear();
     for (; c < end; ++c) {
       Candidate& stencil = candidates[c];
-      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
+      if (stencil.distance > near.thickness + reach) continue;
       const FourPoints at = points_of(stencil, x);
       const Vector4d weights = closest_weights(stencil.kind, at);
       stencil.distance = between_closest(weights, at).norm();
@@ -139,12 +124,7 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
                              : around_node(feature - triangles - edges);
       if (static_cast<int>(next - i) != around) continue;
       const Candidate& stencil = candidates[found[i].candidate];
-      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
-      // Corners of the cloth touch a body by themselves where pairs only hold what lies between
-      // them.
-      if (const Capsule* capsule = capsule_of(stencil);
-          capsule && !capsule->replaces_nodes && feature >= triangles + edges)
-        continue;
+      if (stencil.distance > near.thickness + reach) continue;
       if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
         const int other = feature - triangles - edges;
         const auto first = std::lower_bound(
@@ -164,7 +144,7 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
 void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
                             const Buffer<double>& x) {
   for (Candidate& stencil : candidates) {
-    const double reach = near.rest_distance(stencil) + range + fastest(stencil, displacements_);
+    const double reach = near.thickness + range + fastest(stencil, displacements_);
     if (stencil.kind != PairKind::edge_edge || stencil.distance > reach) continue;
     const FourPoints at = points_of(stencil, x);
     const Vector4d weights = closest_weights(stencil.kind, at);
@@ -185,8 +165,7 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
   const double distance = rho.norm();
   const int a = near.surface.sheet_of_node[stencil.node[0]],
             b = near.surface.sheet_of_node[stencil.node[3]];
-  const Capsule* capsule = materials.capsule_of(a, b);
-  if (!capsule) least_distance_ = std::min(least_distance_, distance);
+  least_distance_ = std::min(least_distance_, distance);
   if (!(distance > 0.0)) return;
   const auto [along_first, along_second] = directions(stencil.kind, weights);
   PairMotions given = PairMotions::Zero();
@@ -220,16 +199,14 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
   const Vector3d first = stencil.kind == PairKind::vertex_triangle
                              ? at[0]
                              : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  const double back = !capsule ? 0.5 : a > b ? 1.0 : 0.0;
   pairs_.push_back({stencil,
                     feature,
                     weights,
                     {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k},
                     {along, across},
                     k * smoothing * smoothing,
-                    first - back * rho,
+                    first - 0.5 * rho,
                     thickness,
-                    capsule ? materials.thickness[std::min(a, b)] : thickness,
                     along_first,
                     along_second,
                     given});
@@ -244,15 +221,11 @@ Matrix3d ContactSet::turn_of(const Candidate& stencil, const Vector4d& weights) 
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
   Matrix3d turn = Matrix3d::Zero();
-  if (capsule_of(stencil)) {
-    turn = capsule_turns_[std::max(a, b) - materials.first_capsule()];
-  } else {
-    for (int c = 0; c < 4; ++c) {
-      const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
-      const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
-      if (share * weights[c] != 0.0)
-        turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
-    }
+  for (int c = 0; c < 4; ++c) {
+    const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
+    const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+    if (share * weights[c] != 0.0)
+      turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
   }
   return turn;
 }

@@ -29,26 +29,17 @@ double fastest(const Candidate& pair, const std::vector<double>& displacements) 
 }
 
 CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double margin,
-                           const PathSettings& settings, std::vector<double> farther)
+                           const PathSettings& settings)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       margin_(margin),
       settings_(settings),
-      farther_(std::move(farther)),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
-      displacement_(share_) {
-  farther_.resize(surface.collides.rows(), 0.0);
-}
+      displacement_(share_) {}
 
-double CandidateSet::rest_distance(const Candidate& pair) const {
-  const std::vector<int>& sheet = surface.sheet_of_node;
-  return thickness + farther_[std::max(sheet[pair.node[0]], sheet[pair.node[3]])];
-}
-
-MinDistanceRule CandidateSet::rule_of(const Candidate& pair) const {
-  const double most = rest_distance(pair);
-  return {settings_.keep, most, settings_.floor * most, settings_.rest};
+MinDistanceRule CandidateSet::rule() const {
+  return {settings_.keep, thickness, settings_.floor * thickness, settings_.rest};
 }
 
 // Half of the diagonal of the box of the motions.
@@ -70,7 +61,7 @@ Eigen::Vector3d CandidateSet::measure(const Buffer<double>& from, const Buffer<d
 
 void CandidateSet::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
-  pairs_ = candidates(surface, x, thickness + 2.0 * margin_, farther_);
+  pairs_ = candidates(surface, x, thickness + 2.0 * margin_);
 }
 
 std::vector<Candidate>& CandidateSet::pairs(const Buffer<double>& x) {
@@ -131,9 +122,9 @@ double CandidateSet::collision_free_fraction(const Buffer<double>& from, const B
   const std::vector<Candidate>& near = pairs(from);
   measure(from, to, displacement_);
   for (const Candidate& pair : near) {
-    if (fastest(pair, displacement_) <= pair.distance - rule_of(pair).of(pair.distance)) continue;
-    least = std::min(
-        least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule_of(pair)));
+    if (fastest(pair, displacement_) <= pair.distance - rule().of(pair.distance)) continue;
+    least =
+        std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule()));
   }
   return least;
 }
@@ -155,10 +146,10 @@ bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) 
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double distance = pair.distance - fastest(pair, drift_);
-      if (fastest(pair, displacement_) <= distance - rule_of(pair).of(distance)) continue;
+      if (fastest(pair, displacement_) <= distance - rule().of(distance)) continue;
       const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]),
                             place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, rule_of(pair));
+      const double safe = safe_share(pair.kind, points_of(pair, from), ends, rule());
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == settings_.rounds_max) continue;

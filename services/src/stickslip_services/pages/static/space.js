@@ -83,7 +83,7 @@ async function show(figure) {
         sphere: () => new three.SphereGeometry(body.radius, 48, 24),
         capsule: () => new three.CapsuleGeometry(body.radius, body.length, 12, 32).rotateX(Math.PI / 2),
         cylinder: () => new three.CylinderGeometry(body.radius, body.radius, 2 * extent, 48, 1, true).rotateX(Math.PI / 2),
-        box: () => new three.RoundedBoxGeometry(...body.size, 4, body.rounding ?? Math.min(0.005, ...body.size.map((side) => side / 2))),
+        box: () => new three.RoundedBoxGeometry(...body.size, 4, body.rounding),
         mesh: () => shape(body),
       }[body.type]();
       solid(geometry, "--body", body.poses);
