@@ -97,7 +97,8 @@ void bind_cloth(nb::module_& m) {
           "friction",
           [](const DiagnosticExtremes& extremes) {
             std::vector<std::pair<double, double>> out;
-            for (const FrictionWork& one : extremes.friction) out.emplace_back(one.work, one.error);
+            for (const FrictionWork& with : extremes.friction)
+              out.emplace_back(with.work, with.error);
             return out;
           },
           "Work of friction with each body, then surface, then sheet, and the bound on its error "

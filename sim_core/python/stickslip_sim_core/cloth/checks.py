@@ -202,7 +202,7 @@ CHECKS = (
 
 def _uneven(seen: Seen) -> float:
     uneven = seen.cloth.history.column("uneven")
-    # What happens after the last frame is not shown, and is no fault of what is.
+    # Motion after the last frame is not shown, and is no fault of the frames.
     if seen.uneven_end is not None:
         uneven = np.append(uneven[:-1], seen.uneven_end)
     return float(uneven.max(initial=0.0))
