@@ -33,8 +33,6 @@ FOLDERS = (
 PRIVATE = {
     "asker": "principal",
     "bearing": "BodyContact",
-    "bone": "capsule",
-    "bones": "capsules",
     "book": "tx, for a QueueTransaction",
     "charge": "leased_for, a fact that the lease sets",
     "ease": "coarsen_if_cheap",

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <span>
 #include <vector>
 
 #include "contact/linearized_contact.hpp"
@@ -134,7 +135,12 @@ class ContactSet {
   // Replaces the pairs by those at x, without forces.
   void find(const Buffer<double>& x);
   void find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
+  // The pairs of one vertex, from all of its candidates, up to a distance, m.
+  void find_vertex(std::span<Candidate> candidates, double reach, const Buffer<double>& x);
   void find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
+  int feature_of(const Candidate& stencil, const Eigen::Vector4d& weights) const;
+  int triangles_around(int feature) const;
+  bool has_reverse(int vertex, int feature) const;
   void add(const Candidate& stencil, int feature, const Eigen::Vector4d& weights,
            const Buffer<double>& x);
   Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,
@@ -143,6 +149,13 @@ class ContactSet {
   void merge();
   void linearize_at(const Buffer<double>& x);
 
+  // A triangle whose closest point to a vertex lies on this feature.
+  struct Found {
+    int feature;
+    const Candidate* candidate;
+    Eigen::Vector4d weights;
+  };
+
   ContactSettings settings_;
   int free_nodes_;
   double least_distance_;
@@ -150,6 +163,7 @@ class ContactSet {
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_;
+  std::vector<Found> found_;                     // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
   std::vector<int> nodes_;                       // of `rows`

@@ -13,12 +13,6 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector4d;
 
-// A triangle whose closest point to a vertex lies on this feature.
-struct Found {
-  int feature, candidate;
-  Vector4d weights;
-};
-
 // Derivatives of the weights by the places of the closest points: along both edges, or along the
 // sides of the feature of a triangle.
 std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights) {
@@ -74,70 +68,83 @@ void ContactSet::find(const Buffer<double>& x) {
   find_edges(candidates, range, x);
 }
 
-// `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a
-// triangle. Such a pair counts once, and only where all triangles around the feature agree: else a
-// point inside one of them is closer.
+// Which feature of a triangle is the closest to a vertex: see Pair.
+int ContactSet::feature_of(const Candidate& stencil, const Vector4d& weights) const {
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size());
+  int corner = 0, opposite = 0;
+  for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
+  const auto corners = (weights.tail<3>().array() != 0.0).count();
+  if (corners == 3) return stencil.second;
+  if (corners == 2) return triangles + surface.triangle_edges[stencil.second][opposite];
+  return triangles + static_cast<int>(surface.edges.size()) + stencil.node[1 + corner];
+}
+
+int ContactSet::triangles_around(int feature) const {
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size());
+  const int edges = static_cast<int>(surface.edges.size());
+  if (feature < triangles) return 1;
+  if (feature < triangles + edges) return surface.triangles_of_edge[feature - triangles];
+  const int node = feature - triangles - edges;
+  return surface.around_begin[node + 1] - surface.around_begin[node];
+}
+
+// Two corners that are each other's closest are one pair.
+bool ContactSet::has_reverse(int vertex, int feature) const {
+  const int nodes_from =
+      static_cast<int>(near.surface.triangles.size() + near.surface.edges.size());
+  if (feature < nodes_from) return false;
+  const int other = feature - nodes_from;
+  const auto first =
+      std::lower_bound(pairs_.begin(), pairs_.end(), other,
+                       [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
+  return std::any_of(first, pairs_.end(), [&](const Pair& pair) {
+    return pair.stencil.first == other && pair.feature == nodes_from + vertex;
+  });
+}
+
+// `range`: beyond what approached in the step, m. The candidates of a vertex follow each other.
 void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
                                const Buffer<double>& x) {
-  const Surface& surface = near.surface;
-  const int triangles = static_cast<int>(surface.triangles.size()),
-            edges = static_cast<int>(surface.edges.size());
-  const auto around_node = [&](int node) {
-    return surface.around_begin[node + 1] - surface.around_begin[node];
-  };
-  const auto is_of = [&](std::size_t c, int vertex) {
-    return c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle &&
-           candidates[c].first == vertex;
-  };
-  std::vector<Found> found;
-  std::size_t c = 0, end = 0;
-  while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
-    const int vertex = candidates[c].first;
+  std::size_t begin = 0;
+  while (begin < candidates.size() && candidates[begin].kind == PairKind::vertex_triangle) {
+    const int vertex = candidates[begin].first;
+    std::size_t end = begin;
     double reach = range;
-    for (; is_of(end, vertex); ++end)
+    for (; end < candidates.size() && candidates[end].kind == PairKind::vertex_triangle &&
+           candidates[end].first == vertex;
+         ++end) {
       reach = std::max(reach, range + fastest(candidates[end], displacements_));
-    found.clear();
-    for (; c < end; ++c) {
-      Candidate& stencil = candidates[c];
-      if (stencil.distance > near.thickness + reach) continue;
-      const FourPoints at = points_of(stencil, x);
-      const Vector4d weights = closest_weights(stencil.kind, at);
-      stencil.distance = between_closest(weights, at).norm();
-      int corner = 0, opposite = 0;
-      for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
-      const auto corners = (weights.tail<3>().array() != 0.0).count();
-      const int feature = corners == 3 ? stencil.second
-                          : corners == 2
-                              ? triangles + surface.triangle_edges[stencil.second][opposite]
-                              : triangles + edges + stencil.node[1 + corner];
-      found.push_back({feature, static_cast<int>(c), weights});
     }
-    std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
-      return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
-    });
-    for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
-      const int feature = found[i].feature;
-      while (next < found.size() && found[next].feature == feature) ++next;
-      const int around = feature < triangles ? 1
-                         : feature < triangles + edges
-                             ? surface.triangles_of_edge[feature - triangles]
-                             : around_node(feature - triangles - edges);
-      if (static_cast<int>(next - i) != around) continue;
-      const Candidate& stencil = candidates[found[i].candidate];
-      if (stencil.distance > near.thickness + reach) continue;
-      if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
-        const int other = feature - triangles - edges;
-        const auto first = std::lower_bound(
-            pairs_.begin(), pairs_.end(), other,
-            [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
-        if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
-              return pair.stencil.first == other && pair.feature == triangles + edges + vertex;
-            })) {
-          continue;
-        }
-      }
-      add(candidates[found[i].candidate], feature, found[i].weights, x);
-    }
+    find_vertex({candidates.data() + begin, end - begin}, near.thickness + reach, x);
+    begin = end;
+  }
+}
+
+// A vertex may be closest to an edge or corner of a triangle. Such a pair counts once, and only
+// where all triangles around the feature agree: else a point inside one of them is closer.
+void ContactSet::find_vertex(std::span<Candidate> candidates, double reach,
+                             const Buffer<double>& x) {
+  std::vector<Found>& found = found_;
+  found.clear();
+  for (Candidate& stencil : candidates) {
+    if (stencil.distance > reach) continue;
+    const FourPoints at = points_of(stencil, x);
+    const Vector4d weights = closest_weights(stencil.kind, at);
+    stencil.distance = between_closest(weights, at).norm();
+    found.push_back({feature_of(stencil, weights), &stencil, weights});
+  }
+  std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
+    return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+  });
+  for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
+    const int feature = found[i].feature;
+    while (next < found.size() && found[next].feature == feature) ++next;
+    const Candidate& stencil = *found[i].candidate;
+    const bool agree = static_cast<int>(next - i) == triangles_around(feature);
+    if (!agree || stencil.distance > reach || has_reverse(stencil.first, feature)) continue;
+    add(stencil, feature, found[i].weights, x);
   }
 }
 

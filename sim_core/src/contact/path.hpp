@@ -69,6 +69,10 @@ class CandidateSet {
   void rebuild(const Buffer<double>& x);
   MinDistanceRule rule() const;
   bool limit_listed(const Buffer<double>& from, Buffer<double>& to);
+  // Where a node on its way to `to` is stopped, as far as is known in `limit_listed`.
+  Eigen::Vector3d limited(int node, const Buffer<double>& from, const Buffer<double>& to) const;
+  double safe_share_of(const Candidate& pair, const Buffer<double>& from,
+                       const Buffer<double>& to) const;
 
   double margin_;
   PathSettings settings_;

@@ -232,8 +232,8 @@ def _prepare_raylet(agent_port: int, directory: Path) -> None:
 
     `directory` is that of the head, with the logs of its processes.
 
-    Ray has no public way for either, so this function wraps Ray's private function that starts
-    processes:
+    Ray 2.60 has no public way for either: no option, variable or hook of `ray start` reaches the
+    command of the raylet. So this function wraps Ray's private function that starts processes:
 
     - The raylet waits 15 s for the ports of its Python process, and then aborts
       (ray-project/ray#65983). It does not wait for ports that it knows already. `ray start` passes

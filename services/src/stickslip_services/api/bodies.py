@@ -39,7 +39,7 @@ MAX_CONTAINERS = 20_000
 
 LARGE_BYTES = 2**20
 """Larger documents are read one at a time [bytes]: a report of a worker of 16 MiB takes 0.3 GB and
-1 s, in which other requests wait for the interpreter."""
+1 s. The parser of Python calls functions for numbers, so other requests get their turn."""
 
 MAX_DIGITS = 4000
 """Digits of an integer: Python converts no more than 4,300, and its message is for programmers."""
@@ -97,12 +97,13 @@ class JsonBody(Generic[T]):
         """
         self._check_containers(body)
         if len(body) <= LARGE_BYTES:
-            return self._read(body)
+            return self._read(body, is_large=False)
         with _LARGE_BODY:
-            return self._read(body)
+            return self._read(body, is_large=True)
 
-    def _read(self, body: bytes) -> T:
-        if self._from_workers:
+    def _read(self, body: bytes, *, is_large: bool) -> T:
+        # pydantic keeps the interpreter until it has read a whole body: 1 to 2 s for 16 MB.
+        if self._from_workers and not is_large:
             # Most messages of workers are in the very form that pydantic writes, and pydantic
             # reads them five times faster. If it writes the same bytes again, no key is duplicate.
             with suppress(ValidationError):

@@ -132,7 +132,9 @@ def _checked(context: Context, sent: Sent) -> Check:
         check.add(error.name, error.rule)
     except (ProblemError, StickslipError) as error:
         for fault in error.fields:
-            check.add(field_of(check.form, fault.pointer), f"{fault.rule} (it is {fault.value})")
+            # A field that is missing has no value.
+            value = f" (it is {fault.value})" if fault.value else ""
+            check.add(field_of(check.form, fault.pointer), f"{fault.rule}{value}")
         if not error.fields:
             check.add("", str(error.detail if isinstance(error, ProblemError) else error))
     return check
