@@ -167,7 +167,8 @@ def test_what_happens_after_the_last_frame_is_not_judged(
     def pose(time: ArrayLike) -> Floats:
         at = np.asarray(time, float)
         place = 0.8 * np.minimum(at, stop) + jump * (at >= stop)
-        return np.eye(3, 4) + np.eye(1, 12, 3).reshape(3, 4) * place[..., None, None]
+        poses: Floats = np.eye(3, 4) + np.eye(1, 12, 3).reshape(3, 4) * place[..., None, None]
+        return poses
 
     start = np.column_stack([np.zeros(len(STRIP.rest)), STRIP.rest])
     gravity = np.tile([0.0, 0.0, -GRAVITY], (len(start), 1))

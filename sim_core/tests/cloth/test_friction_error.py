@@ -16,7 +16,7 @@ LENGTH, WIDTH, THICKNESS = 0.12, 0.01, 5e-4
 FABRIC = custom_fabric(
     "soft", 0.2, young=4e7, poisson=0.3, thickness=5e-4, bending=[1e-7, 1e-7, 5e-8], damping=2.0
 )
-LIMIT = next(check.limit for check in checks.CHECKS if check.name == "friction_error")
+LIMIT = next(check.limit or 0.0 for check in checks.CHECKS if check.name == "friction_error")
 
 BLOCK = [
     *[(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)],
