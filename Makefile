@@ -15,10 +15,10 @@ PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml VERSION
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake sim_core/tests/core -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
   $(addprefix workers/blender/,CMakeLists.txt pyproject.toml)
-# reconstruction.py calls render_rod_set.py with Blender's interpreter, reader.py needs a dataset, cloth_contact.py takes half an
-# hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
+# reconstruction.py calls render_rod_set.py with Blender's interpreter, reader.py needs a dataset, yarn.py centrelines, cloth_contact.py
+# takes half an hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
-  reader.py),$(wildcard benchmarks/*.py))
+  reader.py yarn.py),$(wildcard benchmarks/*.py))
 DISTRIBUTIONS = schemas sim_core services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 

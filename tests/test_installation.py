@@ -1,11 +1,13 @@
 """Set-up works on any machine: pins that every index has, and commands that work as written."""
 
+import importlib.util
 import json
 import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from packaging.requirements import Requirement
@@ -130,6 +132,65 @@ def test_pip_takes_the_commands_of_messages(distribution: str, extras: tuple[str
         [*command, str(ROOT / "constraints.txt")], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+def tool_named(name: str) -> ModuleType:
+    """Return a program of tools/ as a module."""
+    path = ROOT / "tools" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_uv_looks_where_pip_looks() -> None:
+    """uv reads no file of pip, so a company's index must be handed over."""
+    tool = tool_named("setup_environment")
+    listing = (
+        ":env:.find-links='/srv/wheels'\n"
+        "global.index-url='https://pypi.example.org/simple'\n"
+        "global.extra-index-url='\\nhttps://one.example.org\\nhttps://two.example.org'\n"
+        "global.find-links='/other'\n"
+        "global.timeout='60'\n"
+    )
+    assert tool.uv_variables(tool.pip_settings(listing)) == {
+        "UV_DEFAULT_INDEX": "https://pypi.example.org/simple",
+        "UV_INDEX": "https://one.example.org https://two.example.org",
+        "UV_FIND_LINKS": "/srv/wheels",
+        "UV_INDEX_STRATEGY": "unsafe-best-match",
+    }
+    assert tool.uv_variables({}) == {}
+
+
+def test_packages_of_other_places_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/opt/ros/lib")
+    monkeypatch.setenv("PIP_USER", "1")
+    monkeypatch.setenv("STICKSLIP_OTHER", "stays")
+    environment = tool_named("setup_environment").clean_environment()
+    assert not {"PYTHONPATH", "PIP_USER"} & environment.keys()
+    assert environment["STICKSLIP_OTHER"] == "stays"
+
+
+def test_cpu_time_of_processes_without_a_parent_counts(tmp_path: Path) -> None:
+    """Ray's processes outlive the one that starts them, and nobody waits for them."""
+    work = (
+        "import pathlib, time\n"
+        "while time.process_time() < 1.5: pass\n"
+        "time.sleep(0.5)\n"
+        "pathlib.Path('done').touch()\n"
+    )
+    launcher = (
+        "import subprocess, sys, time\n"
+        f"subprocess.Popen([sys.executable, '-c', {work!r}], start_new_session=True)\n"
+        "time.sleep(1)\n"
+    )
+    # The shell stays until the orphan has ended.
+    command = f'{sys.executable} -c "$0"; while [ ! -e done ]; do sleep 0.1; done'
+    measured = tool_named("release_check").run_measured(["sh", "-c", command, launcher], tmp_path)
+    assert 1.4 < measured.cpu_seconds < 6.0
 
 
 def test_the_readme_has_the_measured_minutes_and_gigabytes() -> None:

@@ -5,6 +5,11 @@ python=$1
 missing=""
 
 command -v "$python" >/dev/null 2>&1 || missing="$missing python3.11"
+# Newer systems have no package of Python 3.11, and uv brings one.
+if [ -n "$missing" ] && command -v uv >/dev/null 2>&1; then
+  echo "there is no $python; uv has one:" >&2
+  echo "    uv python install 3.11 && make PYTHON=\"\$(uv python find 3.11)\" ..." >&2
+fi
 if [ -z "$missing" ]; then
   "$python" -c 'import ensurepip, venv' 2>/dev/null || missing="$missing python3.11-venv"
   "$python" -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null ||

@@ -72,7 +72,7 @@ def strip(
             )
             if not isinstance(done.output, SimulateOutput):
                 sys.exit(f"{name}: {done.message}")
-            found = done.output.record
+            record_ref = done.output.record
         else:
             with np.load(record) as arrays, (Path(store) / "record.npz").open("wb") as file:
                 np.savez(
@@ -80,22 +80,25 @@ def strip(
                     allow_pickle=False,
                     **{key: values[None] for key, values in arrays.items()},
                 )
-            found = RecordRef(
+            record_ref = RecordRef(
                 digest=open_store(store).publish((Path(store) / "record.npz").read_bytes()), row=0
             )
         return np.concatenate(
-            [_clip(RenderTask(render=spec.render(point), record=found), store) for point in points]
+            [
+                _clip(RenderTask(render=spec.render(point), record=record_ref), store)
+                for point in points
+            ]
         )
 
 
 def _clip(task: RenderTask, store: str) -> npt.NDArray[np.uint8]:
     """Return the frames of a clip side by side."""
-    seen = replay(task, store=store, blender_python=BLENDER_PYTHON)
-    if not isinstance(seen.output, RenderOutput):
-        sys.exit(f"not rendered: {seen.message}")
+    result = replay(task, store=store, blender_python=BLENDER_PYTHON)
+    if not isinstance(result.output, RenderOutput):
+        sys.exit(f"not rendered: {result.message}")
     width, height = DEFAULT_RESOLUTION
     video = np.empty((INSTANTS, height, width, 3), np.uint8)
-    decode_clip(open_store(store).read(seen.output.chunks["video"].digest), video)
+    decode_clip(open_store(store).read(result.output.chunks["video"].digest), video)
     return np.concatenate(list(video), axis=1)
 
 
@@ -112,14 +115,14 @@ def main() -> None:
     )
     options = arguments.parse_args()
     axes, change = (
-        {k: yaml.safe_load(v) for k, v in (one.split("=", 1) for one in many)}
-        for many in (options.axis, options.set)
+        {k: yaml.safe_load(v) for k, v in (entry.split("=", 1) for entry in entries)}
+        for entries in (options.axis, options.set)
     )
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
         begin = time.perf_counter()
-        found = strip(name, axes, change, all_views=options.views, record=options.record)
-        picture = Image.fromarray(found)
+        pixels = strip(name, axes, change, all_views=options.views, record=options.record)
+        picture = Image.fromarray(pixels)
         small = picture.resize(
             (INSTANTS * SIDE, picture.height * SIDE // DEFAULT_RESOLUTION[1]),
             Image.Resampling.LANCZOS,

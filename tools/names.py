@@ -33,8 +33,6 @@ FOLDERS = (
 PRIVATE = {
     "asker": "principal",
     "bearing": "BodyContact",
-    "bone": "capsule",
-    "bones": "capsules",
     "book": "tx, for a QueueTransaction",
     "charge": "leased_for, a fact that the lease sets",
     "ease": "coarsen_if_cheap",
@@ -50,8 +48,6 @@ PRIVATE = {
     "note_heard": "touch_workers",
     "note_seen": "record_condition",
     "note_stranded": "update_unschedulable_jobs",
-    "skeleton": "capsules",
-    "skeletons": "capsules",
     "sort_out": "reconcile_leases",
     "strained": "stalled",
     "take_back": "expire_leases",

@@ -3,12 +3,15 @@
     python3.11 tools/setup_environment.py runtime | development | blender
 
 Only the standard library is imported: nothing is installed yet. `uv` installs the packages if it is
-on the path, and pip otherwise. PyTorch is always installed by pip, and first: pip's configuration
-says from which index, and so which build (the README explains the choice).
+on the path, and pip otherwise, or where uv fails. PyTorch is always installed by pip, and first:
+pip's configuration says from which index, and so which build (the README explains the choice). uv
+gets the indexes of that configuration, which it does not read by itself.
 """
 
 import argparse
+import ast
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -27,6 +30,17 @@ LINE_SECONDS = 15.0
 
 TRUSTED_FRACTION = 0.25
 """From this fraction of the packages on, the time left follows from the time that has passed."""
+
+DISTURBING = ("PYTHONPATH", "PYTHONHOME", "PIP_USER", "PIP_TARGET", "PIP_PREFIX")
+"""Variables that let packages of another place count as installed, or install to another place."""
+
+UV_VARIABLES = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "cert": "SSL_CERT_FILE",
+}
+"""The variable of uv for each setting of pip that says where packages come from."""
 
 ERROR_LINES = 25
 """The last lines of pip's output that are printed if it fails."""
@@ -139,7 +153,12 @@ def run_logged(command: list[str], log: Path) -> Iterator[str]:
     """Run a command, and yield the lines that it prints; end the program if it fails."""
     with log.open("a", encoding="utf-8") as file:
         process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command,
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=clean_environment(),
         )
         assert process.stdout is not None
         lines = []
@@ -162,12 +181,47 @@ def install_with_pip(arguments: list[str], environment: Environment, progress: P
             progress.start_installing()
 
 
-def install_with_uv(uv: str, arguments: list[str], environment: Environment) -> None:
-    """Install requirements with uv, which shows its own progress."""
-    python = ROOT / environment.folder / "bin" / "python"
-    subprocess.run(
-        [uv, "pip", "install", "--python", str(python), *arguments], cwd=ROOT, check=True
+def clean_environment() -> dict[str, str]:
+    """Return the variables of this process without those that disturb an installation."""
+    return {name: value for name, value in os.environ.items() if name not in DISTURBING}
+
+
+def pip_settings(listing: str) -> dict[str, str]:
+    """Return the settings that `pip config list` prints, without their sections.
+
+    Lines are `global.index-url='URL'`. Variables, of the section `:env:`, come before files.
+    """
+    settings: dict[str, str] = {}
+    for line in sorted(listing.splitlines(), key=lambda line: line.startswith(":env:")):
+        name, separator, value = line.partition("=")
+        if separator:
+            settings[name.rpartition(".")[2]] = ast.literal_eval(value)
+    return settings
+
+
+def uv_variables(settings: dict[str, str]) -> dict[str, str]:
+    """Return the variables that let uv find packages where pip finds them."""
+    variables = {
+        UV_VARIABLES[name]: " ".join(value.split())
+        for name, value in settings.items()
+        if name in UV_VARIABLES
+    }
+    # pip takes the best version of all indexes; uv takes the first index that has the package.
+    if "UV_INDEX" in variables:
+        variables["UV_INDEX_STRATEGY"] = "unsafe-best-match"
+    return variables
+
+
+def install_with_uv(uv: str, arguments: list[str], environment: Environment) -> bool:
+    """Install requirements with uv, which shows its own progress; return whether it could."""
+    python = str(ROOT / environment.folder / "bin" / "python")
+    listing = subprocess.run(
+        [python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False
     )
+    # What is set for uv itself comes first.
+    variables = uv_variables(pip_settings(listing.stdout)) | clean_environment()
+    command = [uv, "pip", "install", "--python", python, *arguments]
+    return subprocess.run(command, cwd=ROOT, env=variables, check=False).returncode == 0
 
 
 def make_environment(name: str) -> None:
@@ -180,17 +234,19 @@ def make_environment(name: str) -> None:
         f"({expectation.packages} packages, about {max(1, round(expectation.minutes))} min)",
         flush=True,
     )
-    if not (folder / "bin" / "python").exists():
-        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    # pip comes last: without it, an earlier set-up was interrupted.
+    if not (folder / "bin" / "pip").exists():
+        subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder)], check=True)
     progress = Progress(name, expectation)
     versions = ["--constraint", environment.constraints]
     for requirement in environment.first:
         install_with_pip([requirement, *versions], environment, progress)
     requirements = ["--requirement", environment.requirements, *versions]
     uv = shutil.which("uv")
-    if uv is not None:
-        install_with_uv(uv, requirements, environment)
-    else:
+    is_done = uv is not None and install_with_uv(uv, requirements, environment)
+    if not is_done:
+        if uv is not None:
+            print("  uv failed (above), so pip installs the packages", flush=True)
         install_with_pip(requirements, environment, progress)
     progress.finish()
 

@@ -147,17 +147,17 @@ def _resolved(value: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
 
     A nullable value becomes its other alternative.
     """
-    found = value
-    if "$ref" in found:
-        found = {
-            **schema["$defs"][found["$ref"].rpartition("/")[2]],
-            **{k: v for k, v in found.items() if k != "$ref"},
+    resolved = value
+    if "$ref" in resolved:
+        resolved = {
+            **schema["$defs"][resolved["$ref"].rpartition("/")[2]],
+            **{k: v for k, v in resolved.items() if k != "$ref"},
         }
-    kinds = [kind for kind in found.get("anyOf", ()) if kind != {"type": "null"}]
+    kinds = [kind for kind in resolved.get("anyOf", ()) if kind != {"type": "null"}]
     if len(kinds) == 1:
-        nullable = {"x-null": True, **{k: v for k, v in found.items() if k != "anyOf"}}
+        nullable = {"x-null": True, **{k: v for k, v in resolved.items() if k != "anyOf"}}
         return {**_resolved(kinds[0], schema), **nullable}
-    return found
+    return resolved
 
 
 def _allowed(value: dict[str, Any]) -> str:

@@ -225,6 +225,24 @@ def test_a_bug_in_composing_a_lease_is_called_a_bug(
     assert shown.state == JobState.succeeded
 
 
+def test_dependents_wait_again_for_a_damaged_result(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    submit_job(context, parsed(rods()), None)
+    worker.finish(*worker.lease(simulate=100))
+    worker.finish(*worker.lease(render=100))
+    with context.database.write() as connection:
+        connection.execute(text("UPDATE tasks SET output = output || ' ' WHERE stage = 'render'"))
+    assert worker.lease(pack=100) == ()
+    with context.database.read() as connection:
+        assert violations(connection) == []
+
+    # The next submission computes the damaged results again before it packs them.
+    again = submit_job(context, parsed(rods()), None)
+    assert worker.lease(pack=100) == ()
+    assert ended(context, worker, clock, again.id).state == JobState.succeeded  # type: ignore[union-attr]
+
+
 def test_a_damaged_page_of_the_file_is_damage_and_other_errors_are_not() -> None:
     corrupt = sqlite3.DatabaseError("database disk image is malformed")
     corrupt.sqlite_errorcode = sqlite3.SQLITE_CORRUPT

@@ -64,6 +64,23 @@ def test_cancelling_a_job_frees_its_quota(
     submit(context, project="lab", gamma=(8.0, 9.0))
 
 
+@pytest.mark.parametrize("cancelled", [0, 1])
+def test_a_started_task_of_a_cancelled_job_runs_on_for_another_job(
+    context: Context, worker: PretendWorker, cancelled: int
+) -> None:
+    """The need of the job that needs it most decides, in whatever order the jobs are read."""
+    jobs = [submit(context, gamma=(1.0, 2.0 + n), phi1=(1.0,)) for n in (0, 1)]
+    leases = worker.lease(simulate=3)
+    alone = gammas(leases).index(2.0 + cancelled)
+    # The cancelled job has a task of its own on lease, so it is `cancelling` until that is dropped.
+    cancel_job(context, jobs[cancelled])
+    assert show_job(context, jobs[cancelled]).state is JobState.cancelling
+    assert worker.start(*leases) == (leases[alone].task_id,)
+    sweep(context)
+    assert show_job(context, jobs[cancelled]).state is JobState.cancelled
+    assert worker.finish(leases[gammas(leases).index(1.0)]) == ["accepted"]
+
+
 @pytest.mark.parametrize("settings", [{"max_tries": 5, "retry_seconds": 3.0}], indirect=True)
 def test_the_wait_before_a_retry_doubles(
     context: Context, worker: PretendWorker, clock: ManualClock

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from stickslip_services.api.bodies import CERTIFICATE_BYTES, SPEC_BYTES
+from pydantic import TypeAdapter
+from stickslip_schemas.documents.worker_api import ReportBatch
+from stickslip_services.api.bodies import CERTIFICATE_BYTES, LARGE_BYTES, SPEC_BYTES, JsonBody
+from stickslip_services.api.problems import ProblemError
 from stickslip_services.app import make_app
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
@@ -61,6 +64,21 @@ def test_a_hostile_spec_is_refused_at_once(client: httpx.Client, path: str, name
     assert answer.status_code in (413, 422)
     assert rule in answer.json()["detail"]
     assert len(answer.content) < 50_000
+
+
+def test_a_large_report_is_not_read_in_one_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pydantic keeps the interpreter for 1 to 2 s where it reads 16 MB; no probe is answered."""
+
+    def hold_the_interpreter(*_arguments: object) -> None:
+        pytest.fail("a large body is read by pydantic alone")
+
+    monkeypatch.setattr(TypeAdapter, "validate_json", hold_the_interpreter)
+    numbers = "[" + ",".join(["1.5"] * (LARGE_BYTES // 4 + 1)) + "]"
+    body = f'{{"worker_id": "w", "reports": [{{"task_id": "t", "labels": {numbers}}}]}}'.encode()
+    reader = JsonBody(ReportBatch, max_containers=100, from_workers=True)
+    with pytest.raises(ProblemError) as caught:
+        reader.read(body)
+    assert all(len(field.value) <= 200 for field in caught.value.fields)
 
 
 def test_a_body_without_a_length_is_cut_off_at_the_limit(client: httpx.Client) -> None:

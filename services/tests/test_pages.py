@@ -3,12 +3,14 @@ jobs.
 """
 
 import asyncio
+import csv
 import html
 import json
 import re
 from collections.abc import Iterator
 from io import BytesIO
 from typing import Any
+from zipfile import ZipFile
 
 import httpx
 import numpy as np
@@ -17,7 +19,8 @@ import yaml
 from fastapi import FastAPI
 from PIL import Image
 from stickslip_schemas.base import JobState
-from stickslip_schemas.scene.library import load_scene
+from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_services.api.routes.pages.jobs import _changes
 from stickslip_services.app import make_app
 from stickslip_services.pages.rendering import _environment, plot, table
@@ -139,7 +142,11 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert (np.shape(rod["points"]), motion["bodies"], motion["holders"]) == ((1, 450), [], [])
     both = read(client, f"{path[0]}/samples/3?beside=1")
     assert "Sample 3 and sample 1" in both
-    assert both.count("motion.json") == both.count("data-plot=") == 2
+    assert both.count("motion.json") == 2
+    # The curves of both are in one plot.
+    assert both.count("data-plot=") == 1
+    assert "sample 3: " in html.unescape(both)
+    assert "sample 1: " in html.unescape(both)
     assert "Labels that differ" in both
     assert '/files/views/c/1/0/0/0/0" download' in both
     assert parsed(yaml.safe_load(client.get(f"/ui{path[0]}/spec.yaml").text)) == parsed(
@@ -176,7 +183,9 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     ]
     assert counts == [["2"], ["2"], ["4"]]
     assert "0 of 4 samples" in read(client, f"{path[0]}?gamma.from=1&gamma.to=0")
-    assert "4 of 4 samples" in read(client, f"{path[0]}?psnr=30")  # of rods, nothing is measured
+    condition = "where0.label=gamma&where0.operator=>&where0.value=1.5"
+    assert "2 of 4 samples" in read(client, f"{path[0]}?{condition}")
+    assert "gamma must be compared" in read(client, f"{path[0]}?{condition[:-3]}much")
     assert "option selected>train" in read(client, f"{path[0]}?split=train")
     assert "gamma 2, phi1 1: 1 of 1 done<" in dataset
     assert "it fell &lt;b&gt;off&lt;/b&gt;" in dataset
@@ -278,7 +287,14 @@ def test_scenes_have_pages_with_their_parameters(client: httpx.Client) -> None:
     digest = load_scene("turning-ball").digest
     assert f'<a href="/scenes/{digest}">turning-ball</a>' in listed
     page = read(client, f"/scenes/{digest}")
-    assert "stickslip scene preview turning-ball" in page
+    assert "stickslip scene preview turning-ball preview" in page
+    shown = re.search(r">scene.yaml</p>.*?<pre[^>]*>(.*?)</pre>", page, re.DOTALL)
+    assert shown is not None
+    assert Scene.model_validate(yaml.safe_load(html.unescape(shown[1]))).digest == digest
+    for name in scene_names():
+        picture = client.get(f"/static/scenes/{name}.webp")
+        assert Image.open(BytesIO(picture.content)).size == (640, 160)
+        assert f"/static/scenes/{name}.webp" in listed
     assert all(name in page for name in ("mu", "speed", "rad/s", "bodies.ball.motion.spin.speed"))
     assert client.get(f"/scenes/{'0' * 64}").status_code == 404
 
@@ -326,3 +342,70 @@ def test_a_browser_gets_errors_as_a_page(client: httpx.Client) -> None:
     )
     for path in ("/jobs/nothing", "/v1/jobs/nothing"):
         assert client.get(path).headers["content-type"] == "application/problem+json"
+
+
+def test_chosen_samples_come_as_a_zip(client: httpx.Client, worker: PretendWorker) -> None:
+    worker.judge = lambda task: (
+        rejection() if getattr(getattr(task, "simulation", None), "gamma", 0) == 1.0 else None
+    )
+    submit(client, name="zipped", gamma=GAMMA)
+    worker.work()
+    (dataset,) = client.get("/v1/datasets").json()["items"]
+    root = f"/ui/datasets/{dataset['id']}/v1"
+    page = read(client, f"{root}/thumbs?where0.label=gamma&where0.operator=<&where0.value=2.5")
+    assert f"{root}/selection.zip?&amp;where0.label=gamma&amp;where0.operator=%3C" in page
+    assert "--where &#39;gamma&lt;2.5&#39;" in page
+    answer = client.get(f"{root}/selection.zip?where0.label=gamma&where0.operator=<&where0.value=3")
+    assert 'filename="zipped-v1.zip"' in answer.headers["content-disposition"]
+    with ZipFile(BytesIO(answer.content)) as file:
+        assert file.testzip() is None
+        rows = list(csv.DictReader(file.read("labels.csv").decode().splitlines()))
+        assert [(row["slot"], float(row["gamma"])) for row in rows] == [("2", 2.0), ("3", 2.0)]
+        views = np.load(BytesIO(file.read("views/0000003.npy")))
+        assert views.shape == (4, 224, 224, 3)
+        assert not [name for name in file.namelist() if name.endswith(("0000000.npy", "1.npy"))]
+    # Without a filter, rejected samples are left out too.
+    with ZipFile(BytesIO(client.get(f"{root}/selection.zip").content)) as file:
+        assert len(file.read("labels.csv").decode().splitlines()) == 1 + 4
+
+
+def test_samples_are_sorted_and_shown_in_parts(client: httpx.Client, worker: PretendWorker) -> None:
+    axis = {"type": "linspace", "start": 1.0, "stop": 60.0, "num": 60}
+    submit(client, name="many", gamma=axis, phi1=(1.0, 2.0))
+    worker.work()
+    (dataset,) = client.get("/v1/datasets").json()["items"]
+    root = f"/ui/datasets/{dataset['id']}/v1"
+
+    def slots(query: str) -> list[int]:
+        return [int(slot) for slot in re.findall(r"/samples/(\d+)\">", read(client, root + query))]
+
+    assert slots("/thumbs") == list(range(48))
+    assert slots("/thumbs?sort=gamma&order=descending")[:4] == [118, 119, 116, 117]
+    last = read(client, f"{root}/thumbs?sort=gamma&order=descending&start=96")
+    assert "Back to the first" in last
+    assert "Jump to the last" not in last
+    assert slots("/thumbs?sort=gamma&order=descending&start=96")[-2:] == [0, 1]
+    first = read(client, f"{root}/thumbs")
+    assert f'hx-get="{root}/thumbs?start=96"' in first
+    assert client.get(f"{root}/thumbs?start=48&part=more").text.count("<li") == 48
+    page = read(client, f"/datasets/{dataset['id']}/v1")
+    assert f"/v1/datasets/{dataset['id']}/versions/1/files/views/c/0/0/0/0/0" in page
+    assert 'download="views-c-0-0-0-0-0"' in page
+
+
+def test_datasets_are_searched(client: httpx.Client, worker: PretendWorker) -> None:
+    for number, name in enumerate(("alpha", "beta")):
+        submit(client, name=name, gamma=(float(number + 1),))
+    worker.work()
+
+    def shown(query: str) -> list[str]:
+        return re.findall(r'/v1">([a-z]+)</a>', read(client, f"/datasets?{query}"))
+
+    assert shown("") == ["beta", "alpha"]
+    assert shown("order=oldest") == ["alpha", "beta"]
+    assert shown("search=ALPH") == ["alpha"]
+    assert shown("search=rod_hang") == ["beta", "alpha"]
+    assert "No dataset fits" in read(client, "/datasets?search=gamma%25")
+    (first, _) = client.get("/v1/datasets").json()["items"]
+    cover = client.get(f"/ui/datasets/{first['id']}/v1/cover.png")
+    assert Image.open(BytesIO(cover.content)).size == (56, 56)

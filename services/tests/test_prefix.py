@@ -1,11 +1,9 @@
 """The service below a path: links, answers and refusals with a prefix, and pages behind nginx."""
 
 import re
-import shutil
-import socket
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlencode
 
 import httpx
 import pytest
@@ -14,7 +12,8 @@ from stickslip_services.app import make_app
 from stickslip_services.errors import SettingsError
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import serving, wait_until
+from stickslip_testing.nginx import nginx
+from stickslip_testing.servers import RunningServer, serving
 from stickslip_testing.worker import DirectApi, PretendWorker
 
 
@@ -100,68 +99,27 @@ def test_a_prefix_opens_nothing_without_a_key(tmp_path: Path) -> None:
         assert httpx.get(f"{url}/lab/livez").status_code == 200
 
 
-NGINX = """
-daemon off;
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-events {{}}
-http {{
-  access_log off;
-  {temporary}
-  server {{
-    listen 127.0.0.1:{port};
-    location /stickslip/ {{
-      proxy_pass {service};
-      proxy_http_version 1.1;
-      proxy_set_header Host $http_host;
-      proxy_set_header X-Forwarded-Prefix /stickslip;
-      proxy_buffering off;
-    }}
-  }}
-}}
-"""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture
-def behind_nginx(tmp_path: Path) -> Iterator[tuple[str, str]]:
-    """The address of a service below /stickslip/ of nginx, and its own."""
-    program = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin")
-    if program is None:
-        pytest.skip("nginx is not installed: apt-get install nginx")
-    port = free_port()
+def behind_nginx(tmp_path: Path) -> Iterator[tuple[str, RunningServer]]:
+    """The address of a service below /stickslip/ of nginx, and the service."""
     with serving(make_app(Settings(data=tmp_path / "data", durable=False))) as service:
-        kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-        temporary = " ".join(f"{kind}_temp_path {tmp_path}/{kind};" for kind in kinds)
-        configuration = tmp_path / "nginx.conf"
-        # The slash at the end makes nginx strip the prefix.
-        text = NGINX.format(folder=tmp_path, port=port, service=f"{service}/", temporary=temporary)
-        configuration.write_text(text)
-        process = subprocess.Popen([program, "-c", str(configuration), "-e", "stderr"])
-        try:
-            address = f"http://127.0.0.1:{port}/stickslip"
-            wait_until(lambda: is_answering(f"{address}/livez"))
-            yield address, service
-        finally:
-            process.terminate()
-            process.wait(20)
-
-
-def is_answering(url: str) -> bool:
-    try:
-        return httpx.get(url).status_code == 200
-    except httpx.TransportError:
-        return False
+        # The slash at the end of the service's address makes nginx strip the prefix.
+        location = f"""
+            location /stickslip/ {{
+              proxy_pass {service}/;
+              proxy_http_version 1.1;
+              proxy_set_header Host $http_host;
+              proxy_set_header X-Forwarded-Prefix /stickslip;
+              proxy_buffering off;
+            }}
+        """
+        with nginx(tmp_path, server=location) as address:
+            yield f"{address}/stickslip", RunningServer(service, tmp_path / "data")
 
 
 @pytest.mark.real
-def test_the_service_works_behind_nginx(behind_nginx: tuple[str, str], tmp_path: Path) -> None:
-    address, _ = behind_nginx
+def test_the_service_works_behind_nginx(behind_nginx: tuple[str, RunningServer]) -> None:
+    address, running = behind_nginx
     submitted = httpx.post(f"{address}/v1/jobs", json=rods())
     job = submitted.json()["id"]
     assert submitted.headers["location"] == f"/stickslip/v1/jobs/{job}"
@@ -171,8 +129,27 @@ def test_the_service_works_behind_nginx(behind_nginx: tuple[str, str], tmp_path:
             continue  # buttons
         followed = httpx.get(address.removesuffix("/stickslip") + path, follow_redirects=True)
         assert followed.status_code == 200, path
-    # A press of a button, with the Origin that a browser sends.
+    # The form, from its page to the job.
+    worker = running.worker(whole=True)
     origin = address.removesuffix("/stickslip")
+    form = httpx.get(f"{address}/submit?kind=rod_hang").text
+    assert 'hx-post="/stickslip/ui/submit"' in form
+    fields = {"kind": "rod_hang", "axes.gamma.values": "3", "axes.phi0.values": "0"}
+    headers = {"Origin": origin, "Content-Type": "application/x-www-form-urlencoded"}
+    body = urlencode(fields | {"axes.phi1.values": "1, 2"})
+    made = httpx.post(f"{address}/ui/submit", content=body, headers=headers)
+    assert made.headers["hx-redirect"].startswith("/stickslip/jobs/job-")
+    worker.work()
+    # Downloads: a shard that the page of the dataset links to, and samples as a zip file.
+    (dataset, *_) = httpx.get(f"{address}/v1/datasets").json()["items"]
+    page = httpx.get(f"{address}/datasets/{dataset['id']}/v1").text
+    shard = re.search(r'href="(/stickslip/v1/[^"]*/files/views/c/0[^"]*)"', page)
+    assert shard is not None
+    assert len(httpx.get(origin + shard[1]).content) > 1000
+    zipped = httpx.get(f"{address}/ui/datasets/{dataset['id']}/v1/selection.zip")
+    assert zipped.content.startswith(b"PK")
+    # A press of a button, with the Origin that a browser sends.
+    job = httpx.post(f"{address}/v1/jobs", json=rods(gamma=(9.0,))).json()["id"]
     paused = httpx.post(f"{address}/ui/jobs/{job}/pause", headers={"Origin": origin})
     assert paused.headers["hx-redirect"] == f"/stickslip/jobs/{job}"
     with httpx.stream("GET", f"{address}/ui/changes") as stream:

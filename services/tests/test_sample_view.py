@@ -12,7 +12,8 @@ from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds import job_spec_adapter
 from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
-from stickslip_services.pages.browsing import sliders, thumbs
+from stickslip_services.pages.browsing import thumbs
+from stickslip_services.pages.choosing import sliders
 from stickslip_services.pages.motion import deformed, motion
 from stickslip_services.pages.pictures import coloured, mp4, shown_part
 from stickslip_services.pages.sample_page import sample_view
@@ -144,8 +145,26 @@ def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
     assert chosen(**{"mu.from": "100"}) == 5 * 3  # the largest alone
     assert chosen(**{"mu.from": "2", "mu.to": "1"}) == 0
     assert chosen(valid="no") == 1
-    assert chosen(psnr="39.999") == 1
-    assert chosen(psnr="bright") == chosen(**{"mu.from": "-1"}) == count
+    bright = {"where0.label": "psnr_cloth", "where0.operator": ">=", "where0.value": "39.999"}
+    assert chosen(**bright) == 1
+    low = {"where1.label": "mu", "where1.operator": "<", "where1.value": "0.5"}
+    assert chosen(**low) == 5 * 100 * 3 - 1  # the first is rejected
+    assert chosen(**bright, **low) == 0
+    assert "no valid sample" in thumbs(data, bright | low, 0)["fault"]
+    wrong = {"where0.label": "psnr_cloth", "where0.operator": ">=", "where0.value": "bright"}
+    assert "must be compared with a number" in thumbs(data, wrong, 0)["fault"]
+    assert chosen(**{"mu.from": "-1"}) == count
+    shown = thumbs(data, {"mu.from": "1", "mu.to": "99", **bright}, 0)
+    lowest, highest = (sliders(data.manifest.spec)[1]["values"][stop] for stop in (1, 99))
+    assert shown["pull_options"] == (
+        f"--where 'mu>={lowest}' --where 'mu<={highest}' --where 'psnr_cloth>=39.999'"
+    )
+    by_psnr = {"sort": "psnr_cloth", "order": "descending"}
+    assert [slot for slot, *_ in thumbs(data, by_psnr, 0)["thumbs"][:3]] == [2999, 2998, 2997]
+    assert thumbs(data, {"sort": "psnr_cloth"}, 0)["thumbs"][0][0] == 1
+    # Rejected samples come last.
+    assert thumbs(data, {"sort": "psnr_cloth"}, 2976)["thumbs"][-1][0] == 0
+    assert thumbs(data, {"sort": "nothing"}, 0)["thumbs"][0][0] == 0
     shown = thumbs(data, {"texture.from": "1", "texture.to": "1"}, 48)
     assert (len(shown["thumbs"]), shown["next_start"]) == (48, 96)
     assert {point["texture"] for _, point, _ in shown["thumbs"]} == {sorted(axes["texture"])[1]}

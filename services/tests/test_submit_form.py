@@ -95,8 +95,8 @@ def test_values_are_read_as_they_are_written() -> None:
         gamma(axes__gamma__form="spiral")
     more = document_of(form, sent(more="views: null\naxes: {phi0: 2}", axes__phi1__values="3"))
     assert (more["views"], more["axes"]) == (None, {"phi1": 3, "phi0": 2})
-    for wrong in ("a: [", "just a word", "- 1"):
-        with pytest.raises(FormError, match=r"more: (is not YAML|must be keys)"):
+    for wrong in ("a: [", "just a word", "- 1", "x: !!binary aGk=", "x: !!set {a}", "1: 2"):
+        with pytest.raises(FormError, match=r"more: (is not YAML|must be keys|must have values)"):
             document_of(form, sent(more=wrong))
 
 
@@ -123,7 +123,7 @@ def test_a_form_is_checked_and_submitted(server: RunningServer) -> None:
     checked = post(server, "/ui/submit/check", filled).text
     assert "<dt>samples</dt><dd>10</dd>" in checked
     assert re.search(r"<dt>CPU time</dt><dd>about [\d.]+ (s|min)", checked)
-    shown = re.search(r"<h3>spec.yaml</h3>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
+    shown = re.search(r">spec.yaml</p>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
     assert shown is not None
     assert yaml.safe_load(html.unescape(shown[1]))["axes"]["mu"]["num"] == 10
     assert f"curl {server.url}/v1/jobs" in html.unescape(checked)

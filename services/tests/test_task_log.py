@@ -8,7 +8,7 @@ from stickslip_services.queue.background import sweep
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, resume_job, retry_task
 from stickslip_services.queue.failures import failed_tasks
-from stickslip_services.queue.jobs import find_job
+from stickslip_services.queue.jobs import find_job, lost_slots
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.task_log import TaskLog, read_task_log
 from stickslip_services.units import percent
@@ -119,6 +119,15 @@ def test_the_page_of_a_failed_task_shows_its_log(server: RunningServer) -> None:
     )
     assert httpx.post(f"{server.url}/v1/jobs/{job}/tasks/{task}:retry").status_code == 409
     assert httpx.get(f"{server.url}/jobs/{job}/tasks/nothing").status_code == 404
+
+
+def test_a_sample_of_a_failed_simulation_counts_as_lost(
+    context: Context, worker: PretendWorker, clock: ManualClock
+) -> None:
+    job = submit(context)
+    crash(worker, clock, context, attempts=3)
+    with context.database.read() as connection:
+        assert lost_slots(connection, int(find_job(connection, job).seq)) == [0]
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,15 @@ One that is added and not tried fails the test.
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
+from pathlib import Path
 
 import httpx
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
 from PIL import Image
 from sqlalchemy import insert, select
 from starlette.routing import Route
@@ -27,6 +29,7 @@ from stickslip_services.queue.context import Context
 from stickslip_services.queue.ids import task_id
 from stickslip_services.settings import Settings
 from stickslip_testing.jobs import rods
+from stickslip_testing.nginx import nginx
 from stickslip_testing.servers import serving, wait_until
 from stickslip_testing.worker import DirectApi, PretendWorker
 
@@ -46,7 +49,10 @@ SHARED = {
     ("GET", "/datasets"),
     ("GET", "/docs"),
     ("GET", "/scenes"),
+    ("GET", "/submit"),
     ("GET", "/workers"),
+    ("POST", "/ui/submit"),
+    ("POST", "/ui/submit/check"),
 }
 """Operations that every project may call. They must tell nothing of another project."""
 
@@ -71,6 +77,9 @@ OWNED = {
     ("PATCH", "/v1/jobs/{job_id}"),
     *(("POST", f"/v1/jobs/{{job_id}}:{verb}") for verb in ("cancel", "pause", "resume")),
     ("GET", "/v1/tasks/{task_id}"),
+    ("GET", "/jobs/{job_id}/tasks/{task_id}"),
+    ("POST", "/v1/jobs/{job_id}/tasks/{task_id}:retry"),
+    ("POST", "/ui/jobs/{job_id}/tasks/{task_id}/retry"),
     ("GET", "/v1/previews/{digest}"),
     ("GET", "/v1/datasets/{dataset}"),
     *(
@@ -88,6 +97,8 @@ OWNED = {
         ("GET", f"/ui/datasets/{{dataset}}/v{{version}}/{rest}")
         for rest in (
             "thumbs",
+            "cover.png",
+            "selection.zip",
             "spec.yaml",
             "samples/{slot}/motion.json",
             "samples/{slot}/{array}.mp4",
@@ -116,6 +127,8 @@ class Tenants:
             return client.post(path, content=b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         if template.endswith("/textures"):
             return client.post(path, content=picture(3), headers={"Content-Type": "image/png"})
+        if method == "POST" and template.startswith("/ui/submit"):
+            return client.post(path, data={"kind": "rod_hang"})
         bodies = {"PATCH": {"priority": 3}, "POST": rods()}
         return client.request(method, path, json=bodies.get(method))
 
@@ -128,9 +141,13 @@ def picture(shade: int) -> bytes:
 
 @pytest.fixture(scope="module")
 def tenants(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tenants]:
-    app = make_app(
-        Settings(data=tmp_path_factory.mktemp("tenants"), durable=False, require_keys=True)
-    )
+    with serving_tenants(tmp_path_factory.mktemp("tenants")) as served:
+        yield served
+
+
+@contextmanager
+def serving_tenants(folder: Path) -> Iterator[Tenants]:
+    app = make_app(Settings(data=folder, durable=False, require_keys=True))
     context: Context = app.state.context
     with serving(app) as url:
         with context.database.write() as connection:
@@ -281,6 +298,79 @@ def test_no_answer_that_needs_a_key_is_kept_by_a_shared_cache(
             assert "authorization" in answer.headers.get("vary", "").lower(), shown
             if reader in ("nobody", "wrong key") and template not in open_to_all:
                 assert answer.status_code == 401, shown
+
+
+def counting_app() -> FastAPI:
+    """Return an app whose only answer may be kept by a shared cache, and counts its calls."""
+    app = FastAPI()
+    calls = []
+
+    @app.get("/public")
+    def public(response: Response) -> int:
+        calls.append(1)
+        response.headers["Cache-Control"] = "public, max-age=600"
+        return len(calls)
+
+    return app
+
+
+CACHING = """
+proxy_http_version 1.1;
+proxy_set_header Host $http_host;
+proxy_cache shared;
+proxy_cache_valid any 10m;
+add_header X-Cache $upstream_cache_status always;
+"""
+"""A cache that also keeps answers which say nothing of caches."""
+
+
+@pytest.mark.real
+def test_a_caching_proxy_gives_nobody_what_the_owner_has_read(tmp_path: Path) -> None:
+    """nginx caches what it may; every path is read by the owner first, twice."""
+    # The jobs of other tests make the other project an owner, too.
+    with serving_tenants(tmp_path / "data") as tenants:
+        read_through_a_cache(tenants, tmp_path)
+
+
+def read_through_a_cache(tenants: Tenants, folder: Path) -> None:
+    templates = {path for method, path in operations(tenants.app) if method == "GET"} - {
+        path for _, path in ENDLESS
+    }
+    alpha, beta = (client.headers["Authorization"] for client in (tenants.alpha, tenants.beta))
+    readers = {"another project": beta, "wrong key": "Bearer sk_wrong", "nobody": None}
+    service = str(tenants.alpha.base_url).rstrip("/")
+    with serving(counting_app()) as public:
+        locations = (
+            f"location / {{ proxy_pass {service}; {CACHING} }}"
+            f"location = /public {{ proxy_pass {public}; {CACHING} }}"
+        )
+        zone = f"proxy_cache_path {folder}/cache keys_zone=shared:1m;"
+        with (
+            nginx(folder, server=locations, http=zone) as address,
+            httpx.Client(base_url=address, timeout=20, trust_env=False) as client,
+        ):
+            # The proxy caches: otherwise the test would show nothing.
+            assert [client.get("/public").text for _ in range(2)] == ["1", "1"]
+            for template in sorted(templates):
+                client.headers["Authorization"] = alpha
+                for _ in range(2):
+                    answer = tenants.call(client, "GET", template)
+                    assert answer.headers["X-Cache"] != "HIT", template
+                for reader, authorization in readers.items():
+                    client.headers.pop("Authorization", None)
+                    if authorization is not None:
+                        client.headers["Authorization"] = authorization
+                    answer = tenants.call(client, "GET", template)
+                    shown = f"{reader}: {template}: {answer.status_code} {answer.headers}"
+                    assert answer.headers["X-Cache"] != "HIT", shown
+                    if ("GET", template) in OWNED:
+                        expected = {404} if reader == "another project" else {401}
+                        assert answer.status_code in expected, shown
+                    elif reader != "another project" and template not in ("/livez", "/readyz"):
+                        assert answer.status_code == 401, shown
+                    assert tenants.parameters["job_id"] not in answer.text or (
+                        tenants.parameters["job_id"] in str(answer.url)
+                    ), shown
 
 
 def test_a_file_is_private_in_every_form_of_its_answer(tenants: Tenants) -> None:

@@ -17,13 +17,14 @@ SOURCE = Path(sys.modules["stickslip_services.queue.context"].__file__ or "").pa
 
 INFRASTRUCTURE = {
     "access/principals.py",
+    "addresses.py",
     "database/database.py",
     "database/statements.py",
     "queue/context.py",
     "queue/ids.py",
     "queue/integrity.py",
 }
-"""Files that every verb uses: database, principal, context, names and digests of rows."""
+"""Files that every verb uses: addresses, database, principal, context, names, digests of rows."""
 
 MAX_FILES = 12
 

@@ -56,8 +56,7 @@ CASES: dict[str, str] = {
             control.rejected_work factor.pool""",
         "ball": """smooth.between smooth.beyond_edge smooth.curvature_max smooth.fold_over
             smooth.reach smooth.same_normal""",
-        "edges": """medial_axis.radius_max medial_axis.thickness_max medial_axis.beyond
-            stepping.sweep""",
+        "edges": "stepping.sweep",
         "valley": "contact.fillet",
         "push": "stepping.near_patience stepping.stalled_soon",
         "let down": "control.halvings",
@@ -68,8 +67,6 @@ CASES: dict[str, str] = {
 
 DEARER = {
     ("stepping.stalled_soon", 0.5): 20.0,
-    # 3.2 times the iterations of GMRES since friction has a single law.
-    ("medial_axis.thickness_max", 0.5): 4.0,
 }
 """Factors of the cost beyond COST."""
 

@@ -63,7 +63,7 @@ def fallen(material: str, mesh: meshes.Mesh, *, box_below: bool) -> str:
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         body = (
-            box(0.5, (0.05, 0.05, 0.06), origin=(0.0005 * step, 0.0, 0.0))
+            box(0.5, (0.05, 0.05, 0.06), rounding=0.01, origin=(0.0005 * step, 0.0, 0.0))
             if box_below
             else sphere(0.6, 0.03, rotation=turn)
         )

@@ -294,9 +294,16 @@ def write_clips(root: Path, spec: ClothDragSpec, rejected: tuple[int, ...] = ())
         for name in ("material", "texture", "viewpoint")
     }
     content["mu"] = np.array([label["mu"] for label in labels])
+    width, height = spec.frame_size
     content["video"] = generator.integers(
-        1, 6, (len(labels), spec.frames, 224, 224, 3), dtype=np.uint8
+        1, 6, (len(labels), spec.frames, height, width, 3), dtype=np.uint8
     )
+    if spec.ground_truth:
+        codes = generator.integers(0, 4, (len(labels), spec.frames, height, width))
+        content["segmentation"] = codes.astype(np.uint8)
+    if spec.canvas:
+        sizes = [spec.picture_size(label["viewpoint"]) for label in labels]
+        content["picture_size"] = np.array(sizes, dtype=np.int32)
     for array in layout(spec):
         if array.name in content or array.name in ("valid", "split", "sample_key"):
             continue
@@ -348,3 +355,31 @@ def make_clips(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., MadeDa
         return write_clips(tmp_path_factory.mktemp("clips") / "v1", cloth_spec(**changes), rejected)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def sized_clips(tmp_path_factory: pytest.TempPathFactory) -> MadeDataset:
+    """6 clips with ground truth, of 66 x 90 and 120 x 66 in frames of 120 x 90; 1 is rejected.
+
+    Do not write into it: copy it.
+    """
+    lab = {
+        "image_size": [640, 480],
+        "camera_matrix": [[700.0, 0.0, 319.5], [0.0, 700.0, 239.5], [0.0, 0.0, 1.0]],
+        "rvec": [np.pi / 2, 0.0, 0.0],
+        "tvec": [0.0, 0.2, 1.0],
+        "resolution": [120, 66],
+    }
+    axes = {
+        "material": "gray-interlock",
+        "mu": [0.1, 0.5, 0.9],
+        "texture": "dots",
+        "viewpoint": ["left", "lab"],
+    }
+    spec = cloth_spec(
+        axes=axes,
+        viewpoints={"lab": lab},
+        resolution=[66, 90],
+        ground_truth=["depth", "segmentation"],
+    )
+    return write_clips(tmp_path_factory.mktemp("sizes") / "v1", spec, rejected=(1,))

@@ -66,6 +66,8 @@ def physics(**changes: Any) -> dict[str, Any]:
         {"cloth": {"origin": [0.0, 0.0, -0.001]}},
         {"bodies": {"ball": {"type": "sphere", "radius": 0.03, "origin": [0, 0, 0.05]}}},
         {"bodies": {"rod": {"type": "cylinder", "radius": 0.03, "origin": [0, 0, 0.05]}}},
+        {"bodies": {"rod": {"type": "cylinder", "radius": 0.0224, "origin": [0, 0, -0.5]}}},
+        {"bodies": {"plate": {"type": "box", "size": [1, 1, 0.04], "origin": [0, 0, -0.5]}}},
         {
             "bodies": {
                 "bone": {"type": "capsule", "radius": 0.02, "length": 0.1, "origin": [0, 0, 0.05]}
@@ -137,6 +139,10 @@ def test_an_error_of_the_run_is_a_bug(
 def test_the_numbers_are_those_of_the_core() -> None:
     assert MAX_EXTENT == solver.EXTENT_MAX
     assert shapes.ROUNDING == contact.ROUNDING
+    assert shapes.RADIUS_LEAST == contact.RADIUS_LEAST
+    for size, cell in (([1, 1, 1], 0.001), ([1, 1, 1], 0.01), ([1, 1, 0.012], 0.01)):
+        mine = shapes.box_rounding({"size": size, "rounding": None}, cell)
+        assert mine == contact.default_rounding(size, cell)
     assert set(SHORTEST_STEPS) == set(presets.PRESETS)
     for name, settings in presets.PRESETS.items():
         shortest = settings.longest_step / settings.finest
@@ -187,6 +193,7 @@ def test_sheets_are_those_of_the_core() -> None:
     given = document["sheets"]["cloth"]
     mine = start_of("cloth", given)
     core = parts.sheet("cloth", given, {}, seed=0, kernel=None)
+    assert mine.cell == pytest.approx(core.mesh.spacing, rel=1e-12)
     np.testing.assert_allclose(mine.positions, core.start, atol=1e-15)
     np.testing.assert_array_equal(mine.mesh.triangles, core.mesh.triangles)
 
@@ -196,5 +203,6 @@ def test_a_scattered_sheet_is_within_its_jitter() -> None:
     document = physics(cloth={"mesh": mesh})
     lattice = start_of("cloth", document["sheets"]["cloth"])
     scattered = meshes.unstructured(0.1, 0.07, 0.01, 3)
+    assert lattice.cell == pytest.approx(scattered.spacing, rel=1e-12)
     offsets = scattered.rest[:, None] - lattice.rest[None]
     assert np.linalg.norm(offsets, axis=2).min(axis=1).max() <= lattice.jitter

@@ -224,7 +224,6 @@ class Reason(StrEnum):
     stretch = "stretch"
     penetration = "penetration"
     passages = "passages"
-    sharpness = "sharpness"
     # The same, of rows that earlier versions wrote.
     missed = "missed"
     # Only jobs end or wait for these.

@@ -77,6 +77,7 @@ def test_short_and_long_forms_are_one_spec() -> None:
         ("demo-rods", RodHangSpec, 48),
         ("demo-cloth", ClothDragSpec, 4),
         ("friction-cloth", ClothDragSpec, 2),
+        ("camera-cloth", ClothDragSpec, 4),
         ("sampled-rods", RodHangSpec, 2_500),
     ],
 )

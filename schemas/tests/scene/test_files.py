@@ -95,7 +95,7 @@ def test_files_become_arrays() -> None:
             r"areas above 0 m\^2, and triangle 0 has none",
         ),
         (BODY, frames(), "triangle 0 has none"),
-        (BODY, b"\xff\xfe\x00", "must be text, or an NPZ file: .* truncated data"),
+        (BODY, b"\xff\xfe\x00", "must be text, or an NPZ file, and byte 2 is not of its encoding"),
         (BODY, b"PK\x03\x04 no archive", "must be an NPZ file, and its directory is missing"),
         (
             BODY,

@@ -17,6 +17,7 @@ from stickslip_schemas.scene.geometry import (
     find_touch,
 )
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.scene.shapes import box_rounding
 from stickslip_schemas.scene.start import check_start, find_start_faults
 from stickslip_schemas.spec.jobs import StartFault
 
@@ -280,8 +281,8 @@ FAULTS: list[tuple[dict[tuple[str, ...], Any], tuple[str, ...], str, Any]] = [
             ORIGIN: [0.0, 0.0, 0.002],
             ("bodies", "ball"): {
                 "type": "box",
-                "size": [0.05, 0.05, 0.02],
-                "origin": [0, 0, 0.03],
+                "size": [0.05, 0.05, 0.024],
+                "origin": [0, 0, 0.032],
                 "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.03])),
             },
         },
@@ -463,8 +464,8 @@ CAN_START: list[dict[tuple[str, ...], Any]] = [
         ORIGIN: [0.0, 0.0, 0.002],
         ("bodies", "ball"): {
             "type": "box",
-            "size": [0.05, 0.05, 0.02],
-            "origin": [0, 0, 0.03],
+            "size": [0.05, 0.05, 0.024],
+            "origin": [0, 0, 0.032],
             "motion": keys((0.1, [0, 0, 0]), (0.4, [0, 0, -0.0195])),
         },
     },
@@ -506,6 +507,63 @@ CAN_START: list[dict[tuple[str, ...], Any]] = [
 @pytest.mark.parametrize("changes", CAN_START)
 def test_it_can_start(changes: dict[tuple[str, ...], Any]) -> None:
     assert faults_of(changes) == []
+
+
+ROD = {"type": "cylinder", "origin": [0.0, 0.0, -1.0], "turn": [1.5708, 0.0, 0.0]}
+BOX = {"type": "box", "origin": [0.0, 0.0, -1.0]}
+LEAST = 0.9 * 0.1 / 8
+
+
+@pytest.mark.parametrize(
+    ("body", "member", "words"),
+    [
+        ({**ROD, "radius": 0.99 * LEAST}, "radius", "0.9 cells, which is 0.01125 m"),
+        ({**BALL, "radius": 0.99 * LEAST}, "radius", "0.9 cells, which is 0.01125 m"),
+        ({**ROD, "type": "capsule", "length": 0.1, "radius": 0.002}, "radius", "0.9 cells"),
+        ({**BOX, "size": [1, 1, 1], "rounding": 0.99 * LEAST}, "rounding", "0.9 cells"),
+        ({**BOX, "size": [1, 1, 1.98 * LEAST]}, "size", "1.8 cells thick, which is 0.0225 m"),
+    ],
+)
+def test_bodies_are_round_against_a_cell(body: dict[str, Any], member: str, words: str) -> None:
+    (fault,) = faults_of({("bodies", "thing"): body})
+    assert fault.location == ("bodies", "thing", member)
+    assert words in fault.rule
+    assert "with the sheet cloth: cells of 0.0125 m catch on what is sharper" in fault.rule
+    assert "make it larger, or the sheet finer" in fault.rule
+    assert fault.value == (list(body[member]) if member == "size" else body[member])
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {**ROD, "radius": LEAST},
+        {**BOX, "size": [1, 1, 1], "rounding": LEAST},
+        {**BOX, "size": [1, 1, 2.02 * LEAST]},
+    ],
+)
+def test_bodies_may_be_as_sharp_as_that(body: dict[str, Any]) -> None:
+    assert faults_of({("bodies", "thing"): body}) == []
+
+
+def test_the_coarsest_sheet_counts() -> None:
+    coarse = {**OTHER, "mesh": {"type": "grid", "size": [0.1, 0.1], "cells": [4, 4]}}
+    changes = {
+        ("sheets", "other", "towel"): {**coarse, "origin": [0.0, 0.0, 0.2]},
+        ("bodies", "thing"): {**ROD, "radius": 0.02},
+    }
+    (fault,) = faults_of(changes)
+    assert "which is 0.0225 m with the sheet other-towel" in fault.rule
+
+
+@pytest.mark.parametrize(
+    ("size", "cell", "rounding"),
+    [([1, 1, 1], 0.001, 0.005), ([1, 1, 1], 0.01, 0.009), ([1, 1, 0.012], 0.01, 0.006)],
+)
+def test_the_edges_of_a_box_are_round_by_default(
+    size: list[float], cell: float, rounding: float
+) -> None:
+    assert box_rounding({"size": size, "rounding": None}, cell) == pytest.approx(rounding)
+    assert box_rounding({"size": size, "rounding": 0.1}, cell) == 0.1
 
 
 @pytest.mark.parametrize("name", scene_names())

@@ -126,11 +126,11 @@ class Settings(BaseSettings):
     def chosen(cls, **values: object) -> Self:
         """Return settings with these values; raise SettingsError.
 
-        Settings that are not given are those of the environment.
+        The environment has the settings that are not given.
         """
-        given = {name: value for name, value in values.items() if value not in (None, ())}
+        settings = {name: value for name, value in values.items() if value not in (None, ())}
         try:
-            return cls(**given)  # type: ignore[arg-type]  # pydantic checks the types
+            return cls(**settings)  # type: ignore[arg-type]  # pydantic checks the types
         except ValidationError as error:
             rules = (
                 item["msg"].removeprefix("Value error, ")
@@ -175,8 +175,8 @@ class Settings(BaseSettings):
         except (ArgumentError, ValueError):
             url = None
         if url is None or url.drivername != "postgresql" or not url.database:
-            shown = _without_secrets(value, url)
-            raise ValueError(f"database must be {_DATABASE_FORM}, and is {shown}")
+            safe_value = _without_secrets(value, url)
+            raise ValueError(f"database must be {_DATABASE_FORM}, and is {safe_value}")
         # SQLAlchemy splits at the first @, and takes the rest of the password for the host.
         user_part = value.partition("://")[2].rpartition("/")[0]
         if user_part.count("@") > 1:

@@ -93,6 +93,7 @@ void bind_cloth(nb::module_& m) {
               "Sum of the sizes of all changes of energy and of all work [J].")
       .def_ro("gain", &DiagnosticExtremes::gain,
               "Largest energy gained beyond the work of all forces [J].");
+  m.attr("radius_least") = radius_least;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
       .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")
@@ -116,8 +117,6 @@ void bind_cloth(nb::module_& m) {
           },
           "How often each rung of the fallback ladder was tried and converged, by name.")
       .def_ro("seen", &StepReport::extremes)
-      .def_ro("sharpest", &StepReport::sharpest,
-              "Least radius of a medial axis that cloth touched, in cells.")
       .def_ro("uneven", &StepReport::uneven,
               "Distance of what drives the cloth from an even motion within a step of the "
               "controller [m].")
@@ -126,16 +125,14 @@ void bind_cloth(nb::module_& m) {
               "where none are near.");
   using PairForces = ClothSolver::PairForces;
   nb::class_<PairForces>(m, "PairForces",
-                         "Forces of cloth on cloth, surfaces and the medial axes of bodies, at P "
-                         "pairs of closest points.")
+                         "Forces of cloth on cloth and surfaces at P pairs of closest points.")
       .def_ro("vertices", &PairForces::vertices,
-              "(P, 4); those of surfaces and then of medial axes come after those of the cloth.")
+              "(P, 4); those of surfaces come after those of the cloth.")
       .def_ro("weights", &PairForces::weights,
               "(P, 4): the force acts on each vertex by its weight.")
       .def_ro("forces", &PairForces::forces, "(P, 3) [N]")
       .def_ro("distance", &PairForces::distance, "(P,) [m]")
-      .def_ro("sliding", &PairForces::sliding, "(P,)")
-      .def_ro("body", &PairForces::body, "(P,): number of the body, or -1.");
+      .def_ro("sliding", &PairForces::sliding, "(P,)");
   nb::class_<ClothSolver>(m, "ClothSolver",
                           "Internal: see stickslip_sim_core.Cloth and cloth/solver.hpp.")
       .def(

@@ -132,12 +132,12 @@ void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, do
 }
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, int others, int capsules,
+                   const std::vector<std::int32_t>& held, int others,
                    const FactorSettings& settings)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics)),
       compact_stencils(bending_stencils(mesh, fabrics, true)),
-      numbering(mesh, stencils, compact_stencils, held, others, capsules),
+      numbering(mesh, stencils, compact_stencils, held, others),
       mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
       mass(numbering.nodes, 0.0),
       own_damping(numbering.nodes, 0.0),

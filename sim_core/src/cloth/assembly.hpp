@@ -51,10 +51,9 @@ struct NeighbourNumbers {
 
 class Assembly {
  public:
-  // `others`: vertices of surfaces; `capsules`: points of medial axes.
+  // `others`: vertices of surfaces.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, int others, int capsules,
-           const FactorSettings& settings = {});
+           const std::vector<std::int32_t>& held, int others, const FactorSettings& settings = {});
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;

@@ -57,36 +57,14 @@ double circle_around(const ClothMesh& mesh, Eigen::Index triangle) {
   return c * c >= a * a + b * b ? 0.5 * c : a * b * c / (4.0 * mesh.area[triangle]);
 }
 
-// Sheets, and after them surfaces and medial axes.
+// Sheets, and after them surfaces.
 std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numbering,
-                                 const SurfaceMeshes& surfaces,
-                                 const std::vector<MedialAxis>& medial_axes) {
+                                 const SurfaceMeshes& surfaces) {
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = mesh.sheet_of_vertex[i];
   const int* others = numbering.node.data() + numbering.vertices;
   for (int i = 0; i < numbering.others; ++i)
     out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
-  int next = numbering.nodes - numbering.capsule_points,
-      sheet = mesh.sheets + static_cast<int>(surfaces.crease.size());
-  for (const MedialAxis& medial_axis : medial_axes) {
-    for (std::size_t p = 0; p < medial_axis.points.size(); ++p) out[next++] = sheet;
-    ++sheet;
-  }
-  return out;
-}
-
-// Pieces of medial axes, by node.
-CapsulePieces capsules_of(const Numbering& numbering, const std::vector<MedialAxis>& medial_axes) {
-  CapsulePieces out;
-  int first = numbering.nodes - numbering.capsule_points;
-  for (const MedialAxis& medial_axis : medial_axes) {
-    const int count = static_cast<int>(medial_axis.points.size());
-    for (int p = 0; p < count; ++p) out.points.push_back(first + p);
-    for (const auto& [a, b] : medial_axis.segments) out.segments.push_back({first + a, first + b});
-    for (const auto& [a, b, c] : medial_axis.triangles)
-      out.triangles.push_back({first + a, first + b, first + c});
-    first += count;
-  }
   return out;
 }
 
@@ -118,36 +96,16 @@ std::vector<double> cells_of_vertices(const ClothMesh& mesh) {
   return out;
 }
 
-ContactMaterials with_capsules(ContactMaterials materials,
-                               const std::vector<MedialAxis>& medial_axes,
-                               const std::vector<Body>& bodies, double cell) {
-  const Eigen::Index before = materials.mu.rows(),
-                     count = before + static_cast<Eigen::Index>(medial_axes.size());
-  Eigen::MatrixXd mu = Eigen::MatrixXd::Constant(count, count, -1.0);
-  mu.topLeftCorner(before, before) = materials.mu;
-  materials.cell = cell;
-  for (const MedialAxis& one : medial_axes) {
-    const Eigen::Index row = before + static_cast<Eigen::Index>(materials.capsules.size());
-    for (int sheet = 0; sheet < materials.sheets; ++sheet) {
-      mu(row, sheet) = mu(sheet, row) = bodies[one.body].mu_of(sheet);
-    }
-    materials.capsules.push_back({one.body, one.radius, one.replaces_nodes});
-  }
-  materials.mu = std::move(mu);
-  return materials;
-}
-
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
                                            const SurfaceMeshes& surfaces,
-                                           const std::vector<MedialAxis>& medial_axes,
                                            const Constants& constants) {
   check_thickness(mesh, materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
   append(surfaces.triangles, numbering.node.data() + numbering.vertices, triangles);
-  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces, medial_axes),
-                  (materials.mu.array() >= 0.0).matrix(), capsules_of(numbering, medial_axes));
+  Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces),
+                  (materials.mu.array() >= 0.0).matrix());
   const double cell = std::sqrt(2.0 * mesh.area.mean());
   return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact,
                                       constants.path, constants.path.margin * cell,
@@ -173,7 +131,7 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
     }
   }
   return std::make_unique<SmoothContact>(std::move(triangles),
-                                         sheets_of_nodes(mesh, numbering, surfaces, {}), materials,
+                                         sheets_of_nodes(mesh, numbering, surfaces), materials,
                                          surfaces.crease, x, radius, settings);
 }
 

@@ -98,22 +98,6 @@ double StepDiagnostics::depth_in(const Body& body, const Buffer<double>& x) cons
   return deepest;
 }
 
-void StepDiagnostics::refuse_inside(const Body& body, int number, double inside,
-                                    const Buffer<double>& x) const {
-  const Numbering& numbering = assembly_.numbering;
-  for (std::size_t t = 0; t < nodes_.size(); t += 3) {
-    const int* node = &nodes_[t];
-    if (std::min({node[0], node[1], node[2]}) >= numbering.free_nodes) continue;
-    const double depth =
-        depth_beyond(body, {at_node(x, node[0]), at_node(x, node[1]), at_node(x, node[2])}, inside);
-    if (depth == 0.0) continue;
-    refuse(text("positions: triangles must not start more than ", 1e3 * inside,
-                " mm inside a body, and that of vertices ", numbering.vertex[node[0]], ", ",
-                numbering.vertex[node[1]], " and ", numbering.vertex[node[2]], " is ", 1e3 * depth,
-                " mm inside body ", number));
-  }
-}
-
 // No triangle comes to a core unless it is as large as the body is thick, or goes as far in a step.
 int StepDiagnostics::passages(const Body& begin, const Body& end, const StepTaken& step) const {
   const Core core = core_of(end);
@@ -182,25 +166,13 @@ void StepDiagnostics::measure_energy(const StepTaken& step, const Newton& newton
   const auto displacement_of = [&](int node) -> Vector3d {
     return at_node(step.x, node) - at_node(step.start, node);
   };
-  for (int i = 0; i < numbering.nodes - numbering.capsule_points; ++i) {
+  for (int i = 0; i < numbering.nodes; ++i) {
     const Vector3d displacement = displacement_of(i);
     add(displacement.dot(at_node(newton.residual, i)));
     const int vertex = numbering.vertex[i];
     if (vertex >= numbering.vertices) continue;
     kinetic += 0.5 * assembly_.mass[i] * at_node(step.v, i).squaredNorm();
     weight += assembly_.mass[i] * step.gravity.row(vertex).dot(displacement);
-  }
-  if (newton.pairs) {  // the axis of a rod that turns does not move, but its face does: what counts
-                       // is what cloth gets
-    for (const Pair& pair : newton.pairs->list()) {
-      if (!newton.pairs->capsule_of(pair.stencil)) continue;
-      Vector3d displacement = Vector3d::Zero();
-      for (int c = 0; c < 4; ++c) {
-        if (pair.stencil.node[c] < numbering.nodes - numbering.capsule_points)
-          displacement += pair.weights[c] * displacement_of(pair.stencil.node[c]);
-      }
-      add(displacement.dot(pair.contact.force));
-    }
   }
   const double energy = kinetic + assembly_.membrane_energy + assembly_.bending_energy;
   if (energy_) {

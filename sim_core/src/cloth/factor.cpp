@@ -75,32 +75,33 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
   tile_begin.push_back(0);
   child_begin.push_back(0);
   Shelf shelf;
-  long kept = 0, panel_max = 0, local_max = 0;
+  long update_floats = 0, panel_max = 0, local_max = 0;
   const auto pad = [](long rows) {
     return (rows + front_padding - 1) / front_padding * front_padding;
   };
   for (int f = 0; f < fronts; ++f) {
     const int first = pivot_begin[f], last = pivot_begin[f + 1];
-    std::vector<int>& own = structure[f];
+    std::vector<int>& front_rows = structure[f];
     for (int i = first; i < last; ++i) {
       for (int e = bending.begin[i]; e < bending.begin[i + 1]; ++e) {
-        if (bending.node[e] >= last) own.push_back(bending.node[e]);
+        if (bending.node[e] >= last) front_rows.push_back(bending.node[e]);
       }
     }
     for (int child : below[f]) {
       for (int j : structure[child]) {
-        if (j >= last) own.push_back(j);
+        if (j >= last) front_rows.push_back(j);
       }
     }
-    std::sort(own.begin(), own.end());
-    own.erase(std::unique(own.begin(), own.end()), own.end());
-    rows.insert(rows.end(), own.begin(), own.end());
+    std::sort(front_rows.begin(), front_rows.end());
+    front_rows.erase(std::unique(front_rows.begin(), front_rows.end()), front_rows.end());
+    rows.insert(rows.end(), front_rows.begin(), front_rows.end());
     row_begin.push_back(static_cast<int>(rows.size()));
     const auto place = [&](int node) {
       return node < last ? node - first
                          : last - first +
-                               static_cast<int>(std::lower_bound(own.begin(), own.end(), node) -
-                                                own.begin());
+                               static_cast<int>(
+                                   std::lower_bound(front_rows.begin(), front_rows.end(), node) -
+                                   front_rows.begin());
     };
     for (int child : below[f]) {
       const std::vector<int>& theirs = structure[child];
@@ -127,15 +128,15 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
       }
     }
     entry_begin.push_back(static_cast<long>(entry_slot.size()));
-    const long columns = 3L * (last - first), others = 3L * static_cast<long>(own.size());
+    const long columns = 3L * (last - first), others = 3L * static_cast<long>(front_rows.size());
     const long ld = pad(columns) + pad(others);
     tile_begin.push_back(tile_begin.back() + front_floats(columns, others));
     panel_max = std::max(panel_max, ld * columns);
     local_max = std::max(local_max, columns + others);
     const long update = pad(others) * others;
     if (piece[f] == f) {
-      update_begin.push_back(kept);
-      kept += update;
+      update_begin.push_back(update_floats);
+      update_floats += update;
     } else {
       update_begin.push_back(shelf.put(f, update));
     }
@@ -148,16 +149,16 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
       work[f] += static_cast<double>(columns - c + others) * (columns - c + others);
   }
   run_begin.push_back(0);
-  for (const std::vector<FrontRun>& some : runs_of) {
-    runs.insert(runs.end(), some.begin(), some.end());
+  for (const std::vector<FrontRun>& front_runs : runs_of) {
+    runs.insert(runs.end(), front_runs.begin(), front_runs.end());
     run_begin.push_back(static_cast<int>(runs.size()));
   }
   for (std::size_t f = 0; f < piece.size(); ++f) {
-    if (piece[f] != static_cast<int>(f)) update_begin[f] += kept;
+    if (piece[f] != static_cast<int>(f)) update_begin[f] += update_floats;
   }
   tiles.assign(tile_begin.back() + 64, 0.0f);
   panel.assign(panel_max + 64, 0.0f);
-  updates.assign(kept + shelf.length + 64, 0.0f);
+  updates.assign(update_floats + shelf.length + 64, 0.0f);
   local.assign(local_max + 64, 0.0f);
 }
 
@@ -170,13 +171,13 @@ double FactorStorage::mark(const std::vector<char>& touched) {
     for (int i = pivot_begin[f]; i < pivot_begin[f + 1]; ++i) due[piece[f]] |= touched[i];
     for (int c = child_begin[f]; c < child_begin[f + 1]; ++c) due[piece[f]] |= due[children[c]];
   }
-  double all = 0.0, some = 0.0;
+  double all = 0.0, due_work = 0.0;
   for (int f = 0; f < fronts; ++f) {
     due[f] = due[piece[f]];
     all += work[f];
-    if (due[f]) some += work[f];
+    if (due[f]) due_work += work[f];
   }
-  return some / all;
+  return due_work / all;
 }
 
 Factor FactorStorage::view(bool half) {
@@ -229,7 +230,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
   storage_.mark_all();
   matrix_ = assembly.neighbour(x, numbers_);
   refresh(assembly, contact);
-  age.made(dt);
+  age.restart(dt);
 }
 
 void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {

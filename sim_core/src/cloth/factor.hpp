@@ -49,7 +49,7 @@ struct FactorStorage {
 // since.
 class FactorAge {
  public:
-  void made(double dt) { dt_ = dt, fresh_ = -1, last_ = excess_ = 0; }
+  void restart(double dt) { dt_ = dt, fresh_ = -1, last_ = excess_ = 0; }
   void forget() { dt_ = 0.0; }
   bool exists() const { return dt_ > 0.0; }
   // Whether it is for steps of this length.

@@ -131,12 +131,8 @@ int Pattern::slot(int i, int j) const {
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
                      const std::vector<Stencil>& compact,
-                     const std::vector<std::int32_t>& held_vertices, int others_in,
-                     int capsule_points_in)
-    : vertices(static_cast<int>(mesh.rest.rows())),
-      others(others_in),
-      capsule_points(capsule_points_in),
-      nodes(vertices + others + capsule_points) {
+                     const std::vector<std::int32_t>& held_vertices, int others_in)
+    : vertices(static_cast<int>(mesh.rest.rows())), others(others_in), nodes(vertices + others) {
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);

@@ -33,19 +33,18 @@ struct Pattern {
 // The pattern of a graph in the order of elimination; `place`: of each node in it.
 Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::vector<int>& place);
 
-// Free vertices in the order of elimination, then held vertices, then the vertices of surfaces and
-// the points of medial axes, which are no cloth and move as prescribed.
+// Free vertices in the order of elimination, then held vertices, then the vertices of surfaces,
+// which are no cloth and move as prescribed.
 struct Numbering {
-  int vertices, others, capsule_points, nodes, free_nodes;
-  std::vector<int> node, vertex;  // of a vertex, another or a point of a medial axis, and back
+  int vertices, others, nodes, free_nodes;
+  std::vector<int> node, vertex;  // of a vertex or another, and back
   std::vector<int> held;          // nodes of the held vertices, in the caller's order
   Dissection dissection;
   Pattern bending, compact_bending, membrane;  // of the free nodes
 
   // Throws std::invalid_argument, naming `held`.
   Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
-            const std::vector<Stencil>& compact, const std::vector<std::int32_t>& held, int others,
-            int capsules);
+            const std::vector<Stencil>& compact, const std::vector<std::int32_t>& held, int others);
 };
 
 }  // namespace sim_core

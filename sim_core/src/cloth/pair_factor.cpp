@@ -28,7 +28,7 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
   if (whole) {
     read_matrix(assembly, x);
     storage_->mark_all();
-    age.made(dt);
+    age.restart(dt);
   } else {
     for (std::size_t i = 0; i < touched_.size(); ++i) due_[place_[i]] = touched_[i];
     share = storage_->mark(due_);

@@ -102,7 +102,7 @@ struct SteppingSettings {
   // % more in a crumple.
   int smooth_iterations = 100;
 
-  // Way of a vertex relative to a body without a medial axis, over half the body's least extent,
+  // Way of a vertex relative to a body, over half the body's least extent,
   // from which a step is halved: what begins a step before a body must not be predicted behind its
   // middle.
   double sweep = 0.5;
@@ -179,13 +179,12 @@ struct Constants {
   ContactSettings contact;
   PathSettings path;
   SmoothSettings smooth;
-  CapsuleSettings medial_axis;
   NewtonSettings newton;
   SteppingSettings stepping;
   ControlSettings control;
   FactorSettings factor;
 
-  SIM_CORE_NAMED(contact, path, smooth, medial_axis, newton, stepping, control, factor)
+  SIM_CORE_NAMED(contact, path, smooth, newton, stepping, control, factor)
 
   Constants() = default;
   // Replaces those named "group.name". Throws std::invalid_argument if there is none of that name,

@@ -20,14 +20,12 @@ struct ClothSolver::Impl {
   Newton& newton;
   const Numbering& numbering;
 
-  explicit Impl(const ClothSetup& setup, const std::vector<Body>& bodies = {},
-                const std::vector<MedialAxis>& medial_axes = {})
+  explicit Impl(const ClothSetup& setup)
       : mesh(setup.rest, setup.triangles),
         surfaces(setup.surfaces),
-        materials(with_capsules(setup.touch, medial_axes, bodies, cell_of(mesh))),
+        materials(setup.touch),
         assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), points_of(medial_axes),
-                 setup.constants.factor),
+                 static_cast<int>(surfaces.surface_of_vertex.size()), setup.constants.factor),
         stepper(mesh, assembly, setup.settings, setup.constants),
         controller(stepper, setup.control, setup.constants.control),
         newton(stepper.newton),
@@ -39,23 +37,12 @@ struct ClothSolver::Impl {
       newton.contact.cell[i] = cells[numbering.vertex[i]];
     }
     if ((materials.mu.array() >= 0.0).any()) {
-      newton.pairs =
-          contact_set_of(mesh, numbering, materials, surfaces, medial_axes, setup.constants);
+      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, setup.constants);
     }
     if (numbering.others > 0) {
       newton.contact.surfaces =
           smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
     }
-    stepper.medial_axes = medial_axes;
-    newton.contact.replaced_bodies.assign(bodies.size(), 0);
-    for (const MedialAxis& one : medial_axes)
-      newton.contact.replaced_bodies[one.body] = one.replaces_nodes;
-  }
-
-  static int points_of(const std::vector<MedialAxis>& medial_axes) {
-    std::size_t count = 0;
-    for (const MedialAxis& one : medial_axes) count += one.points.size();
-    return static_cast<int>(count);
   }
 
   void load(const Points3& positions, Buffer<double>& into) const {
@@ -106,24 +93,6 @@ ClothSolver::ClothSolver(const ClothSetup& setup)
     : setup_(setup), impl_(std::make_unique<Impl>(setup_)) {}
 ClothSolver::~ClothSolver() = default;
 
-// Before a first step: takes medial axes of these bodies in place of those of others.
-void ClothSolver::meet(const std::vector<Body>& bodies) {
-  if (impl_->stepper.started()) return;
-  const Points3 at = positions();
-  const double across =
-      (setup_.rest.colwise().maxCoeff() - setup_.rest.colwise().minCoeff()).norm();
-  const std::vector<MedialAxis> medial_axes =
-      medial_axes_of(bodies, impl_->materials.cell, at.colwise().minCoeff().transpose(),
-                     at.colwise().maxCoeff().transpose(),
-                     setup_.constants.medial_axis.beyond * across, setup_.constants.medial_axis);
-  if (medial_axes.empty() && impl_->stepper.medial_axes.empty()) return;
-  std::unique_ptr<Impl> next = std::make_unique<Impl>(setup_, bodies, medial_axes);
-  const long kept = 4L * (next->numbering.nodes - next->numbering.capsule_points);
-  std::copy(impl_->stepper.x.begin(), impl_->stepper.x.begin() + kept, next->stepper.x.begin());
-  std::copy(impl_->stepper.v.begin(), impl_->stepper.v.begin() + kept, next->stepper.v.begin());
-  impl_ = std::move(next);
-}
-
 void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
                             const Points3& surfaces, const std::vector<Body>& bodies, bool begins) {
   impl_->load(positions, impl_->stepper.x);
@@ -138,10 +107,10 @@ void ClothSolver::set_state(const Points3& positions, const Points3& velocities,
   impl_->controller.restart();
 }
 
-// Places the bodies before a first step, and refuses free vertices inside one where the scene
-// `begins`.
+// Before a first step: refuses bodies that are sharp against a cell, and free vertices inside one
+// where the scene `begins`.
 void ClothSolver::begin(const std::vector<Body>& bodies, bool begins) {
-  meet(bodies);
+  refuse_sharp(bodies, cell_of(impl_->mesh));
   if (begins) impl_->stepper.refuse_inside(bodies);
   impl_->stepper.restart(bodies);
 }
@@ -149,7 +118,7 @@ void ClothSolver::begin(const std::vector<Body>& bodies, bool begins) {
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held,
                              const Points3& surfaces, const std::vector<Body>& bodies,
                              double damping) {
-  meet(bodies);
+  if (!impl_->stepper.started()) refuse_sharp(bodies, cell_of(impl_->mesh));
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
@@ -165,26 +134,11 @@ Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x);
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.v); }
 Points3 ClothSolver::reactions() const { return impl_->unload(impl_->newton.residual); }
 
-template <class Call>
-void ClothSolver::each_capsule_contact(const Call& call) const {
-  if (!impl_->newton.pairs) return;
-  for (const Pair& pair : impl_->newton.pairs->list()) {
-    const Capsule* capsule = impl_->newton.pairs->capsule_of(pair.stencil);
-    if (!capsule || !pair.active()) continue;
-    for (int c = 0; c < 4; ++c) {
-      const int vertex = impl_->numbering.vertex[pair.stencil.node[c]];
-      if (vertex < impl_->numbering.vertices && pair.weights[c] != 0.0)
-        call(vertex, pair, capsule->body);
-    }
-  }
-}
-
 std::vector<std::int32_t> ClothSolver::contacts() const {
   const Numbering& numbering = impl_->numbering;
   std::vector<std::int32_t> out(numbering.vertices, -1);
   for (int i = 0; i < numbering.free_nodes; ++i)
     out[numbering.vertex[i]] = impl_->newton.contact.touched[i];
-  each_capsule_contact([&](int vertex, const Pair&, int body) { out[vertex] = body; });
   return out;
 }
 
@@ -194,8 +148,6 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
   }
-  each_capsule_contact(
-      [&](int vertex, const Pair& pair, int) { out[vertex] |= pair.row.mode == contact_slip; });
   return out;
 }
 
@@ -227,17 +179,13 @@ ClothSolver::PairForces ClothSolver::pair_forces() const {
     }
   }
   const auto count = static_cast<Eigen::Index>(some.size());
-  PairForces out{{count, 4},        {count, 4},
-                 Points3(count, 3), Eigen::VectorXd(count),
-                 Truths(count),     Eigen::VectorXi(count)};
+  PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), Truths(count)};
   for (Eigen::Index p = 0; p < count; ++p) {
     for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->stencil.node[c]];
     out.weights.row(p) = some[p]->weights.transpose();
     out.forces.row(p) = some[p]->contact.force.transpose();
     out.distance[p] = some[p]->contact.gap + some[p]->thickness;
     out.sliding[p] = some[p]->row.mode == contact_slip;
-    const Capsule* capsule = impl_->newton.pairs->capsule_of(some[p]->stencil);
-    out.body[p] = capsule ? capsule->body : -1;
   }
   return out;
 }

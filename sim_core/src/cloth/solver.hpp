@@ -35,16 +35,11 @@ struct SurfaceMeshes {
 double cell_of(const ClothMesh& mesh);
 // Side of a cell around each vertex, m: that of a square of two of its triangles.
 std::vector<double> cells_of_vertices(const ClothMesh& mesh);
-// The materials with medial axes of these bodies.
-ContactMaterials with_capsules(ContactMaterials materials,
-                               const std::vector<MedialAxis>& medial_axes,
-                               const std::vector<Body>& bodies, double cell);
 
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
                                            const SurfaceMeshes& surfaces,
-                                           const std::vector<MedialAxis>& medial_axes,
                                            const Constants& constants);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials,
@@ -100,7 +95,7 @@ class ClothSolver {
   Points3 surface_forces() const;
 
   // Pairs of cloth with cloth and surfaces that bear a force at the end of the last step. Vertices
-  // of surfaces and points of medial axes come after those of the cloth.
+  // of surfaces come after those of the cloth.
   using Truths = Eigen::Matrix<bool, Eigen::Dynamic, 1>;
   struct PairForces {
     Eigen::Matrix<std::int32_t, Eigen::Dynamic, 4, Eigen::RowMajor> vertices;
@@ -108,7 +103,6 @@ class ClothSolver {
     Points3 forces;            // N: on sum w_i x_i
     Eigen::VectorXd distance;  // m
     Truths sliding;
-    Eigen::VectorXi body;  // -1: of no body
   };
   PairForces pair_forces() const;
 
@@ -126,11 +120,6 @@ class ClothSolver {
   const ClothSetup setup_;
   std::unique_ptr<Impl> impl_;
 
-  // Calls with each vertex of a pair with a medial axis that bears, the pair, and the body.
-  template <class Call>
-  void each_capsule_contact(const Call& call) const;
-
-  void meet(const std::vector<Body>& bodies);
   void begin(const std::vector<Body>& bodies, bool begins = true);
 };
 

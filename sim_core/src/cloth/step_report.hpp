@@ -51,8 +51,6 @@ struct StepReport {
   int newton = 0, krylov = 0;
   double least_distance =
       std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
-  double sharpest =
-      std::numeric_limits<double>::infinity();  // cells: least radius of a medial axis that bears
   double uneven =
       0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
   double factorizations = 0.0;                       // whole ones, and shares of those in part
@@ -81,7 +79,6 @@ struct StepReport {
     converged = converged && other.converged;
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
     least_distance = std::min(least_distance, other.least_distance);
-    sharpest = std::min(sharpest, other.sharpest);
     uneven = std::max(uneven, other.uneven);
     extremes.add(other.extremes);
   }

@@ -5,6 +5,8 @@
 #include <cmath>
 #include <limits>
 
+#include "math/refusal.hpp"
+
 namespace sim_core {
 namespace {
 
@@ -82,46 +84,6 @@ bool passes_inside(const Core& core, const Corners& start, const Corners& end) {
   return false;
 }
 
-// Where the box from `low` to `high` lies along an axis.
-std::array<double, 2> range_along(const Vector3d& axis, const Vector3d& origin, const Vector3d& low,
-                                  const Vector3d& high) {
-  const double middle = axis.dot(0.5 * (low + high) - origin),
-               half = axis.cwiseAbs().dot(0.5 * (high - low));
-  return {middle - half, middle + half};
-}
-
-// Corners of the core: bit `a` of a corner's number says on which side of axis `a` it lies, where
-// the core has one.
-MedialAxis medial_axis_of(const std::array<std::array<double, 2>, 3>& core, bool whole) {
-  MedialAxis out{};
-  std::vector<int> axes;
-  for (int a = 0; a < 3; ++a) {
-    if (core[a][0] < core[a][1]) axes.push_back(a);
-  }
-  const int count = 1 << axes.size();
-  for (int corner = 0; corner < count; ++corner) {
-    Vector3d p(core[0][0], core[1][0], core[2][0]);
-    for (std::size_t k = 0; k < axes.size(); ++k) p[axes[k]] = core[axes[k]][corner >> k & 1];
-    out.points.push_back(p);
-  }
-  const int all = static_cast<int>(axes.size());
-  for (int corner = 0; corner < count; ++corner) {
-    for (int k = 0; k < all; ++k) {
-      if (corner >> k & 1) continue;
-      const int next = corner | 1 << k;
-      out.segments.push_back({corner, next});
-      if (whole && all == 1) out.triangles.push_back({corner, next, next});
-      for (int l = k + 1; whole && l < all; ++l) {
-        if (corner >> l & 1) continue;
-        const int other = corner | 1 << l, opposite = next | other;
-        out.triangles.push_back({corner, next, opposite});
-        out.triangles.push_back({corner, opposite, other});
-      }
-    }
-  }
-  return out;
-}
-
 }  // namespace
 
 double Body::half_thickness() const {
@@ -143,25 +105,6 @@ Gap gap_of(const Body& body, const Vector3d& x) {
   beyond.maxCoeff(&axis);
   normal[axis] = std::copysign(1.0, local[axis]);
   return {beyond[axis] - body.radius, body.rotation * normal};
-}
-
-// A body is convex, so its distance grows by at least the normal's share of the path from
-// the triangle's middle. Where that leaves it open, its quarters are looked at.
-double depth_beyond(const Body& body, const std::array<Vector3d, 3>& triangle, double allowed) {
-  const auto& [a, b, c] = triangle;
-  const Vector3d middle = (a + b + c) / 3.0;
-  const Gap gap = gap_of(body, middle);
-  if (gap.distance < -allowed) return -gap.distance;
-  const double lowest = std::min(
-      {gap.normal.dot(a - middle), gap.normal.dot(b - middle), gap.normal.dot(c - middle)});
-  constexpr double error = 1e-6;  // m
-  if (!(gap.distance + lowest < -allowed - error)) return 0.0;
-  const Vector3d ab = 0.5 * (a + b), bc = 0.5 * (b + c), ca = 0.5 * (c + a);
-  for (const auto& quarter : {std::array{ab, bc, ca}, {a, ab, ca}, {ab, b, bc}, {ca, bc, c}}) {
-    const double depth = depth_beyond(body, quarter, allowed);
-    if (depth > 0.0) return depth;
-  }
-  return 0.0;
 }
 
 Vector3d carried(const Body& begin, const Body& end, const Vector3d& x) {
@@ -217,29 +160,16 @@ bool passes(const Core& core, const Corners& start, const Corners& end) {
   return corners() || (wide && passes_inside(core, start, end));
 }
 
-std::vector<MedialAxis> medial_axes_of(const std::vector<Body>& bodies, double cell,
-                                       const Vector3d& low, const Vector3d& high, double beyond,
-                                       const CapsuleSettings& settings) {
-  std::vector<MedialAxis> out;
+void refuse_sharp(const std::vector<Body>& bodies, double cell) {
+  // A radius may be computed from the same cell by other roundings.
+  constexpr double slack = 1e-9;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     const Body& body = bodies[b];
-    if (body.shape == Body::plane || body.radius >= settings.radius_max * cell) continue;
-    std::array<std::array<double, 2>, 3> core;
-    for (int a = 0; a < 3; ++a) {
-      core[a] = {-body.core[a], body.core[a]};
-      if (std::isfinite(body.core[a])) continue;
-      core[a] = range_along(body.rotation.col(a), body.origin, low, high);
-      core[a][0] -= beyond;
-      core[a][1] += beyond;
-    }
-    const bool whole = body.core.minCoeff() + body.radius < settings.thickness_max * cell;
-    MedialAxis one = medial_axis_of(core, whole);
-    one.body = static_cast<int>(b);
-    one.radius = body.radius;
-    one.replaces_nodes = whole;
-    out.push_back(std::move(one));
+    if (body.shape == Body::plane || body.radius >= (1.0 - slack) * radius_least * cell) continue;
+    refuse(text("bodies: must have a radius of ", radius_least, " cells of the cloth or more, ",
+                1e3 * radius_least * cell, " mm, and body ", b, " has ", 1e3 * body.radius,
+                " mm: give a finer cloth"));
   }
-  return out;
 }
 
 }  // namespace sim_core

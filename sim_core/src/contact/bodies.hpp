@@ -1,11 +1,9 @@
-// Bodies that cloth touches: their gaps, normals and motion, their cores and medial axes.
+// Bodies that cloth touches: their gaps, normals and motion, and their cores.
 #pragma once
 
 #include <Eigen/Core>
 #include <array>
 #include <vector>
-
-#include "contact/settings.hpp"
 
 namespace sim_core {
 
@@ -35,11 +33,6 @@ struct Gap {
 };
 Gap gap_of(const Body& body, const Eigen::Vector3d& x);
 
-// Depth in a body of a point of a triangle that is deeper than `allowed`, or 0 where none is, up to
-// 1 um, m.
-double depth_beyond(const Body& body, const std::array<Eigen::Vector3d, 3>& triangle,
-                    double allowed);
-
 // Where the motion from `begin` to `end` carries the material point of the body that is at x.
 Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3d& x);
 
@@ -65,25 +58,13 @@ using Corners = std::array<Eigen::Vector3d, 3>;
 // Whether a triangle whose corners go straight from `start` to `end` passes the core.
 bool passes(const Core& core, const Corners& start, const Corners& end);
 
-// The points, segments and faces of a body's core, which cloth touches by pairs of closest points
-// at the distance of the radius. What is small against a cell slips through between vertices, so
-// vertices do not feel it.
-struct MedialAxis {
-  int body;
-  double radius;        // m
-  bool replaces_nodes;  // no vertex touches the body itself; else vertices do, and pairs hold what
-                        // lies between them
-  std::vector<Eigen::Vector3d> points;  // in the body's axes, m
-  std::vector<std::array<int, 2>> segments;
-  std::vector<std::array<int, 3>> triangles;  // with two corners alike: a segment, for vertices
+// Radius of a ball, a rod or the edges of a box, over the side of a cell, below which friction is
+// not right: a strip over the edge of a box bears its force within 2 % at 0.9 (mu 0.6) and 7 % at
+// 0.75, and below that it catches.
+constexpr double radius_least = 0.9;
 
-  Eigen::Vector3d point(const Body& at, int i) const { return at.origin + at.rotation * points[i]; }
-};
-
-// Of those bodies whose radius is small against a cell [m]. An endless core ends `beyond` [m] from
-// the cloth, which lies between `low` and `high`.
-std::vector<MedialAxis> medial_axes_of(const std::vector<Body>& bodies, double cell,
-                                       const Eigen::Vector3d& low, const Eigen::Vector3d& high,
-                                       double beyond, const CapsuleSettings& settings);
+// Throws std::invalid_argument where a body is sharper than that for cloth whose cells have this
+// side, m.
+void refuse_sharp(const std::vector<Body>& bodies, double cell);
 
 }  // namespace sim_core

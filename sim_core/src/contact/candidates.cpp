@@ -119,69 +119,6 @@ bool in_order(const Candidate& p, const Candidate& q) {
   return p.first != q.first ? p.first < q.first : p.second < q.second;
 }
 
-// Pairs with medial axes, which have few pieces and reach far: each is compared with all of the
-// cloth.
-struct CapsuleSearch {
-  const Surface& surface;
-  const Buffer<double>& x;
-  const double reach;
-  const std::vector<double>& farther;
-
-  double reach_of(int node) const { return reach + farther[surface.sheet_of_node[node]]; }
-
-  // Calls with each piece of the cloth whose box meets that of a piece of a medial axis.
-  template <class Pieces, class Call>
-  void near(const Box& box, int node, const Pieces& pieces, int count, const Call& call) const {
-    for (int i = 0; i < count; ++i) {
-      if (box.intersects(box_of(pieces[i], x, 0.0)) && surface.may_touch(pieces[i][0], node))
-        call(i);
-    }
-  }
-
-  void find_vertices(std::vector<Candidate>& out) const {
-    const std::size_t before = out.size();
-    for (std::size_t t = surface.capsule_triangles; t < surface.triangles.size(); ++t) {
-      const auto& corner = surface.triangles[t];
-      const Box box = box_of(corner, x, reach_of(corner[0]));
-      for (int v = 0; v < surface.capsule_vertices; ++v) {
-        const int vertex = surface.vertices[v];
-        if (!box.contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0])) continue;
-        add_if_near(out,
-                    {PairKind::vertex_triangle,
-                     vertex,
-                     static_cast<int>(t),
-                     {vertex, corner[0], corner[1], corner[2]},
-                     0.0},
-                    x, reach_of(corner[0]));
-      }
-    }
-    for (std::size_t v = surface.capsule_vertices; v < surface.vertices.size(); ++v) {
-      const int vertex = surface.vertices[v];
-      const Box box = box_of(std::array<int, 1>{vertex}, x, reach_of(vertex));
-      near(box, vertex, surface.triangles, surface.capsule_triangles, [&](int t) {
-        const auto& corner = surface.triangles[t];
-        add_if_near(
-            out,
-            {PairKind::vertex_triangle, vertex, t, {vertex, corner[0], corner[1], corner[2]}, 0.0},
-            x, reach_of(vertex));
-      });
-    }
-    if (out.size() > before) std::sort(out.begin(), out.end(), in_order);
-  }
-
-  void find_edges(std::vector<Candidate>& out) const {
-    for (std::size_t e = surface.capsule_edges; e < surface.edges.size(); ++e) {
-      const auto& b = surface.edges[e];
-      near(box_of(b, x, reach_of(b[0])), b[0], surface.edges, surface.capsule_edges, [&](int i) {
-        const auto& a = surface.edges[i];
-        add_if_near(out,
-                    {PairKind::edge_edge, i, static_cast<int>(e), {a[0], a[1], b[0], b[1]}, 0.0}, x,
-                    reach_of(b[0]));
-      });
-    }
-  }
-};
-
 }  // namespace
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
@@ -189,20 +126,17 @@ FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
           at_node(x, pair.node[3])};
 }
 
-std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
-                                  const std::vector<double>& farther) {
+std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach) {
   std::vector<Candidate> out;
   std::vector<Box> boxes;
-  for (int t = 0; t < surface.capsule_triangles; ++t)
-    boxes.push_back(box_of(surface.triangles[t], x, reach));
+  for (const auto& corners : surface.triangles) boxes.push_back(box_of(corners, x, reach));
   if (boxes.empty() || !std::all_of(boxes.begin(), boxes.end(), [](const Box& box) {
         return box.min().allFinite() && box.max().allFinite();
       })) {
     return out;
   }
   const Grid around_triangles(boxes);
-  for (int v = 0; v < surface.capsule_vertices; ++v) {
-    const int vertex = surface.vertices[v];
+  for (const int vertex : surface.vertices) {
     const int cell = around_triangles.cell_at(at_node(x, vertex).array());
     if (cell < 0) continue;
     for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
@@ -216,12 +150,9 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
           x, reach);
     }
   }
-  const CapsuleSearch medial_axes{surface, x, reach, farther};
-  medial_axes.find_vertices(out);
   const std::size_t vertex_pairs = out.size();
   boxes.clear();
-  for (int e = 0; e < surface.capsule_edges; ++e)
-    boxes.push_back(box_of(surface.edges[e], x, 0.5 * reach));
+  for (const auto& ends : surface.edges) boxes.push_back(box_of(ends, x, 0.5 * reach));
   const Grid edges(boxes);
   Around around;
   for (int cell = 0; cell < edges.cells(); ++cell) {
@@ -243,7 +174,6 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       }
     }
   }
-  medial_axes.find_edges(out);
   std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(), in_order);
   return out;
 }

@@ -55,7 +55,7 @@ PairPast::PairPast(const Pair& pair)
       change(pair.change),
       normal(pair.contact.normal),
       middle(pair.middle),
-      scale(pair.scale),
+      thickness(pair.thickness),
       penalty_scale(pair.penalty_scale),
       missed(violation(pair.contact, pair.row.mode)) {}
 
@@ -158,15 +158,6 @@ bool ContactSet::relevant() const {
   });
 }
 
-double ContactSet::sharpest() const {
-  double out = std::numeric_limits<double>::infinity();
-  for (const Pair& pair : pairs_) {
-    const Capsule* capsule = capsule_of(pair.stencil);
-    if (capsule && pair.active()) out = std::min(out, capsule->radius / materials.cell);
-  }
-  return out;
-}
-
 bool ContactSet::active() const {
   return std::any_of(pairs_.begin(), pairs_.end(), [](const Pair& pair) {
     return pair.active() || !pair.contact.force.isZero(0.0);
@@ -196,7 +187,7 @@ bool ContactSet::warm_start() {
   bool any = false;
   for (Pair& pair : pairs_) {
     if (pair.active() || pair.contact.force.isZero(0.0) ||
-        pair.contact.gap > settings_.closing_gap * pair.scale)
+        pair.contact.gap > settings_.closing_gap * pair.thickness)
       continue;
     Contact touching = pair.contact;
     touching.gap = 0.0;
@@ -227,7 +218,7 @@ bool ContactSet::activate(const Buffer<float>& change) {
       if (pair.stencil.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
       if (!(pair.contact.gap + pair.contact.normal.dot(motion) <
-            -settings_.closing_gap * pair.scale))
+            -settings_.closing_gap * pair.thickness))
         continue;
       pair.row = pair_row(pair.contact, closing(pair.contact, motion), pair.proximal);
       pair.added = any = true;

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <span>
 #include <vector>
 
 #include "contact/linearized_contact.hpp"
@@ -28,9 +29,8 @@ struct Pair {
   Contact contact;
   ProximalStiffness proximal;
   double smoothing_energy;  // epsilon, J: 0 under the exact law
-  Eigen::Vector3d middle;   // of the two points, or with a medial axis that of the cloth, m
+  Eigen::Vector3d middle;   // of the two points, m
   double thickness;         // m: that it keeps apart
-  double scale;             // m: that of the cloth, which is less with a medial axis
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
@@ -61,7 +61,7 @@ struct PairPast {
   Candidate stencil;
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
-  double scale, penalty_scale;
+  double thickness, penalty_scale;
   double missed;  // violation of its row, m; see `violation`
 
   PairPast(const Pair& pair);
@@ -86,11 +86,9 @@ class ContactSet {
   // Forgets all forces.
   void restart();
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
-  // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m;
-  // `capsule_turns`: of the medial axes in the step.
+  // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m.
   void begin(const Buffer<double>& start, const Buffer<double>& ends,
-             const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own,
-             std::vector<Eigen::Matrix3d> capsule_turns);
+             const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own);
   // Keeps the forces at the end of a step for the next one.
   void store_history();
 
@@ -122,10 +120,6 @@ class ContactSet {
 
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
-  // The medial axis of a pair, or null.
-  const Capsule* capsule_of(const Candidate& pair) const;
-  // Least radius over the side of a cell of a medial axis that bears; infinite where none does.
-  double sharpest() const;
   // Whether there is a force or an active pair.
   bool active() const;
   // Mean error of the forces by smoothing, N.
@@ -138,7 +132,12 @@ class ContactSet {
   // Replaces the pairs by those at x, without forces.
   void find(const Buffer<double>& x);
   void find_vertices(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
+  // The pairs of one vertex, from all of its candidates, up to a distance, m.
+  void find_vertex(std::span<Candidate> candidates, double reach, const Buffer<double>& x);
   void find_edges(std::vector<Candidate>& candidates, double range, const Buffer<double>& x);
+  int feature_of(const Candidate& stencil, const Eigen::Vector4d& weights) const;
+  int triangles_around(int feature) const;
+  bool has_reverse(int vertex, int feature) const;
   void add(const Candidate& stencil, int feature, const Eigen::Vector4d& weights,
            const Buffer<double>& x);
   Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,
@@ -147,13 +146,21 @@ class ContactSet {
   void merge();
   void linearize_at(const Buffer<double>& x);
 
+  // A triangle whose closest point to a vertex lies on this feature.
+  struct Found {
+    int feature;
+    const Candidate* candidate;
+    Eigen::Vector4d weights;
+  };
+
   ContactSettings settings_;
   int free_nodes_;
   double least_distance_;
   std::vector<double> displacements_;  // of each node in the step but for a common one, m
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
-  std::vector<Eigen::Matrix3d> own_, capsule_turns_;
+  std::vector<Eigen::Matrix3d> own_;
+  std::vector<Found> found_;                     // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
   std::vector<int> nodes_;                       // of `rows`

@@ -1,6 +1,6 @@
 // Coulomb's law with unilateral contact, exactly: no force at a distance, no sinking in, friction
-// on its cone against the slip. It is the same for a node on a body or on a smooth surface, for two
-// pieces of cloth, and for a piece of cloth and a capsule.
+// on its cone against the slip. It is the same for a node on a body or on a smooth surface, and for
+// two pieces of cloth.
 //
 // Let r be the force that a contact bears [N], r_N its part along the normal n and r_T the rest, g
 // the gap [m], u the slip in this step [m], and k > 0 a stiffness [N/m] that decides how fast the

@@ -13,12 +13,6 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector4d;
 
-// A triangle whose closest point to a vertex lies on this feature.
-struct Found {
-  int feature, candidate;
-  Vector4d weights;
-};
-
 // Derivatives of the weights by the places of the closest points: along both edges, or along the
 // sides of the feature of a triangle.
 std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights) {
@@ -42,20 +36,12 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
   return {first, second};
 }
 
-// How much farther than other pairs those with each sheet, surface and medial axis reach, m.
-std::vector<double> farther_of(const ContactMaterials& materials) {
-  std::vector<double> out(materials.thickness.size(), 0.0);
-  for (const Capsule& capsule : materials.capsules)
-    out.push_back(capsule.radius - materials.farthest());
-  return out;
-}
-
 }  // namespace
 
 ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
                        const ContactSettings& settings, const PathSettings& path, double margin,
                        int free_nodes)
-    : near(std::move(surface), materials_in.farthest(), margin, path, farther_of(materials_in)),
+    : near(std::move(surface), materials_in.farthest(), margin, path),
       materials(materials_in),
       settings_(settings),
       free_nodes_(free_nodes),
@@ -64,13 +50,11 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
       turns_(settings.turn_max) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
-                       const Buffer<double>& expected, std::vector<Matrix3d> own,
-                       std::vector<Matrix3d> capsule_turns) {
+                       const Buffer<double>& expected, std::vector<Matrix3d> own) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
-  capsule_turns_ = std::move(capsule_turns);
   base_ = history_;
 }
 
@@ -84,87 +68,90 @@ void ContactSet::find(const Buffer<double>& x) {
   find_edges(candidates, range, x);
 }
 
-const Capsule* ContactSet::capsule_of(const Candidate& pair) const {
-  const std::vector<int>& sheet = near.surface.sheet_of_node;
-  return materials.capsule_of(sheet[pair.node[0]], sheet[pair.node[3]]);
+// Which feature of a triangle is the closest to a vertex: see Pair.
+int ContactSet::feature_of(const Candidate& stencil, const Vector4d& weights) const {
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size());
+  int corner = 0, opposite = 0;
+  for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
+  const auto corners = (weights.tail<3>().array() != 0.0).count();
+  if (corners == 3) return stencil.second;
+  if (corners == 2) return triangles + surface.triangle_edges[stencil.second][opposite];
+  return triangles + static_cast<int>(surface.edges.size()) + stencil.node[1 + corner];
 }
 
-// `range`: beyond what approached in the step, m. A vertex may be closest to an edge or corner of a
-// triangle. Such a pair counts once, and only where all triangles around the feature agree: else a
-// point inside one of them is closer.
+int ContactSet::triangles_around(int feature) const {
+  const Surface& surface = near.surface;
+  const int triangles = static_cast<int>(surface.triangles.size());
+  const int edges = static_cast<int>(surface.edges.size());
+  if (feature < triangles) return 1;
+  if (feature < triangles + edges) return surface.triangles_of_edge[feature - triangles];
+  const int node = feature - triangles - edges;
+  return surface.around_begin[node + 1] - surface.around_begin[node];
+}
+
+// Two corners that are each other's closest are one pair.
+bool ContactSet::has_reverse(int vertex, int feature) const {
+  const int nodes_from =
+      static_cast<int>(near.surface.triangles.size() + near.surface.edges.size());
+  if (feature < nodes_from) return false;
+  const int other = feature - nodes_from;
+  const auto first =
+      std::lower_bound(pairs_.begin(), pairs_.end(), other,
+                       [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
+  return std::any_of(first, pairs_.end(), [&](const Pair& pair) {
+    return pair.stencil.first == other && pair.feature == nodes_from + vertex;
+  });
+}
+
+// `range`: beyond what approached in the step, m. The candidates of a vertex follow each other.
 void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
                                const Buffer<double>& x) {
-  const Surface& surface = near.surface;
-  const int triangles = static_cast<int>(surface.triangles.size()),
-            edges = static_cast<int>(surface.edges.size());
-  const auto around_node = [&](int node) {
-    return surface.around_begin[node + 1] - surface.around_begin[node];
-  };
-  const auto is_of = [&](std::size_t c, int vertex) {
-    return c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle &&
-           candidates[c].first == vertex;
-  };
-  std::vector<Found> found;
-  std::size_t c = 0, end = 0;
-  while (c < candidates.size() && candidates[c].kind == PairKind::vertex_triangle) {
-    const int vertex = candidates[c].first;
+  std::size_t begin = 0;
+  while (begin < candidates.size() && candidates[begin].kind == PairKind::vertex_triangle) {
+    const int vertex = candidates[begin].first;
+    std::size_t end = begin;
     double reach = range;
-    for (; is_of(end, vertex); ++end)
+    for (; end < candidates.size() && candidates[end].kind == PairKind::vertex_triangle &&
+           candidates[end].first == vertex;
+         ++end) {
       reach = std::max(reach, range + fastest(candidates[end], displacements_));
-    found.clear();
-    for (; c < end; ++c) {
-      Candidate& stencil = candidates[c];
-      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
-      const FourPoints at = points_of(stencil, x);
-      const Vector4d weights = closest_weights(stencil.kind, at);
-      stencil.distance = between_closest(weights, at).norm();
-      int corner = 0, opposite = 0;
-      for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
-      const auto corners = (weights.tail<3>().array() != 0.0).count();
-      const int feature = corners == 3 ? stencil.second
-                          : corners == 2
-                              ? triangles + surface.triangle_edges[stencil.second][opposite]
-                              : triangles + edges + stencil.node[1 + corner];
-      found.push_back({feature, static_cast<int>(c), weights});
     }
-    std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
-      return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
-    });
-    for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
-      const int feature = found[i].feature;
-      while (next < found.size() && found[next].feature == feature) ++next;
-      const int around = feature < triangles ? 1
-                         : feature < triangles + edges
-                             ? surface.triangles_of_edge[feature - triangles]
-                             : around_node(feature - triangles - edges);
-      if (static_cast<int>(next - i) != around) continue;
-      const Candidate& stencil = candidates[found[i].candidate];
-      if (stencil.distance > near.rest_distance(stencil) + reach) continue;
-      // Corners of the cloth touch a body by themselves where pairs only hold what lies between
-      // them.
-      if (const Capsule* capsule = capsule_of(stencil);
-          capsule && !capsule->replaces_nodes && feature >= triangles + edges)
-        continue;
-      if (feature >= triangles + edges) {  // two corners that are each other's closest are one pair
-        const int other = feature - triangles - edges;
-        const auto first = std::lower_bound(
-            pairs_.begin(), pairs_.end(), other,
-            [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
-        if (std::any_of(first, pairs_.end(), [&](const Pair& pair) {
-              return pair.stencil.first == other && pair.feature == triangles + edges + vertex;
-            })) {
-          continue;
-        }
-      }
-      add(candidates[found[i].candidate], feature, found[i].weights, x);
-    }
+    find_vertex({candidates.data() + begin, end - begin}, near.thickness + reach, x);
+    begin = end;
+  }
+}
+
+// A vertex may be closest to an edge or corner of a triangle. Such a pair counts once, and only
+// where all triangles around the feature agree: else a point inside one of them is closer.
+void ContactSet::find_vertex(std::span<Candidate> candidates, double reach,
+                             const Buffer<double>& x) {
+  std::vector<Found>& found = found_;
+  found.clear();
+  for (Candidate& stencil : candidates) {
+    if (stencil.distance > reach) continue;
+    const FourPoints at = points_of(stencil, x);
+    const Vector4d weights = closest_weights(stencil.kind, at);
+    stencil.distance = between_closest(weights, at).norm();
+    found.push_back({feature_of(stencil, weights), &stencil, weights});
+  }
+  std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
+    return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+  });
+  for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
+    const int feature = found[i].feature;
+    while (next < found.size() && found[next].feature == feature) ++next;
+    const Candidate& stencil = *found[i].candidate;
+    const bool agree = static_cast<int>(next - i) == triangles_around(feature);
+    if (!agree || stencil.distance > reach || has_reverse(stencil.first, feature)) continue;
+    add(stencil, feature, found[i].weights, x);
   }
 }
 
 void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
                             const Buffer<double>& x) {
   for (Candidate& stencil : candidates) {
-    const double reach = near.rest_distance(stencil) + range + fastest(stencil, displacements_);
+    const double reach = near.thickness + range + fastest(stencil, displacements_);
     if (stencil.kind != PairKind::edge_edge || stencil.distance > reach) continue;
     const FourPoints at = points_of(stencil, x);
     const Vector4d weights = closest_weights(stencil.kind, at);
@@ -185,8 +172,7 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
   const double distance = rho.norm();
   const int a = near.surface.sheet_of_node[stencil.node[0]],
             b = near.surface.sheet_of_node[stencil.node[3]];
-  const Capsule* capsule = materials.capsule_of(a, b);
-  if (!capsule) least_distance_ = std::min(least_distance_, distance);
+  least_distance_ = std::min(least_distance_, distance);
   if (!(distance > 0.0)) return;
   const auto [along_first, along_second] = directions(stencil.kind, weights);
   PairMotions given = PairMotions::Zero();
@@ -220,36 +206,30 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
   const Vector3d first = stencil.kind == PairKind::vertex_triangle
                              ? at[0]
                              : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  const double back = !capsule ? 0.5 : a > b ? 1.0 : 0.0;
   pairs_.push_back({stencil,
                     feature,
                     weights,
                     {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k},
                     {along, across},
                     k * smoothing * smoothing,
-                    first - back * rho,
+                    first - 0.5 * rho,
                     thickness,
-                    capsule ? materials.thickness[std::min(a, b)] : thickness,
                     along_first,
                     along_second,
                     given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a body or surface,
+// Motion of the first point over the second, less that by which rho turns: with a surface,
 // or half with each sheet.
 Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, const Vector3d& rho) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
   Matrix3d turn = Matrix3d::Zero();
-  if (capsule_of(stencil)) {
-    turn = capsule_turns_[std::max(a, b) - materials.first_capsule()];
-  } else {
-    for (int c = 0; c < 4; ++c) {
-      const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
-      const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
-      if (share * weights[c] != 0.0)
-        turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
-    }
+  for (int c = 0; c < 4; ++c) {
+    const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
+    const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+    if (share * weights[c] != 0.0)
+      turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
   }
   return rho - turn * between_closest(weights, points_of(stencil, *start_));
 }

@@ -35,7 +35,7 @@ void ContactSet::transfer(double share) {
       const int mode = base_[o].mode;
       const double last = base_[o].missed, now = violation(pairs_[i].contact, mode);
       if (smoothing == 0.0 && share == 1.0 && mode != contact_open &&
-          last > settings_.length_tolerance && last < settings_.stall_up_to * pairs_[i].scale &&
+          last > settings_.length_tolerance && last < settings_.stall_up_to * pairs_[i].thickness &&
           now > settings_.stall_ratio * last) {
         pairs_[i].penalty_scale =
             std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
@@ -68,7 +68,7 @@ void ContactSet::transfer(double share) {
       pairs_[match].contact.force += force;
       continue;
     }
-    best = settings_.transfer_radius * orphan->scale;
+    best = settings_.transfer_radius * orphan->thickness;
     for (std::size_t i = 0; i < pairs_.size(); ++i) {
       const double far = (pairs_[i].middle - orphan->middle).norm();
       const double alike = pairs_[i].contact.normal.dot(orphan->normal);
@@ -105,11 +105,9 @@ void ContactSet::merge() {
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
-    const double radius = settings_.merge_radius * pairs_[i].scale;
+    const double radius = settings_.merge_radius * pairs_[i].thickness;
     const auto take = [&](std::size_t j) {
-      if (gone[j] || capsule_of(pairs_[j].stencil) != capsule_of(pairs_[i].stencil) ||
-          (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius)
-        return;
+      if (gone[j] || (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius) return;
       const Vector3d& force = pairs_[j].contact.force;
       pairs_[i].contact.force +=
           pairs_[i].contact.normal.dot(pairs_[j].contact.normal) > 0.0 ? force : Vector3d(-force);

@@ -29,26 +29,17 @@ double fastest(const Candidate& pair, const std::vector<double>& displacements) 
 }
 
 CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double margin,
-                           const PathSettings& settings, std::vector<double> farther)
+                           const PathSettings& settings)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       margin_(margin),
       settings_(settings),
-      farther_(std::move(farther)),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
-      displacement_(share_) {
-  farther_.resize(surface.collides.rows(), 0.0);
-}
+      displacement_(share_) {}
 
-double CandidateSet::rest_distance(const Candidate& pair) const {
-  const std::vector<int>& sheet = surface.sheet_of_node;
-  return thickness + farther_[std::max(sheet[pair.node[0]], sheet[pair.node[3]])];
-}
-
-MinDistanceRule CandidateSet::rule_of(const Candidate& pair) const {
-  const double most = rest_distance(pair);
-  return {settings_.keep, most, settings_.floor * most, settings_.rest};
+MinDistanceRule CandidateSet::rule() const {
+  return {settings_.keep, thickness, settings_.floor * thickness, settings_.rest};
 }
 
 // Half of the diagonal of the box of the motions.
@@ -70,7 +61,7 @@ Eigen::Vector3d CandidateSet::measure(const Buffer<double>& from, const Buffer<d
 
 void CandidateSet::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
-  pairs_ = candidates(surface, x, thickness + 2.0 * margin_, farther_);
+  pairs_ = candidates(surface, x, thickness + 2.0 * margin_);
 }
 
 std::vector<Candidate>& CandidateSet::pairs(const Buffer<double>& x) {
@@ -131,34 +122,42 @@ double CandidateSet::collision_free_fraction(const Buffer<double>& from, const B
   const std::vector<Candidate>& near = pairs(from);
   measure(from, to, displacement_);
   for (const Candidate& pair : near) {
-    if (fastest(pair, displacement_) <= pair.distance - rule_of(pair).of(pair.distance)) continue;
-    least = std::min(
-        least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule_of(pair)));
+    if (fastest(pair, displacement_) <= pair.distance - rule().of(pair.distance)) continue;
+    least =
+        std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule()));
   }
   return least;
+}
+
+Eigen::Vector3d CandidateSet::limited(int node, const Buffer<double>& from,
+                                      const Buffer<double>& to) const {
+  if (share_[node] == 1.0) return at_node(to, node);
+  return at_node(from, node) + share_[node] * (at_node(to, node) - at_node(from, node));
+}
+
+// The share of its way from `from` to where its nodes are let that a pair may go.
+double CandidateSet::safe_share_of(const Candidate& pair, const Buffer<double>& from,
+                                   const Buffer<double>& to) const {
+  const double distance = pair.distance - fastest(pair, drift_);
+  if (fastest(pair, displacement_) <= distance - rule().of(distance)) return 1.0;
+  FourPoints ends;
+  for (int c = 0; c < 4; ++c) ends[c] = limited(pair.node[c], from, to);
+  return safe_share(pair.kind, points_of(pair, from), ends, rule());
 }
 
 bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) {
   measure(at_, from, drift_);
   const Eigen::Vector3d common = measure(from, to, displacement_);
   std::fill(share_.begin(), share_.end(), 1.0);
-  const auto place = [&](int i) -> Eigen::Vector3d {
-    if (share_[i] == 1.0) return at_node(to, i);
-    return at_node(from, i) + share_[i] * (at_node(to, i) - at_node(from, i));
-  };
   const auto shorten = [&](int i, double share) {
     share_[i] *= share;
-    displacement_[i] = (place(i) - at_node(from, i) - common).norm();
+    displacement_[i] = (limited(i, from, to) - at_node(from, i) - common).norm();
   };
   bool whole = true;
   for (int round = 0; round <= settings_.rounds_max; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
-      const double distance = pair.distance - fastest(pair, drift_);
-      if (fastest(pair, displacement_) <= distance - rule_of(pair).of(distance)) continue;
-      const FourPoints ends{place(pair.node[0]), place(pair.node[1]), place(pair.node[2]),
-                            place(pair.node[3])};
-      const double safe = safe_share(pair.kind, points_of(pair, from), ends, rule_of(pair));
+      const double safe = safe_share_of(pair, from, to);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == settings_.rounds_max) continue;
@@ -171,7 +170,7 @@ bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) 
     }
   }
   for (int i : surface.vertices) {
-    if (share_[i] != 1.0) at_node(to, i) = place(i).eval();
+    if (share_[i] != 1.0) at_node(to, i) = limited(i, from, to);
   }
   return whole;
 }

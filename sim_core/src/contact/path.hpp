@@ -29,24 +29,17 @@ double fastest(const Candidate& pair, const std::vector<double>& displacements);
 
 // All pairs of sheets that touch each other, without a common node, that are within `reach` at x:
 // vertices and triangles first, sorted by (first, second). By a grid of cells about as large as a
-// triangle. `farther`: of each sheet, how much larger the reach is of pairs with it, m; other than
-// 0 of medial axes only.
-std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach,
-                                  const std::vector<double>& farther = {});
+// triangle.
+std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach);
 
-// Knows which pairs are near: all that can come within `thickness`, the largest, or `farther` than
-// that by sheet, of medial axes, while no node has moved further than `margin` from where it was,
-// whatever common displacement all have come.
+// Knows which pairs are near: all that can come within `thickness`, the largest, while no node has
+// moved further than `margin` from where it was, whatever common displacement all have come.
 class CandidateSet {
  public:
-  CandidateSet(Surface surface, double thickness, double margin, const PathSettings& settings = {},
-               std::vector<double> farther = {});
+  CandidateSet(Surface surface, double thickness, double margin, const PathSettings& settings = {});
 
   const Surface surface;
   const double thickness;
-
-  // What a pair keeps apart at most, m.
-  double rest_distance(const Candidate& pair) const;
 
   // The pairs, for positions x. Of each, `distance` is at most its distance there.
   std::vector<Candidate>& pairs(const Buffer<double>& x);
@@ -74,12 +67,15 @@ class CandidateSet {
   double moved(const Buffer<double>& from, const Buffer<double>& to,
                const Buffer<double>* or_to = nullptr) const;
   void rebuild(const Buffer<double>& x);
-  MinDistanceRule rule_of(const Candidate& pair) const;
+  MinDistanceRule rule() const;
   bool limit_listed(const Buffer<double>& from, Buffer<double>& to);
+  // Where a node on its way to `to` is stopped, as far as is known in `limit_listed`.
+  Eigen::Vector3d limited(int node, const Buffer<double>& from, const Buffer<double>& to) const;
+  double safe_share_of(const Candidate& pair, const Buffer<double>& from,
+                       const Buffer<double>& to) const;
 
   double margin_;
   PathSettings settings_;
-  std::vector<double> farther_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
   std::vector<double> share_, drift_, displacement_;

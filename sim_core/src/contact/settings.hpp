@@ -163,19 +163,4 @@ struct SmoothSettings {
   SIM_CORE_NAMED(reach, curvature_max, same_normal, beyond_edge, between, fold_over, body_first)
 };
 
-struct CapsuleSettings {
-  // Radius over the side of a cell below which a body has a medial axis. From there on a strip over
-  // a box edge bears its force within 2 % (mu 0.6), and at 0.75 within 7 %.
-  double radius_max = 0.9;
-  // Half of the shortest edge of a box over the side of a cell below which its medial axis is all
-  // that cloth feels: it then has faces, too, which cost more than those that vertices touch, but
-  // nothing jumps over it.
-  double thickness_max = 2.0;
-  // Distance over the diameter of the cloth at rest by which an endless body reaches beyond the
-  // cloth.
-  double beyond = 2.0;
-
-  SIM_CORE_NAMED(radius_max, thickness_max, beyond)
-};
-
 }  // namespace sim_core

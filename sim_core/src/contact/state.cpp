@@ -107,7 +107,6 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   std::array<BodyContact, 6> near;  // the bodies whose fillets may reach here, the nearest first
   int count = 0;
   for (std::size_t b = 0; b < bodies.size(); ++b) {
-    if (by_pairs(b)) continue;
     BodyContact candidate{gap_of(bodies[b], p), static_cast<int>(b)};
     if (candidate.gap.distance < on.gap.distance) on = candidate;
     if (!(candidate.gap.distance < 2.0 * fillet_)) continue;

@@ -129,10 +129,6 @@ class ContactState {
   Buffer<float> force,
       correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
-  std::vector<char> replaced_bodies;  // (bodies): those that nodes do not feel; none: all are felt
-  bool by_pairs(std::size_t body) const {
-    return body < replaced_bodies.size() && replaced_bodies[body];
-  }
   std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear

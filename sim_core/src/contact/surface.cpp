@@ -24,16 +24,12 @@ Matrix3d axes(const std::array<int, 3>& corner, const Buffer<double>& x) {
 }  // namespace
 
 Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> sheet_of_node_in,
-                 CollisionMask collides_in, const CapsulePieces& capsules)
+                 CollisionMask collides_in)
     : triangles(std::move(triangles_in)),
       around_begin(sheet_of_node_in.size() + 1, 0),
       sheet_of_node(std::move(sheet_of_node_in)),
-      capsule_triangles(static_cast<int>(triangles.size())),
       collides(std::move(collides_in)),
       last_collider(collides.rows(), -1) {
-  triangles.insert(triangles.end(), capsules.triangles.begin(), capsules.triangles.end());
-  const int first_capsule =
-      capsules.points.empty() ? static_cast<int>(sheet_of_node.size()) : capsules.points.front();
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (sheet_of_node[i] < 0) continue;
     for (Eigen::Index sheet = 0; sheet < collides.rows(); ++sheet) {
@@ -43,11 +39,10 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
   for (const auto& corners : triangles) {
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
-      if (i != j) edges.push_back({std::min(i, j), std::max(i, j)});
-      if (c == 0 || corners[c] != corners[c - 1]) ++around_begin[corners[c] + 1];
+      edges.push_back({std::min(i, j), std::max(i, j)});
+      ++around_begin[corners[c] + 1];
     }
   }
-  edges.insert(edges.end(), capsules.segments.begin(), capsules.segments.end());
   std::sort(edges.begin(), edges.end());
   edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
   triangles_of_edge.assign(edges.size(), 0);
@@ -57,30 +52,19 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
       const std::array<int, 2> edge{std::min(i, j), std::max(i, j)};
       own[c] = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
-      const bool counts =
-          i != j && std::find(own.begin(), own.begin() + c, own[c]) == own.begin() + c;
-      triangles_of_edge[own[c]] += counts;
+      ++triangles_of_edge[own[c]];
     }
     triangle_edges.push_back(own);
   }
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
-    if (around_begin[i + 1] > 0 || static_cast<int>(i) >= first_capsule)
-      vertices.push_back(static_cast<int>(i));
+    if (around_begin[i + 1] > 0) vertices.push_back(static_cast<int>(i));
     around_begin[i + 1] += around_begin[i];
   }
   around.resize(around_begin.back());
   std::vector<int> next(around_begin.begin(), around_begin.end() - 1);
   for (std::size_t t = 0; t < triangles.size(); ++t) {
-    const auto& corners = triangles[t];
-    for (int c = 0; c < 3; ++c) {
-      if (c == 0 || corners[c] != corners[c - 1]) around[next[corners[c]]++] = static_cast<int>(t);
-    }
+    for (int corner : triangles[t]) around[next[corner]++] = static_cast<int>(t);
   }
-  capsule_edges = static_cast<int>(
-      std::lower_bound(edges.begin(), edges.end(), std::array<int, 2>{first_capsule, -1}) -
-      edges.begin());
-  capsule_vertices = static_cast<int>(
-      std::lower_bound(vertices.begin(), vertices.end(), first_capsule) - vertices.begin());
 }
 
 void Turns::begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes) {

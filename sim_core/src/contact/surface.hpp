@@ -12,14 +12,7 @@
 
 namespace sim_core {
 
-// What cloth touches of a body by pairs alone, or besides its vertices.
-struct Capsule {
-  int body;
-  double radius;        // m: what pairs keep apart
-  bool replaces_nodes;  // see MedialAxis
-};
-
-// Of sheets and, after them, surfaces and medial axes.
+// Of sheets and, after them, surfaces.
 struct ContactMaterials {
   std::vector<double> thickness;  // m: two keep the mean of theirs apart
   Eigen::MatrixXd mu;             // of each two; negative: they do not touch each other
@@ -30,20 +23,11 @@ struct ContactMaterials {
   // than 1 they are active where cloth is curved only.
   double edge_share = 1.0, second_share = 1.0;
   double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
-  double cell = 0.0;            // m: side of a cell, of the coarsest sheet
-  std::vector<Capsule> capsules;
 
-  int first_capsule() const { return static_cast<int>(thickness.size()); }
-  // Of two sheets, surfaces and medial axes: the medial axis, or null.
-  const Capsule* capsule_of(int a, int b) const {
-    const int last = std::max(a, b) - first_capsule();
-    return last < 0 ? nullptr : &capsules[last];
-  }
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
   // (contact/state.hpp): pairs only hold what comes nearer between the nodes.
   double rest_distance(int a, int b) const {
-    if (const Capsule* capsule = capsule_of(a, b)) return capsule->radius;
     return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
   }
   // The same by kind of pair; `first` and `second`: sheets of its pieces.
@@ -55,13 +39,14 @@ struct ContactMaterials {
                                                        : 1.0;
     return share * rest_distance(first, second);
   }
-  // The largest of these without medial axes; without any, the largest thickness of a sheet.
+  // The largest of these; without any, the largest thickness of a sheet.
   double farthest() const {
     double out = 0.0;
-    if ((mu.topLeftCorner(first_capsule(), first_capsule()).array() < 0.0).all()) {
+    if ((mu.array() < 0.0).all()) {
       return *std::max_element(thickness.begin(), thickness.begin() + sheets);
     }
-    for (int a = 0; a < first_capsule(); ++a) {
+    const int count = static_cast<int>(thickness.size());
+    for (int a = 0; a < count; ++a) {
       for (int b = 0; b <= a; ++b) out = mu(a, b) < 0.0 ? out : std::max(out, rest_distance(a, b));
     }
     return out;
@@ -69,13 +54,6 @@ struct ContactMaterials {
 };
 
 using CollisionMask = Eigen::Matrix<bool, Eigen::Dynamic, Eigen::Dynamic>;
-
-// Points, segments and triangles of medial axes, by node. Their nodes are the last.
-struct CapsulePieces {
-  std::vector<int> points;
-  std::vector<std::array<int, 2>> segments;
-  std::vector<std::array<int, 3>> triangles;
-};
 
 // Triangles that may touch: their corners, edges, and what lies around each.
 struct Surface {
@@ -86,12 +64,11 @@ struct Surface {
   std::vector<int> triangles_of_edge;              // counts
   std::vector<int> around_begin, around;           // triangles around each node, ascending
   std::vector<int> sheet_of_node;
-  int capsule_triangles, capsule_edges, capsule_vertices;  // where those of medial axes begin
-  CollisionMask collides;                                  // whether two sheets touch each other
+  CollisionMask collides;          // whether two sheets touch each other
   std::vector<int> last_collider;  // by sheet: the last node that it touches
 
   Surface(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
-          CollisionMask collides, const CapsulePieces& capsules = {});
+          CollisionMask collides);
   bool may_touch(int node, int other) const {
     return collides(sheet_of_node[node], sheet_of_node[other]);
   }

@@ -155,7 +155,7 @@ def test_what_moves_evenly_is_valid() -> None:
 
     def bodies(time: float) -> list[Body]:
         share = min(max(time - 0.3, 0.0) / 0.1, 1.0)
-        far = sphere(0.5, 0.01, origin=(5.0 + (time > 0.2), 0.0, 0.0))
+        far = sphere(0.5, 0.03, origin=(5.0 + (time > 0.2), 0.0, 0.0))
         return [plane(1.0, origin=(0.01 * share * share * (3.0 - 2.0 * share), 0.0, 0.0)), far]
 
     cloth, path = watched(bodies, 0.5)
@@ -239,7 +239,11 @@ class TestController:
 
         def motion(time: float) -> tuple[Floats, Floats, list[Body]]:
             x = 0.05 * (1.0 - np.cos(6.0 * max(time - 0.8, 0.0)))
-            return gravity, np.empty((0, 3)), [box(0.3, (1, 1, 1), origin=(x, 0.0, -0.5))]
+            return (
+                gravity,
+                np.empty((0, 3)),
+                [box(0.3, (1, 1, 1), rounding=0.02, origin=(x, 0.0, -0.5))],
+            )
 
         cloth.advance(end, motion, event=end)
         return cloth

@@ -128,7 +128,7 @@ class TestFriction:
                     0.02,
                     bodies=[
                         plane(0.9, origin=(0, 0, -1.0)),
-                        box(mu, (1, 1, 1), origin=(moved, 0, -0.5)),
+                        box(mu, (1, 1, 1), rounding=0.02, origin=(moved, 0, -0.5)),
                     ],
                 )
                 assert (cloth.contacts == 1).all()
@@ -205,15 +205,17 @@ class TestBodies:
         assert cloth.total.seen.contact_work < 1e-6 * cloth.total.seen.flow
 
     def test_box_carries(self) -> None:
-        cloth = self.fall([plane(0.5), box(0.5, (0.06, 0.06, 0.1))])
+        cloth = self.fall([plane(0.5), box(0.5, (0.06, 0.06, 0.1), rounding=0.01)])
         assert cloth.positions[:, 2].max() == pytest.approx(0.05, abs=2e-3)
         assert (cloth.contacts == 1).any()
 
     @pytest.mark.physics
     def test_turned_box_is_the_same_box(self) -> None:
         """Half a turn about x maps a box onto itself."""
-        first = self.fall([box(0.5, (0.06, 0.06, 0.1))], 20)
-        second = self.fall([box(0.5, (0.06, 0.06, 0.1), rotation=turn(0, np.pi))], 20)
+        first = self.fall([box(0.5, (0.06, 0.06, 0.1), rounding=0.01)], 20)
+        second = self.fall(
+            [box(0.5, (0.06, 0.06, 0.1), rounding=0.01, rotation=turn(0, np.pi))], 20
+        )
         assert second.positions == pytest.approx(
             first.positions, abs=2e-3
         )  # corners buckle as they like

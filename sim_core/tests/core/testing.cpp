@@ -118,7 +118,7 @@ NB_MODULE(_testing, m) {
         FactorSettings exact;  // no fold is too small, and none is old
         exact.fold_smallest = exact.stiffening_change = 0.0;
         Assembly assembly(kernel_level("").cloth, mesh,
-                          Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, 0, exact);
+                          Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, exact);
         const std::vector<int>& node = assembly.numbering.node;
         Buffer<double> at(4 * x.rows());
         Buffer<float> in(4 * x.rows()), out(4 * x.rows());

@@ -81,6 +81,13 @@ def _caught(cells: int, bodies: Bodies) -> str:
     return code or ("right" if middle > 0.0 else f"wrong: the middle is at {middle:.3g} m")
 
 
+def _refused(cells: int, bodies: Bodies, *, height: float = 0.02) -> str:
+    try:
+        return _run(cells, bodies, height=height)[0]
+    except ValueError:
+        return "refused"
+
+
 def rod_of_a_cell(cells: int) -> str:
     """A rod whose radius is a cell carries the napkin."""
     return _caught(cells, lambda _: [cylinder(1.0, SIDE / cells, rotation=ALONG_Y)])
@@ -93,12 +100,12 @@ def ball_of_a_cell(cells: int) -> str:
 
 def rod_of_a_quarter(cells: int) -> str:
     """A rod with a radius of a quarter of a cell is too sharp."""
-    return _caught(cells, lambda _: [cylinder(1.0, 0.25 * SIDE / cells, rotation=ALONG_Y)])
+    return _refused(cells, lambda _: [cylinder(1.0, 0.25 * SIDE / cells, rotation=ALONG_Y)])
 
 
 def rod_of_half(cells: int) -> str:
-    """A rod with a radius of just over half a cell carries the napkin."""
-    return _caught(cells, lambda _: [cylinder(1.0, 0.51 * SIDE / cells, rotation=ALONG_Y)])
+    """A rod with a radius of just over half a cell is too sharp."""
+    return _refused(cells, lambda _: [cylinder(1.0, 0.51 * SIDE / cells, rotation=ALONG_Y)])
 
 
 def wide_rod(cells: int) -> str:
@@ -251,18 +258,12 @@ def stretched_rim(cells: int) -> str:
 
 def start_in_floor(cells: int) -> str:
     """A napkin that starts 5 cm under the floor."""
-    try:
-        return _run(cells, lambda _: [plane(0.5)], height=-0.05)[0]
-    except ValueError:
-        return "refused"
+    return _refused(cells, lambda _: [plane(0.5)], height=-0.05)
 
 
 def start_in_ball(cells: int) -> str:
     """A napkin that starts through the middle of a ball."""
-    try:
-        return _run(cells, lambda _: [sphere(0.5, 0.03)], height=0.005)[0]
-    except ValueError:
-        return "refused"
+    return _refused(cells, lambda _: [sphere(0.5, 0.03)], height=0.005)
 
 
 def shaken_floor(cells: int) -> str:
@@ -324,8 +325,8 @@ EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingPr
             (napkin_on_floor, ("right",)),
             (rod_of_a_cell, ("right",)),
             (ball_of_a_cell, ("right",)),
-            (rod_of_a_quarter, ("sharpness",)),
-            (rod_of_half, ("right",)),
+            (rod_of_a_quarter, ("refused",)),
+            (rod_of_half, ("refused",)),
             (wide_rod, ("right",)),
             (table_corner, ("right",)),
             (hanging, ("right",)),

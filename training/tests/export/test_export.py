@@ -177,8 +177,8 @@ def test_the_same_export_has_the_same_bytes(clips: Any, tmp_path: Path) -> None:
     [
         (
             [],
-            "an export needs one of --hdf5, --webdataset, --huggingface, --lerobot, --obj, "
-            "and has none",
+            "an export needs one of --hdf5, --webdataset, --huggingface, --coco, --lerobot, "
+            "--obj, and has none",
         ),
         (["--webdataset", "OUT", "--huggingface", "OUT"], "and has --webdataset, --huggingface"),
         (["--webdataset", "OUT", "--arrays", "movie"], "got 'movie'"),

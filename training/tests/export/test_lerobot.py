@@ -18,7 +18,9 @@ VIEWS = ("front", "high")
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
 
-def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any, dict[str, Any]]:
+def content(
+    simulations: int = 4, *, without: tuple[int, ...] = (), has_depth: bool = False
+) -> tuple[Any, dict[str, Any]]:
     """Return what an export reads of simulations that two cameras see, and all arrays by slot."""
     instants = np.linspace(0, INSTANTS - 1, FRAMES).round().astype(int).tolist()
     time = {"instants_per_second": 15.0}
@@ -59,6 +61,9 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
         array("viewpoint", "code", "int16", categories=VIEWS),
         array("split", "code", "uint8", categories=SPLITS),
     )
+    if has_depth:
+        pixels = {"frame": FRAMES, "y": SIDE, "x": SIDE}
+        layouts += (array("depth", "depth", "float32", pixels, per_sample=True),)
     rest = np.stack(np.meshgrid(*[np.linspace(0.0, 0.2, 5)] * 2, indexing="ij"), axis=-1).reshape(
         -1, 2
     )
@@ -80,6 +85,8 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
         "viewpoint": (np.arange(count) % 2).astype(np.int16),
         "split": np.repeat(np.arange(simulations) % 3, 2).astype(np.uint8),
     }
+    depth = RANDOM.uniform(0.7, 1.9, (count, FRAMES, SIDE, SIDE)).astype(np.float32)
+    data["depth"] = np.where(depth < 0.8, np.inf, depth)
     arrays = {layout.name: layout for layout in layouts}
     reader = SimpleNamespace(
         arrays=arrays,
@@ -96,6 +103,7 @@ def content(simulations: int = 4, *, without: tuple[int, ...] = ()) -> tuple[Any
         title="fold-napkin",
         sample_bytes=1,
         read=lambda name, slots: data[name][slots],
+        picture=lambda name, slot: data[name][slot],
     )
     return made, data
 
@@ -134,6 +142,11 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
     every = np.array(rows["action"])
     np.testing.assert_allclose(stats["action"]["mean"], every.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(stats["action"]["std"], every.std(axis=0), atol=1e-12)
+    shown = data["video"][[0, 6, 4]].reshape(-1, 3) / 255.0  # by the camera `front`
+    pictures = stats["observation.images.front"]
+    assert pictures["count"] == [len(shown)]
+    for name, expected in (("mean", shown.mean(axis=0)), ("std", shown.std(axis=0))):
+        np.testing.assert_allclose(np.ravel(pictures[name]), expected, atol=1e-9)
 
 
 def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
@@ -145,6 +158,36 @@ def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
         with av.open(str(path)) as file:
             frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
         np.testing.assert_array_equal(frames, data["video"][slot])
+
+
+def test_depth_is_a_feature_in_twelve_bits(tmp_path: Path) -> None:
+    """As lerobot 0.6 reads it: from codes and the numbers beside them, to half a step."""
+    av = pytest.importorskip("av", reason="av is not installed: make setup-dev")
+    made, data = content(1, has_depth=True)
+    lerobot.write(made, tmp_path, lambda _: None)
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    stats = json.loads((tmp_path / "meta/stats.json").read_text())
+    for slot, view in enumerate(VIEWS):
+        key = f"observation.images.{view}_depth"
+        feature = info["features"][key]
+        assert (feature["dtype"], feature["shape"]) == ("video", [SIDE, SIDE, 1])
+        assert feature["info"]["is_depth_map"]
+        assert not feature["info"]["video.use_log"]
+        near, far = (feature["info"][f"video.depth_{end}"] for end in ("min", "max"))
+        path = info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
+        with av.open(str(tmp_path / path)) as file:
+            assert file.streams.video[0].codec_context.pix_fmt == "gray12le"
+            codes = np.stack([frame.to_ndarray(format="gray12le") for frame in file.decode(0)])
+        depth = near + codes * (far - near) / 4095
+        wanted = data["depth"][slot]
+        is_there = np.isfinite(wanted)
+        assert (codes[~is_there] == 4095).all()
+        assert (codes[is_there] < 4095).all()
+        step = (far - near) / 4095
+        assert step < 3e-4
+        assert np.abs(depth - wanted)[is_there].max() <= 0.501 * step
+        assert np.shape(stats[key]["mean"]) == (1, 1, 1)
+        assert stats[key]["max"][0][0][0] == pytest.approx(far)
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,13 @@
 import contextlib
 import logging
 import os
+import re
 import secrets
 import shutil
 import signal
 import socket
 import stat
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -84,6 +86,8 @@ class RayCluster:
         if isinstance(self.location, str):
             return f"none answers at {self.location}"
         logs = self.location / "session_latest" / "logs"
+        if reason := find_reason(self.location):
+            return reason
         # If a head does not even start its processes, only its own output gives the reason.
         paths = [logs / name for name in ("raylet.err", "raylet.out", "gcs_server.out")]
         for path in [*paths, *filter(None, [self.log])]:
@@ -91,6 +95,40 @@ class RayCluster:
                 if lines := path.read_text(errors="replace").split("\n")[:-1]:
                     return f"last line of {path}: {lines[-1][:300]}"
         return f"it has not written to {self.location} yet"
+
+
+FATAL = re.compile(r"\] \(\w+\) [\w.]+:\d+: (?:Unhandled exception: )?(.*)")
+"""A line of a log of Ray's processes: after the level and the place in the source, the message."""
+
+LEAST_FREE_BYTES = 64 * 2**20
+"""Space that Ray needs for its logs and sockets [bytes]; with less, they do not give the reason."""
+
+MAX_REASON_LETTERS = 300
+"""Longest reason that is shown."""
+
+
+def find_reason(directory: Path) -> str:
+    """Return why the processes of a head have ended, from their logs; an empty text if unknown."""
+    logs = directory / "session_latest" / "logs"
+    for name in ("raylet.err", "gcs_server.err", "raylet.out", "gcs_server.out"):
+        with contextlib.suppress(OSError):
+            for line in (logs / name).read_text(errors="replace").splitlines():
+                # C is Ray's level of errors that end a process; other exceptions have a phrase.
+                is_fatal = re.match(r"\[[\d-]+ [\d:,.]+ C ", line) or "Unhandled exception" in line
+                if is_fatal and (match := FATAL.search(line)):
+                    return f"{name.partition('.')[0]}: {match[1][:MAX_REASON_LETTERS]}"
+    with contextlib.suppress(OSError):
+        free_bytes = shutil.disk_usage(directory).free
+        if free_bytes < LEAST_FREE_BYTES:
+            return f"the file system of {directory} has {free_bytes / 1e6:.1f} MB left"
+    return ""
+
+
+def _print_reason(directory: Path) -> None:
+    """Write the reason to the output of the head, of which `stickslip up` shows the last lines."""
+    if reason := find_reason(directory):
+        sys.stderr.write(f"Ray has ended: {reason}\n")
+        sys.stderr.flush()
 
 
 SETTINGS = {
@@ -159,7 +197,7 @@ def run_head(directory: Path, cpus: int | None) -> None:
     from ray.scripts.scripts import cli
 
     port, *agent_ports = _free_ports(1 + len(AGENT_PORTS))
-    _prepare_raylet(agent_ports[0])
+    _prepare_raylet(agent_ports[0], directory)
     options = {
         "port": port,
         "num-cpus": cpus or len(os.sched_getaffinity(0)),
@@ -172,7 +210,12 @@ def run_head(directory: Path, cpus: int | None) -> None:
     }
     (directory / "address").write_text(f"127.0.0.1:{port}")
     words = [f"--{name}={value}" for name, value in options.items()]
-    cli.main(["start", "--head", "--block", "--no-monitor", *words], prog_name="ray")
+    try:
+        cli.main(["start", "--head", "--block", "--no-monitor", *words], prog_name="ray")
+    except SystemExit as end:
+        if end.code:
+            _print_reason(directory)
+        raise
 
 
 def _free_ports(count: int) -> list[int]:
@@ -184,11 +227,13 @@ def _free_ports(count: int) -> list[int]:
     return ports
 
 
-def _prepare_raylet(agent_port: int) -> None:
+def _prepare_raylet(agent_port: int, directory: Path) -> None:
     """Let `ray start` of this process give a port to the raylet, and end with the raylet.
 
-    Ray has no public way for either, so this function wraps Ray's private function that starts
-    processes:
+    `directory` is that of the head, with the logs of its processes.
+
+    Ray 2.60 has no public way for either: no option, variable or hook of `ray start` reaches the
+    command of the raylet. So this function wraps Ray's private function that starts processes:
 
     - The raylet waits 15 s for the ports of its Python process, and then aborts
       (ray-project/ray#65983). It does not wait for ports that it knows already. `ray start` passes
@@ -208,7 +253,9 @@ def _prepare_raylet(agent_port: int) -> None:
 
         # This process ends with the raylet, and the kernel then ends its other children.
         def end_with_raylet() -> None:
-            os._exit(raylet.process.wait() or 1)
+            status = raylet.process.wait() or 1
+            _print_reason(directory)
+            os._exit(status)
 
         threading.Thread(target=end_with_raylet, daemon=True).start()
         return raylet

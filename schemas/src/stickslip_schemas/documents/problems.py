@@ -2,7 +2,7 @@
 
 import json
 from enum import StrEnum
-from itertools import islice
+from itertools import islice, takewhile
 from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
@@ -66,6 +66,10 @@ class Problem(BaseModel):
     errors: list[FieldError] = Field(default_factory=list)
 
 
+SHOWN_LETTERS = 200
+"""Letters of a wrong value that a message shows."""
+
+
 def field_errors(
     error: ValidationError, document: Any, expected: Any, *, at_most: int | None = None
 ) -> list[FieldError]:
@@ -108,5 +112,27 @@ def _pointer_token(part: int | str) -> str:
 
 def _shown(value: Any) -> str:
     # Values that JSON does not have are named by their type: nobody wants to read a Python repr.
-    text = json.dumps(value, default=lambda item: type(item).__name__)
-    return text if len(text) <= 200 else text[:197] + "..."
+    text = json.dumps(_beginning(value, [SHOWN_LETTERS]), default=lambda item: type(item).__name__)
+    return text if len(text) <= SHOWN_LETTERS else text[: SHOWN_LETTERS - 3] + "..."
+
+
+def _beginning(value: Any, values_left: list[int]) -> Any:
+    """Return a value without the parts that are not shown: it may have millions of them.
+
+    Each part takes a letter or more, so as many parts as letters are enough; `values_left` counts
+    them down.
+    """
+    values_left[0] -= 1
+    if isinstance(value, str):
+        return value[: SHOWN_LETTERS + 1]
+    if isinstance(value, dict):
+        return {
+            name: _beginning(item, values_left)
+            for name, item in takewhile(lambda _: values_left[0] >= 0, value.items())
+        }
+    if isinstance(value, list | tuple):
+        return [
+            _beginning(item, values_left)
+            for item in takewhile(lambda _: values_left[0] >= 0, value)
+        ]
+    return value

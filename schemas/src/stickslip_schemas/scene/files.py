@@ -467,15 +467,15 @@ def _read_path(data: bytes) -> Arrays:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise UnfitFileError(f"must be text in UTF-8, or an NPZ file: {error}") from error
+        rule = f"must be text in UTF-8, or an NPZ file, and byte {error.start} is not UTF-8"
+        raise UnfitFileError(rule) from error
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     try:
         header = next(reader, [])
         if tuple(cell.strip().lower() for cell in header) != PATH_COLUMNS:
-            raise UnfitFileError(
-                f"must begin with the line {','.join(PATH_COLUMNS)}, and begins with "
-                f"{','.join(header)[:80]!r}"
-            )
+            first = ",".join(header)[:80]
+            rule = f"must begin with the line {','.join(PATH_COLUMNS)}, and begins with {first!r}"
+            raise UnfitFileError(rule)
         # Rows of empty cells are what spreadsheets leave below a table.
         rows = [_path_row(cells, reader.line_num) for cells in reader if any(map(str.strip, cells))]
     except csv.Error as error:

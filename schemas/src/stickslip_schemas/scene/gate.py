@@ -148,25 +148,25 @@ def _check_obj(data: bytes) -> None:
     """
     text = obj_text(data)
     # Equal vertices are welded later, so there may be more of them than a body may have.
-    vertices = sum(1 for _ in _VERTEX.finditer(text))
+    vertices = len(_VERTEX.findall(text))
     if vertices > MAX_SOUP_VERTICES:
         raise UnfitFileError(f"must have at most {MAX_SOUP_VERTICES} vertices, and has {vertices}")
-    triangles = 0
-    for face in _FACE.finditer(text):
-        corners = face[1]
-        if len(corners) > MAX_FACE_BYTES:
-            raise UnfitFileError(
-                f"a face must have at most {MAX_FACE_BYTES} bytes in its line, and one has "
-                f"{len(corners)}"
-            )
-        count = len(corners.split())
-        if count > MAX_CORNERS:
-            raise UnfitFileError(
-                f"a face must have at most {MAX_CORNERS} corners, and one has {count}"
-            )
-        triangles += max(1, count - 2)
-        if triangles > MAX_TRIANGLES:
-            raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has more")
+    # Lists of lines and of counts: a loop in Python takes twice as long.
+    faces = _FACE.findall(text)
+    if len(faces) > MAX_TRIANGLES:
+        raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has more")
+    longest = max(map(len, faces), default=0)
+    if longest > MAX_FACE_BYTES:
+        raise UnfitFileError(
+            f"a face must have at most {MAX_FACE_BYTES} bytes in its line, and one has {longest}"
+        )
+    corners = list(map(len, map(bytes.split, faces)))
+    if max(corners, default=0) > MAX_CORNERS:
+        raise UnfitFileError(
+            f"a face must have at most {MAX_CORNERS} corners, and one has {max(corners)}"
+        )
+    if sum(corners) - 2 * len(corners) > MAX_TRIANGLES:
+        raise UnfitFileError(f"must have at most {MAX_TRIANGLES} triangles, and has more")
 
 
 def _check_npz(data: bytes) -> None:
@@ -279,7 +279,10 @@ def _read_header(name: str, header: bytes) -> tuple[int, tuple[int, ...]]:
         raise UnfitFileError(f"{name} must be numbers, and its type is {str(number)[:40]}")
     shape = fields["shape"]
     if not isinstance(shape, tuple) or not all(_is_side(side) for side in shape):
-        raise UnfitFileError(f"{name} must have a shape of whole numbers, and it is {shape!s:.60}")
+        raise UnfitFileError(
+            f"{name} must have a shape of whole numbers from 0 to {MAX_FILE_BYTES}, and it is "
+            f"{shape!s:.60}"
+        )
     return int(match[1]), shape
 
 

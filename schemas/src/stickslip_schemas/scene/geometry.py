@@ -273,12 +273,12 @@ def ray_lengths(mesh: TriangleMesh, points: Floats, direction: Floats, farthest:
     # In axes of which the last is along the rays, a ray meets what it meets seen from its end.
     axes = np.linalg.svd(direction[None])[2][[1, 2, 0]]
     axes[2] = direction
-    seen = TriangleMesh(mesh.vertices @ axes.T, mesh.triangles)
+    rotated = TriangleMesh(mesh.vertices @ axes.T, mesh.triangles)
     starts = points @ axes.T
     lengths = np.full(len(points), np.inf)
     rays = BoxTree(starts, starts + np.array([0.0, 0.0, farthest]))
-    for i, j in overlapping_boxes(rays, seen.tree):
-        heights = _heights(starts[i, :2], seen.corners[j])
+    for i, j in overlapping_boxes(rays, rotated.tree):
+        heights = _heights(starts[i, :2], rotated.corners[j])
         ahead = heights >= starts[i, 2]
         np.minimum.at(lengths, i[ahead], heights[ahead] - starts[i[ahead], 2])
     return np.where(lengths <= farthest, lengths, np.inf)

@@ -50,8 +50,7 @@ class Jump:
 def surface_at_start(body: Mapping[str, Any]) -> TriangleMesh:
     """Return the triangles of a body of type mesh where they are at 0 s."""
     file = body["file"]
-    every = np.arange(_vertex_count(file))
-    vertices = _frame_positions(file, every, slice(0, 1))[0]
+    vertices = _frame_positions(file, slice(None), slice(0, 1))[0]
     if body["motion"] is not None:
         pose = Track(body["motion"]).pose_at_start(vertices.mean(axis=0))
         vertices = vertices @ pose[:, :3].T + pose[:, 3]
@@ -180,11 +179,12 @@ def _groups(file: Mapping[str, Any]) -> list[Integers]:
     return np.array_split(np.arange(count), min(groups, count))
 
 
-def _frame_positions(file: Mapping[str, Any], vertices: Integers, frames: slice) -> Floats:
+def _frame_positions(file: Mapping[str, Any], vertices: Integers | slice, frames: slice) -> Floats:
     """Return where vertices (V,) are in frames of a file (F, V, 3) [m]."""
     if "bones" not in file:
         return np.asarray(file["positions"][frames][:, vertices], float)
-    rest = np.column_stack([file["rest"][vertices], np.ones(len(vertices))])
+    rest = np.asarray(file["rest"][vertices], float)
+    rest = np.column_stack([rest, np.ones(len(rest))])
     weights = np.asarray(file["weights"][vertices], float)
     # A vertex of a skin is the sum over bones of w (A x + b).
     bones = np.asarray(file["bones"][frames], float)

@@ -151,7 +151,9 @@ def obj_text(data: bytes) -> bytes:
             try:
                 data = data.decode(encoding).encode()
             except UnicodeDecodeError as error:
-                raise UnfitFileError(f"must be text, or an NPZ file: {error}") from error
+                raise UnfitFileError(
+                    f"must be text, or an NPZ file, and byte {error.start} is not of its encoding"
+                ) from error
     data = data.removeprefix(codecs.BOM_UTF8)
     if b"\0" in data[:1024]:
         raise UnfitFileError("must be an OBJ, STL, PLY or NPZ file, and is none of them")
@@ -300,7 +302,10 @@ def _read_text_stl(data: bytes) -> Polygons:
         # Through single precision, as in a binary file.
         positions = np.array(vertices, dtype=np.float32).astype(np.float64).reshape(-1, 3)
     except ValueError as error:
-        raise UnfitFileError(f"vertices of an STL file must be three numbers: {error}") from error
+        word = next(word for row in vertices for word in row if not _is_number(word))
+        shown = word.decode("utf-8", "replace")[:80]
+        rule = f"vertices of an STL file must be three numbers, and one has {shown!r}"
+        raise UnfitFileError(rule) from error
     facets = len(re.findall(rb"\bendfacet\b", data, re.IGNORECASE))
     if len(positions) != 3 * facets:
         raise UnfitFileError(
@@ -308,6 +313,14 @@ def _read_text_stl(data: bytes) -> Polygons:
             f"{facets} facets"
         )
     return _soup(positions)
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _soup(positions: Floats) -> Polygons:

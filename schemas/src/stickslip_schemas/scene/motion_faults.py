@@ -115,23 +115,25 @@ def stretch_faults(
 
 
 def _largest_stretch(
-    sheet: SheetStart, one: Mapping[str, Any], other: Mapping[str, Any], end: float
+    sheet: SheetStart, first: Mapping[str, Any], second: Mapping[str, Any], end: float
 ) -> tuple[float, float]:
     """Return when two holders stretch the cloth between them most [s], and the stretch there.
 
     It is a lower bound: the cloth between two vertices is no shorter than the distance of both.
     """
-    held = [_some(np.flatnonzero(held_vertices(sheet, holder))) for holder in (one, other)]
+    held = [
+        _evenly_spread(np.flatnonzero(held_vertices(sheet, holder))) for holder in (first, second)
+    ]
     if sheet.jitter or not len(held[0]) or not len(held[1]):
         return 0.0, 0.0
-    tracks = [None if h["motion"] is None else Track(h["motion"]) for h in (one, other)]
+    tracks = [None if h["motion"] is None else Track(h["motion"]) for h in (first, second)]
     times = {time for track in tracks if track for time in track.times.tolist() if time <= end}
     # The flat sheet is the longest that the cloth between two vertices can be without a stretch.
     lengths = np.linalg.norm(sheet.rest[held[0]][:, None] - sheet.rest[held[1]][None], axis=2)
     largest = (0.0, 0.0)
     for time in sorted(times):
         points = []
-        for vertices, track, holder in zip(held, tracks, (one, other), strict=True):
+        for vertices, track, holder in zip(held, tracks, (first, second), strict=True):
             at_start = sheet.positions[vertices]
             middle = sheet.positions[held_vertices(sheet, holder)].mean(axis=0)
             points.append(at_start if track is None else track.moved(at_start, middle, time))
@@ -142,8 +144,8 @@ def _largest_stretch(
     return largest
 
 
-def _some(vertices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return at most `COMPARED_VERTICES` of some vertices, evenly spread."""
+def _evenly_spread(vertices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return at most `COMPARED_VERTICES` of the vertices, evenly spread."""
     count = min(len(vertices), COMPARED_VERTICES)
     if not count:
         return vertices

@@ -230,7 +230,8 @@ class Box(_Placed):
         default=None,
         gt=0,
         le=50,
-        description="radius of its edges [m]; null: 5 mm, or half the least of size",
+        description="radius of its edges [m]; null: 5 mm or 0.9 cells of the coarsest sheet, at "
+        "most half the least of size",
     )
 
     @model_validator(mode="after")

@@ -83,7 +83,7 @@ def press_faults(
                 f"{body.times[key]:g} s it is {1e3 * excess:.3g} mm further than the cloth lets "
                 "it; end the motion earlier by that and by the thickness of the cloth"
             )
-            member = "file" if body.given.get("motion") is None else "motion"
+            member = "file" if body.document.get("motion") is None else "motion"
             value = {"time": float(body.times[key])}
             yield StartFault(("bodies", name, member), rule, value)
             break
@@ -93,7 +93,7 @@ def press_faults(
 class _Solid:
     """A body, and how it moves as a whole."""
 
-    given: Mapping[str, Any]
+    document: Mapping[str, Any]
     """Its JSON."""
     surface: TriangleMesh | None
     """The triangles of a mesh at the start."""
@@ -118,7 +118,9 @@ class _Solid:
         gaps = np.zeros(len(points))
         # Steps of the distance to the body never pass its surface.
         for _ in range(FALL_STEPS):
-            gaps = np.maximum(start_gap(self.given, points + travelled[:, None] * direction), 0.0)
+            gaps = np.maximum(
+                start_gap(self.document, points + travelled[:, None] * direction), 0.0
+            )
             travelled = np.minimum(travelled + gaps, FARTHEST_FALL)
         return np.where(gaps < FALL_TOLERANCE, travelled, np.inf)
 

@@ -1,4 +1,4 @@
-"""Signed distances of points from bodies with an inside, at the start of a scene."""
+"""Bodies with an inside: how round they are, and distances of points from them at the start."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,13 +11,45 @@ from stickslip_schemas.scene.motions import Track, rotation_matrix
 Floats = npt.NDArray[np.float64]
 
 ROUNDING = 0.005
-"""Radius of the edges of a box without one of its own [m]: `ROUNDING` of the solver."""
+"""Radius of the edges of a box without one of its own [m]: `ROUNDING` of the solver.
+
+It is larger for coarse cloth (`box_rounding`).
+"""
+
+RADIUS_LEAST = 0.9
+"""Least radius of what cloth touches, over the side of a cell: `radius_least` of the solver."""
+
+
+def cell_side(rest: Floats, triangles: npt.NDArray[np.integer[Any]]) -> float:
+    """Return the side of a cell of a sheet [m]: the square root of twice the mean triangle.
+
+    `rest` are its flat vertices (V, 2) [m], `triangles` (T, 3).
+    """
+    corners = rest[triangles]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return float(np.sqrt(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).mean()))
+
+
+def box_rounding(box: Mapping[str, Any], cell: float) -> float:
+    """Return the radius of the edges of a box [m] for cloth whose largest cells have a side [m]."""
+    if box["rounding"] is not None:
+        return float(box["rounding"])
+    return float(min(max(ROUNDING, RADIUS_LEAST * cell), 0.5 * min(box["size"])))
+
+
+def with_roundings(bodies: Mapping[str, Any], cell: float) -> dict[str, Any]:
+    """Return bodies as JSON, with the radius of the edges of each box (see `box_rounding`)."""
+    rounded: dict[str, Any] = {}
+    for name, body in bodies.items():
+        is_box = body["type"] == "box"
+        rounded[name] = {**body, "rounding": box_rounding(body, cell)} if is_box else body
+    return rounded
 
 
 def start_gap(body: Mapping[str, Any], points: Floats) -> Floats:
     """Return the distances (N,) [m] of points (N, 3) from a body at 0 s; negative inside.
 
-    The body is the JSON of a plane, sphere, cylinder, capsule or box.
+    The body is the JSON of a plane, sphere, cylinder, capsule, or box with its rounding.
     """
     origin = np.array(body["origin"], float)
     if body["type"] == "plane":
@@ -40,8 +72,6 @@ def start_gap(body: Mapping[str, Any], points: Floats) -> Floats:
         case _:
             half = 0.5 * np.array(body["size"], float)
             radius = body["rounding"]
-            if radius is None:
-                radius = min(ROUNDING, float(half.min()))
             return _rounded_gap(local, half - radius, radius)
 
 

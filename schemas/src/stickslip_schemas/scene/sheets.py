@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from stickslip_schemas.scene.geometry import TriangleMesh
 from stickslip_schemas.scene.motions import rotation_matrix
+from stickslip_schemas.scene.parts import Unstructured
+from stickslip_schemas.scene.shapes import cell_side
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -37,6 +39,8 @@ class SheetStart:
     jitter: float
     """How far vertices may be from those here [m]; 0 if they are the same."""
     pieces: int
+    cell: float
+    """Side of a cell [m], see `cell_side`."""
     least_height: float
     """Least height of a triangle over an edge that it shares [m]; inf if it is not known."""
 
@@ -67,6 +71,7 @@ def start_of(name: str, sheet: Mapping[str, Any]) -> SheetStart:
         is_hung=start["type"] == "hung",
         jitter=jitter,
         pieces=_count_pieces(triangles) if is_file else 1,
+        cell=_cell_of(sheet["mesh"], rest, triangles),
         least_height=np.inf if jitter else _least_height(rest, triangles),
     )
 
@@ -90,6 +95,15 @@ def _mesh_of(mesh: Mapping[str, Any]) -> tuple[Floats, Integers, Floats | None, 
     rows = max(1, round(length / (spacing * 0.75**0.5)))
     rest, triangles = _grid(width, length, columns, rows)
     return rest, triangles, None, spacing
+
+
+def _cell_of(mesh: Mapping[str, Any], rest: Floats, triangles: Integers) -> float:
+    """Return the side of a cell of a sheet [m]; `mesh` is its JSON."""
+    if mesh["type"] != "unstructured":
+        return cell_side(rest, triangles)
+    # The lattice here lacks the vertices with which shifted rows begin and end.
+    _, count = Unstructured(size=mesh["size"], spacing=mesh["spacing"]).shape
+    return float(np.sqrt(2.0 * mesh["size"][0] * mesh["size"][1] / count))
 
 
 def _grid(width: float, length: float, columns: int, rows: int) -> tuple[Floats, Integers]:

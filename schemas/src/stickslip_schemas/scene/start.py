@@ -6,6 +6,7 @@ without the core refuses a scene before anything is queued:
     sheets      together within the size that the solver takes, thinner than their cells, each in
                 one piece
     holders     hold a vertex each, none twice, and leave one free
+    bodies      are round against the cells of the sheets
     start       no sheet inside a body, across another thing, or at no distance from it
     motions     no faster than the shortest steps of the preset can follow
     holders     do not tear the cloth between them
@@ -32,8 +33,8 @@ from stickslip_schemas.scene.mesh_bodies import surface_at_start
 from stickslip_schemas.scene.motion_faults import motion_faults, stretch_faults
 from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.presses import press_faults
-from stickslip_schemas.scene.shapes import start_gap
-from stickslip_schemas.scene.sheets import SheetStart, held_vertices, start_of
+from stickslip_schemas.scene.shapes import RADIUS_LEAST, box_rounding, start_gap, with_roundings
+from stickslip_schemas.scene.sheets import SLACK, SheetStart, held_vertices, start_of
 from stickslip_schemas.spec.jobs import StartFault
 
 Floats = npt.NDArray[np.float64]
@@ -78,6 +79,10 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     end = document_end(document)
     faults += motion_faults(document, sheets, end)
     # Geometry of a wrong unit or shape would only repeat these faults in many other words.
+    if not faults:
+        faults += _radius_faults(document, sheets)
+    cell = max(sheet.cell for sheet in sheets)
+    document = {**document, "bodies": with_roundings(document["bodies"], cell)}
     if not faults:
         faults += _body_faults(document, sheets)
     if not faults:
@@ -182,6 +187,34 @@ def document_end(document: Mapping[str, Any]) -> float:
     """Return the time at which a scene ends at the latest [s]."""
     end = document["end"]
     return float(document["duration"] if end is None else end["at_most"])
+
+
+# ---- Bodies that are sharp against a cell
+
+
+def _radius_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
+    """Yield bodies with a smaller radius than cells can slide over (`RADIUS_LEAST`)."""
+    coarsest = max(sheets, key=lambda sheet: sheet.cell)
+    # The side of a cell is a rounded number, and radii are often multiples of it.
+    least = (1.0 - SLACK) * RADIUS_LEAST * coarsest.cell
+    for name, body in sorted(document["bodies"].items()):
+        if body["type"] in ("plane", "mesh"):
+            continue
+        is_box = body["type"] == "box"
+        radius = box_rounding(body, coarsest.cell) if is_box else body["radius"]
+        if radius >= least:
+            continue
+        is_thin = is_box and body["rounding"] is None
+        member = "size" if is_thin else "rounding" if is_box else "radius"
+        asked = f"{2 * RADIUS_LEAST:g} cells thick" if is_thin else f"{RADIUS_LEAST:g} cells"
+        # Rounded up, so that the number that the message names is enough.
+        metres = np.ceil(1e6 * (2 * least if is_thin else least)) / 1e6
+        rule = (
+            f"must be at least {asked}, which is {metres:g} m with the sheet "
+            f"{coarsest.name}: cells of {coarsest.cell:.3g} m catch on what is sharper; make it "
+            "larger, or the sheet finer"
+        )
+        yield StartFault(("bodies", name, member), rule, body[member])
 
 
 # ---- Starts in and across others

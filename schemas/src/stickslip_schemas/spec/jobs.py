@@ -131,8 +131,13 @@ class Render(Document):
     resolution: Resolution = resolution_field("of pictures by cameras of a rig or of the sample")
 
     @property
-    def pixels(self) -> int:
-        """How many pixels are rendered together; memory grows with them."""
+    def frame_pixels(self) -> int:
+        """How many pixels a frame of a clip has; memory grows with them."""
+        return 0
+
+    @property
+    def clip_pixels(self) -> int:
+        """How many pixels all frames of a clip have together; memory grows with them, too."""
         return 0
 
     @property
@@ -329,6 +334,13 @@ class JobSpec(Document):
         return {}
 
     # What pages show of a sample. A kind answers, so that common code knows no kind.
+
+    def picture_part(self, point: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Return width and height of the picture of a sample in its frames [px].
+
+        None if pictures fill their frames.
+        """
+        return None
 
     def looks_arrays(self) -> tuple[ArrayLayout, ...]:
         """Return the arrays that say how the samples look: pictures, cameras, light."""

@@ -212,8 +212,8 @@ def sealer(settings: Settings) -> Fernet:
 
     Raise SettingsError for a key of another form.
     """
-    given = settings.secrets_key
-    key = secret_in(settings.data / "secrets-key") if given is None else given.get_secret_value()
+    secret = settings.secrets_key
+    key = secret_in(settings.data / "secrets-key") if secret is None else secret.get_secret_value()
     try:
         return Fernet(key.rstrip("=") + "=")
     except ValueError:

@@ -94,7 +94,7 @@ class Feeds:
         self._feeds: dict[int, _Feed] = {}
 
     def stream(self, job: int, *, after: int) -> StreamingResponse:
-        """Answer with the events of a job after the one with the id `after`."""
+        """Answer with the events of a job whose ids are above `after`."""
         # No cache may keep events, and no proxy may buffer them.
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         return EventStream(self._watch(job, after), headers=headers, media_type="text/event-stream")

@@ -10,7 +10,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, or_, select, update
 from stickslip_schemas.base import Sha256, sha256
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion, Page
 from stickslip_schemas.documents.tasks import (
@@ -235,16 +235,36 @@ def damaged_files(
     }
 
 
-def list_datasets(connection: Connection, page: PageRequest) -> Page[Dataset]:
-    """Return a page of datasets, newest first."""
+def list_datasets(
+    connection: Connection, page: PageRequest, search: str = "", *, newest_first: bool = True
+) -> Page[Dataset]:
+    """Return a page of datasets; `search` keeps those that have it in the id, kind or name."""
     to_dataset = partial(_dataset_of, connection)
+    query = select(datasets).where(_is_visible_dataset())
+    if search:
+        query = query.where(_matches(search))
     return read_page(
         connection,
-        select(datasets).where(_is_visible_dataset()),
+        query,
         page,
         datasets.c.seq,
         lambda rows: map(to_dataset, rows),
+        newest_first=newest_first,
     )
+
+
+def _matches(search: str) -> ColumnElement[bool]:
+    """Return the condition that a dataset has a text in the id, kind, or a name that is shown."""
+    columns = [datasets.c.id, datasets.c.kind]
+    # The first name may be that of another project, which a search must not tell.
+    if current_principal().sees_all:
+        columns.append(datasets.c.name)
+    is_named = exists().where(
+        jobs.c.dataset == datasets.c.id,
+        is_visible_project(jobs.c.project),
+        jobs.c.name.icontains(search, autoescape=True),
+    )
+    return or_(is_named, *(column.icontains(search, autoescape=True) for column in columns))
 
 
 def find_dataset(connection: Connection, dataset: str) -> Dataset:

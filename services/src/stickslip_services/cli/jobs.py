@@ -100,6 +100,9 @@ def _validate_offline(spec: JobSpec, url: str, *, as_json: bool) -> None:
 
 def _costs(costs: Estimate) -> Iterator[tuple[str, str]]:
     for stage, seconds in costs.stages.items():
+        # Rods without pictures have no render, for example.
+        if seconds.high == 0.0:
+            continue
         is_measured = stage in costs.measured
         source = "measured by this service" if is_measured else "by the package's records"
         yield f"CPU time, {stage}", f"{interval(seconds)}, {source}"

@@ -244,7 +244,7 @@ class Client:
         return self.job(job_id)
 
     def _messages(self, job_id: str, last_id: str) -> Iterator[Message]:
-        """Yield the messages of a job's stream that follow the one with the id `last_id`."""
+        """Yield the messages of a job's stream after the message `last_id`."""
         # With the id of the last event, the coordinator continues after it.
         headers = {"Accept": "text/event-stream"}
         if last_id:

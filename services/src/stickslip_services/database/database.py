@@ -128,12 +128,12 @@ def document_of(model: type[M], row: object, **more: object) -> M:
 
     Times, in seconds since 1970, become dates in UTC.
     """
-    found = {
+    fields = {
         name: getattr(row, name)
         for name in model.model_fields
         if name not in more and hasattr(row, name)
     }
-    return model.model_validate(found | more)
+    return model.model_validate(fields | more)
 
 
 def read_page(
@@ -153,11 +153,11 @@ def read_page(
     if page.after is not None:
         query = query.where(position < page.after if newest_first else position > page.after)
     rows = connection.execute(query).all()
-    shown = rows[: page.size]
+    rows_of_page = rows[: page.size]
     token = (
-        str(getattr(shown[-1], position.key)) if len(rows) > page.size else None
+        str(getattr(rows_of_page[-1], position.key)) if len(rows) > page.size else None
     )  # one row more than a page
-    return Page[T](items=tuple(items(shown)), next_page_token=token)
+    return Page[T](items=tuple(items(rows_of_page)), next_page_token=token)
 
 
 _PRAGMAS = (

@@ -42,11 +42,11 @@ def connect(settings: Settings, role: Role = Role.coordinator) -> Database:
 
 def migration(connection: Connection) -> Config:
     """Return Alembic's configuration for an open transaction."""
-    made = Config()
-    made.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    made.set_main_option("path_separator", "os")
-    made.attributes["connection"] = connection
-    return made
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    config.attributes["connection"] = connection
+    return config
 
 
 def upgrade(connection: Connection) -> None:
@@ -82,8 +82,8 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
         revision = _postgresql_revision(settings, role)
     name = settings.database_name
     if revision is None and with_store and _has_versions(settings):
-        given = {"--store": settings.store, "--database": settings.database}
-        same = " and ".join(option for option, value in given.items() if value is not None)
+        options = {"--store": settings.store, "--database": settings.database}
+        same = " and ".join(option for option, value in options.items() if value is not None)
         raise DatabaseRefusedError(
             f"{settings.store_place} holds datasets, and the database {name} is gone: run "
             "`stickslip reindex --data "
@@ -144,9 +144,9 @@ def _sqlite_revision(path: Path) -> str | None:
     revision = None
     try:
         with closing(sqlite3.connect(path, timeout=30)) as connection:
-            (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            (finding,) = connection.execute("PRAGMA quick_check(1)").fetchone()
             if (
-                found == "ok"
+                finding == "ok"
                 and connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
             ):
                 (revision,) = connection.execute(
@@ -159,10 +159,10 @@ def _sqlite_revision(path: Path) -> str | None:
             f"{path} is not a database of stickslip: move it away, or name another --data"
         ) from error
     except sqlite3.DatabaseError as error:
-        found = str(error)
-    if found != "ok":
+        finding = str(error)
+    if finding != "ok":
         raise DatabaseRefusedError(
-            f"{path} is damaged ({found.splitlines()[-1]}): move it away and run "
+            f"{path} is damaged ({finding.splitlines()[-1]}): move it away and run "
             f"`stickslip reindex --data {path.parent}`, which finds the datasets in the store again"
         )
     return revision

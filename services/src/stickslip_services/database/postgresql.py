@@ -88,18 +88,21 @@ class PostgresqlDatabase(Database):
         """Identifies the announcements of this process."""
         self._role = role
         self._durable = durable
-        given = {name: value for name, value in _CONNECT.items() if name not in url.query}
+        arguments = {name: value for name, value in _CONNECT.items() if name not in url.query}
         # 24 readers, 4 touchers, a writer: three coordinators fit into the 100 connections of a
         # server by default.
         reader = create_engine(
-            url, paramstyle="format", connect_args=given, pool_size=8, max_overflow=16
+            url, paramstyle="format", connect_args=arguments, pool_size=8, max_overflow=16
         )
         writer = create_engine(
-            url, paramstyle="format", connect_args=given, pool_size=1, max_overflow=0
+            url, paramstyle="format", connect_args=arguments, pool_size=1, max_overflow=0
         )
-        own = {"pool_size": 4, "max_overflow": 0, "isolation_level": "AUTOCOMMIT"}
-        self._toucher = create_engine(url, paramstyle="format", connect_args=given, **own)
-        self._arguments: dict[str, Any] = {**writer.dialect.create_connect_args(url)[1], **given}
+        pool = {"pool_size": 4, "max_overflow": 0, "isolation_level": "AUTOCOMMIT"}
+        self._toucher = create_engine(url, paramstyle="format", connect_args=arguments, **pool)
+        self._arguments: dict[str, Any] = {
+            **writer.dialect.create_connect_args(url)[1],
+            **arguments,
+        }
         for engine in (reader, writer, self._toucher):
             event.listen(
                 engine,

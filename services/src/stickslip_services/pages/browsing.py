@@ -1,14 +1,14 @@
 """Contents of the page of a dataset version: filters, chosen samples, and distributions."""
 
+import shlex
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout
-from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.arrays import ArrayLayout
 
+from stickslip_services.pages.choosing import Query, choose, sliders, sortable
 from stickslip_services.pages.rendering import grid_maps
 from stickslip_services.pages.samples import SampleData
 
@@ -18,11 +18,8 @@ THUMB_SIDE = 112
 SHOWN_THUMBS = 48
 """Samples that a page shows at once."""
 
-MAX_STOPS = 101
-"""Stops of a slider: one at each percent if an axis has more values."""
-
-MAX_INDEX_DIGITS = 8
-"""Digits of the index of a slider's value in an address."""
+SHOWN_SHARDS = 12
+"""Files of an array that the page of a version links to."""
 
 BARS = (5, 20)
 """Fewest and most bars of a histogram."""
@@ -33,51 +30,58 @@ VALUES_PER_BAR = 4
 GROUPS = ("Parameters", "Looks", "Physics", "Checks")
 """Groups of labels, in the order of the pages."""
 
-Flags = npt.NDArray[np.bool_]
-Slider = dict[str, Any]
+_PLACES = ("start", "part")
+"""Parts of a query that say which samples a page shows, and not which are chosen."""
 
 
-def sliders(spec: JobSpec) -> list[Slider]:
-    """Return the names of the axes with more than one value, and at most `MAX_STOPS` values each.
-
-    The values are in order.
-    """
-    found = []
-    for name, column in zip(spec.named_axes, spec.columns(), strict=True):
-        values = sorted(set(column))
-        if len(values) > MAX_STOPS:
-            stops = np.unique(np.linspace(0, len(values) - 1, MAX_STOPS).astype(int))
-            values = [values[stop] for stop in stops]
-        if len(values) > 1:
-            found.append({"name": name, "values": values})
-    return found
-
-
-def thumbs(data: SampleData, query: Mapping[str, str], start: int) -> dict[str, Any]:
-    """Return the context of `thumbs.html`: the samples within the filters, from number `start` on.
-
-    The query has the ends of each slider, `NAME.from` and `NAME.to`, as indices into its values;
-    `split`, the name of a split; `valid`, yes or no; and `psnr`, the least PSNR of the cloth [dB].
-    """
-    axes = sliders(data.manifest.spec)
-    slots = np.flatnonzero(_within_filters(data, axes, query))
+def thumbs(data: SampleData, query: Query, start: int) -> dict[str, Any]:
+    """Return the context of `thumbs.html`: the chosen samples from number `start` on."""
+    choice = choose(data, query)
+    count = len(choice.slots)
     end = start + SHOWN_THUMBS
     # Of a clip, the middle picture is shown; of a rod, the first view.
     pictured = picture_array(data)
     pictures = None if pictured is None else data.arrays[pictured]
     is_clip = pictures is not None and pictures.dimensions[0] == "frame"
     middle = pictures.shape[0] // 2 if pictures is not None and is_clip else 0
-    columns = {axis["name"]: data.label(axis["name"]) for axis in axes}
+    names = [axis["name"] for axis in sliders(data.manifest.spec)]
+    # The label by which samples are sorted is shown with them.
+    is_sorted_by = {array.name: array.name == query.get("sort") for array in sortable(data)}
+    names += [name for name, is_shown in is_sorted_by.items() if is_shown and name not in names]
+    columns = {name: data.label(name) for name in names}
     return {
-        "thumbs": [_thumb(data, columns, slot) for slot in slots[start:end].tolist()],
-        "chosen": len(slots),
-        "next_start": end if end < len(slots) else None,
-        "kept_query": {name: value for name, value in query.items() if name != "start"},
-        "has_psnr": "psnr_cloth" in data.arrays,
+        "thumbs": [_thumb(data, columns, slot) for slot in choice.slots[start:end]],
+        "chosen": count,
+        "start": start,
+        "next_start": end if end < count else None,
+        "last_start": max(count - 1, 0) // SHOWN_THUMBS * SHOWN_THUMBS,
+        "fault": choice.fault,
+        "pull_options": shlex.join(choice.options),
+        "kept_query": {name: value for name, value in query.items() if name not in _PLACES},
         "pictured": pictured,
         "picture_index": middle,
         "picture_step": 1 if pictures is None else max(1, min(pictures.shape[1:3]) // THUMB_SIDE),
     }
+
+
+def shards(data: SampleData) -> list[dict[str, Any]]:
+    """Return the arrays of a version with their files: the first `SHOWN_SHARDS` of each.
+
+    A file has its path, and the first and the last of its samples.
+    """
+    spec = data.manifest.spec
+    count = data.manifest.sample_count
+    tables = []
+    for array in data.arrays.values():
+        samples = spec.samples_per_file(array)
+        file_count = -(-count // samples)
+        files = [
+            (array.shard_path(number), number * samples, min((number + 1) * samples, count) - 1)
+            for number in range(min(file_count, SHOWN_SHARDS))
+        ]
+        # What is not one value, such as a clip, comes first: it is what people look for.
+        tables.append({"array": array, "files": files, "more": file_count - len(files)})
+    return sorted(tables, key=lambda table: bool(table["array"].is_label))
 
 
 def _thumb(
@@ -89,48 +93,6 @@ def _thumb(
         for name, column in columns.items()
     }
     return slot, point, data.rejection(slot)
-
-
-def _within_filters(data: SampleData, axes: list[Slider], query: Mapping[str, str]) -> Flags:
-    """Return which samples are within all filters, by slot."""
-    within = np.ones(data.manifest.sample_count, dtype=bool)
-    for axis in axes:
-        within &= _within_slider(data, axis, query)
-    split = query.get("split")
-    if split in SPLITS:
-        within &= data.label("split") == SPLITS.index(split)
-    validity = query.get("valid")
-    if validity in ("yes", "no"):
-        within &= data.label("valid").astype(bool) == (validity == "yes")
-    # A dataset without clips has no PSNR, and the field may hold no number.
-    with suppress(ValueError, KeyError):
-        within &= np.asarray(data.label("psnr_cloth"), dtype=float) >= float(query["psnr"])
-    return within
-
-
-def _within_slider(data: SampleData, axis: Slider, query: Mapping[str, str]) -> Flags:
-    """Return which samples are between the two ends of a slider."""
-    values = axis["values"]
-    array = data.arrays[axis["name"]]
-    first = _index(query.get(f"{axis['name']}.from", ""), default=0)
-    last = _index(query.get(f"{axis['name']}.to", ""), default=len(values) - 1)
-    chosen = values[first : last + 1]
-    column = np.asarray(data.label(array.name), dtype=float)
-    if array.categories:
-        codes = [array.categories.index(str(value)) for value in chosen]
-        return np.isin(column, codes)
-    if len(chosen) == len(values):
-        # Also samples between two stops, and NaN.
-        return np.ones(len(column), dtype=bool)
-    if not chosen:
-        return np.zeros(len(column), dtype=bool)
-    return np.asarray((column >= min(chosen)) & (column <= max(chosen)))
-
-
-def _index(text: str, *, default: int) -> int:
-    """Return an index from an address, or the default if there is none."""
-    is_index = text.isdecimal() and len(text) <= MAX_INDEX_DIGITS
-    return int(text) if is_index else default
 
 
 def losses(data: SampleData) -> dict[str, Any]:
@@ -180,6 +142,14 @@ def _is_numeric_label(array: ArrayLayout) -> bool:
 def _bars(values: npt.NDArray[np.float64]) -> list[tuple[int, float, float, float]]:
     """Return count, height [% of the highest] and ends of each bar of a histogram."""
     fewest, most = BARS
+    distinct, numbers = np.unique(values, return_counts=True)
+    # A grid has few values, and bins between them would be empty.
+    if len(distinct) <= most:
+        highest = int(numbers.max())
+        return [
+            (int(number), 100 * number / highest, value, value)
+            for value, number in zip(distinct, numbers, strict=True)
+        ]
     bar_count = min(most, max(fewest, values.size // VALUES_PER_BAR))
     counts, bounds = np.histogram(values, bins=bar_count)
     highest = max(int(counts.max()), 1)

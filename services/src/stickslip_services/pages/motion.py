@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from stickslip_schemas.scene.shapes import with_roundings
+from stickslip_schemas.scene.sheets import start_of
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_services.pages.samples import SampleData
@@ -129,9 +131,10 @@ def _bodies(data: SampleData, slot: int) -> list[Body]:
     scene = spec.sample_scene(numbers, data.store.read)
     if scene is None:
         return bodies
+    cell = max(start_of(name, sheet).cell for name, sheet in scene["sheets"].items())
     poses = np.asarray(data.read("body_pose", slot), dtype=float)
     times = np.arange(len(poses)) / scene["frame_rate"]
-    for number, (name, document) in enumerate(scene["bodies"].items()):
+    for number, (name, document) in enumerate(with_roundings(scene["bodies"], cell).items()):
         body = {key: document[key] for key in _SHOWN_FIELDS if key in document}
         body["name"] = name
         body["poses"] = poses[:, number]

@@ -21,16 +21,23 @@ CONSTANT_RATE_FACTOR = "18"
 """Quality of H.264, at which the eye sees no loss."""
 
 
+Range = tuple[float, float]
+"""Least and largest number of a clip, or of several that are compared."""
+
+
 def coloured(
-    array: ArrayLayout, values: npt.NDArray[np.generic], indices: Iterable[int]
+    array: ArrayLayout,
+    values: npt.NDArray[np.generic],
+    indices: Iterable[int],
+    scale: Range | None = None,
 ) -> Iterator[Picture]:
     """Yield frames of pictures or of ground truth (y, x, 3) as sRGB.
 
-    Codes get a colour each. Numbers are scaled by their range over the clip.
+    Codes get a colour each. Numbers are scaled by a range, by default theirs over the clip.
     """
     # The range is that of all frames, so it is looked up once.
     is_number = array.dimensions[-1] != "rgb" and "categories" not in array.attributes
-    low, high = _range(values) if is_number else (0.0, 0.0)
+    low, high = _balanced(scale or range_of(values)) if is_number else (0.0, 0.0)
     for index in indices:
         frame = values[index]
         if is_number:
@@ -41,8 +48,8 @@ def coloured(
             yield np.asarray(_PALETTE[frame % len(_PALETTE)])
 
 
-def _range(values: npt.NDArray[np.generic]) -> tuple[float, float]:
-    """Return the least and the largest finite number of a clip; of two signs, they are opposite."""
+def range_of(values: npt.NDArray[np.generic]) -> Range:
+    """Return the least and the largest finite number of a clip; (0, 0) without any."""
     low, high = np.inf, -np.inf
     # Frame by frame, for a clip of large pictures has gigabytes.
     for frame in values:
@@ -50,8 +57,12 @@ def _range(values: npt.NDArray[np.generic]) -> tuple[float, float]:
         if finite.size:
             low = min(low, float(finite.min()))
             high = max(high, float(finite.max()))
-    if high < low:
-        return 0.0, 0.0
+    return (0.0, 0.0) if high < low else (low, high)
+
+
+def _balanced(scale: Range) -> Range:
+    """Return a range whose ends are opposite if it has numbers of two signs."""
+    low, high = scale
     if low < 0.0:
         # Of two signs: grey is 0.
         high = max(-low, high)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 import yaml
 from fastapi import Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.addresses import prefix, url
@@ -29,6 +30,7 @@ STATIC = Path(__file__).parent / "static"
 _POLICY = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+        "media-src 'self' blob:; "
         "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     ),
     "Referrer-Policy": "same-origin",
@@ -68,6 +70,13 @@ def spec_text(spec: JobSpec) -> str:
         if axis["type"] == "list":
             values = axis["values"]
             document["axes"][name] = values[0] if len(values) == 1 else values
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
+
+
+def scene_text(scene: Scene) -> str:
+    """Return the document of a scene as YAML."""
+    # As it was written: without its defaults, a document would lose the types of its parts.
+    document = scene.model_dump(mode="json", exclude_unset=True)
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 

@@ -1,6 +1,6 @@
 """Contents of the page of a sample: stills, the layers of the clip, plots, and labels in groups."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum, auto
 from math import prod
 from typing import Any
@@ -9,8 +9,9 @@ import numpy as np
 from stickslip_schemas.spec.arrays import ArrayLayout
 
 from stickslip_services.pages.browsing import GROUPS, groups_of, picture_array
+from stickslip_services.pages.choosing import sliders
 from stickslip_services.pages.motion import is_path
-from stickslip_services.pages.rendering import plot, table
+from stickslip_services.pages.rendering import number, plot, table
 from stickslip_services.pages.samples import SampleData
 
 MAX_CURVES = 4
@@ -80,6 +81,7 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         # A frame of a clip shows one of the instants of the motion.
         shown_instants = clip.attributes.get("instants", frames)
 
+    groups = _labels(data, names[View.label], slot)
     timed = [array for array in data.arrays.values() if array.dimensions[:1] == ("instant",)]
     return {
         "slot": slot,
@@ -96,7 +98,8 @@ def sample_view(data: SampleData, slot: int) -> dict[str, Any]:
         "plots": [_plot(data, name, slot) for name in names[View.plot]],
         "paths": bool(names[View.path]),
         "has_contact": any(name.endswith(".contact") for name in data.arrays),
-        "groups": _labels(data, names[View.label], slot),
+        "groups": groups,
+        "caption": _caption(data, groups),
     }
 
 
@@ -105,6 +108,35 @@ def _size(data: SampleData, name: str, slot: int) -> tuple[int, int]:
     height, width = data.arrays[name].shape[1:3]
     size = data.picture_size(slot)
     return (width, height) if size is None else (int(size[0]), int(size[1]))
+
+
+def overlaid(views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the plots of one sample, or those of two with the curves of both on one scale."""
+    if len(views) == 1:
+        plots: list[dict[str, Any]] = views[0]["plots"]
+        return plots
+    joined = []
+    for of_samples in zip(*(view["plots"] for view in views), strict=True):
+        tables = []
+        for position, (view, of_sample) in enumerate(zip(views, of_samples, strict=True)):
+            for part in of_sample["tables"]:
+                # A curve names its sample, and those of the second one are dashed.
+                curves = {
+                    f"sample {view['slot']}: {name}": values
+                    for name, values in part["curves"].items()
+                }
+                tables.append({**part, "curves": curves, "dashed": position > 0})
+        joined.append({**of_samples[0], "tables": tables})
+    return joined
+
+
+def _caption(data: SampleData, groups: Mapping[str, Mapping[str, tuple[object, str]]]) -> str:
+    """Return the parameters of a sample that differ between samples, for example `mu 0.3`."""
+    varied = {axis["name"] for axis in sliders(data.manifest.spec)}
+    parameters = groups.get("Parameters", {})
+    return ", ".join(
+        f"{name} {number(value)}" for name, (value, _) in parameters.items() if name in varied
+    )
 
 
 def _labels(
@@ -116,6 +148,9 @@ def _labels(
     for name in names:
         array = data.arrays[name]
         value = data.named(array, data.read(name, slot))
+        # A seed counts nothing, so its digits are not grouped.
+        if name.endswith("seed"):
+            value = str(value)
         # The name of a code says enough.
         description = "" if array.categories else array.description
         groups[group_of[name]][name] = (value, description)

@@ -4,6 +4,7 @@ A field has the name of its place in the spec: `quality`, or `axes.mu.values`. W
 field for, such as custom textures, is written as YAML in the field `more`.
 """
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -180,7 +181,8 @@ def _setting(name: str, schema: Schema, whole: Schema) -> Setting | None:
     choices = _choices(schema)
     kind = "choice" if choices else _SCALARS.get(str(schema.get("type")))
     if schema.get("type") == "array":
-        choices = _choices(_resolved(schema["items"], whole))
+        # A tuple, such as a size, has no single kind of item, and no field.
+        choices = _choices(_resolved(schema.get("items", {}), whole))
         kind = "several" if choices else None
     if kind is None:
         return None
@@ -347,6 +349,11 @@ def _more(sent: Sent) -> dict[str, Any]:
         raise FormError("more", f"is not YAML: {' '.join(str(error).split())[:300]}") from error
     if not isinstance(document, dict):
         raise FormError("more", "must be keys of a spec with their values, such as `seed: 7`")
+    # Tags such as `!!binary` and `!!set` make values that a spec, which is JSON, cannot hold.
+    try:
+        json.dumps(document)
+    except TypeError as error:
+        raise FormError("more", f"must have values that JSON has, too: {error}") from error
     return document
 
 

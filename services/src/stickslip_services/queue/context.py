@@ -132,12 +132,12 @@ class Notifier:
             with suppress(RuntimeError):  # the loop is closed: nobody waits there any more
                 loop.call_soon_threadsafe(event.set)
 
-    async def wait(self, seen: int, timeout: float) -> None:
-        """Return when there have been more than `seen` notifications, or after `timeout` [s]."""
+    async def wait(self, since: int, timeout: float) -> None:
+        """Return when there have been more than `since` notifications, or after `timeout` [s]."""
         entry = (asyncio.get_running_loop(), asyncio.Event())
         with self._lock:
             # A notification may have come between the caller's look for news and this call.
-            if self.count != seen:
+            if self.count != since:
                 return
             self._waiting.add(entry)
         try:

@@ -175,14 +175,14 @@ def pooled(costs: Mapping[Group, Cost], stage: Stage, kind: str) -> StageTimings
 
     Returns None if no group is known.
     """
-    found = [
+    shares = [
         cost.share
         for (of_stage, of_kind, _), cost in costs.items()
         if (of_stage, of_kind) == (stage, kind) and cost.is_known
     ]
-    if not found:
+    if not shares:
         return None
-    mean = sum(share.total for share in found) / sum(share.count for share in found)
+    mean = sum(share.total for share in shares) / sum(share.count for share in shares)
     return StageTimings(1, mean, mean**2)
 
 

@@ -93,8 +93,8 @@ def _end_or_rerun(
         return  # cancelled, or ended by another check
     if damaged is not None and not damaged:
         # The check has read every file, so the scrub need not read them soon.
-        own = dataset_versions.c.publish_task == dataset.publish_task
-        intact = update(dataset_versions).where(own).values(scrubbed_at=tx.now, damaged=0)
+        is_version = dataset_versions.c.publish_task == dataset.publish_task
+        intact = update(dataset_versions).where(is_version).values(scrubbed_at=tx.now, damaged=0)
         tx.connection.execute(intact)
         version = find_committed(tx.connection, dataset.publish_task)
         complete_job(tx, dataset.seq, version, "every result was cached")

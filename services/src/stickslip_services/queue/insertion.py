@@ -40,7 +40,7 @@ from stickslip_services.queue.integrity import (
 from stickslip_services.queue.job_states import set_job_state
 from stickslip_services.queue.plan import Plan, PlannedTask
 from stickslip_services.queue.ready import add_ready
-from stickslip_services.queue.rerun import RESET_ATTEMPTS, reset_tasks, wait_for
+from stickslip_services.queue.rerun import RESET_ATTEMPTS, add_dependencies, reset_tasks
 from stickslip_services.queue.rows import HAS_RESULT, PlanInputs, SampleRow, task_columns
 from stickslip_services.queue.transaction import QueueTransaction
 
@@ -91,21 +91,21 @@ def insert_piece(tx: QueueTransaction, job: int, piece: Plan) -> None:
     (`existing_datasets`).
     """
     known = _insert_plan(tx, job, piece)
-    own = jobs.c.seq == job
-    tx.connection.execute(update(jobs).where(own).values(planned=piece.end))
+    is_job = jobs.c.seq == job
+    tx.connection.execute(update(jobs).where(is_job).values(planned=piece.end))
     key = piece.publish_key
     if key is None:
         return
     publish_task = tx.connection.scalar(select(tasks.c.seq).where(tasks.c.key == key))
     # The plan is complete, so the claim of the planner ends with it.
     planned = {"publish_task": publish_task, "planner": None, "planner_until": None}
-    tx.connection.execute(update(jobs).where(own).values(planned))
+    tx.connection.execute(update(jobs).where(is_job).values(planned))
     # A dataset in the database may be damaged in the store, so it is checked before the job ends.
     if key in known and known[key].state == TaskState.succeeded:
         message = "the dataset exists already: its files are being checked"
         set_job_state(tx, job, JobState.queued, message=message)
         return
-    row = tx.connection.execute(select(jobs.c.state, jobs.c.started_at).where(own)).one()
+    row = tx.connection.execute(select(jobs.c.state, jobs.c.started_at).where(is_job)).one()
     if row.state == JobState.planning:
         # Workers may have run tasks of earlier pieces during the planning.
         started = row.started_at is not None
@@ -280,7 +280,7 @@ def _rewire(
         tx.connection.execute(update(tasks).where(tasks.c.seq.in_(batch)).values(waiting_on=0))
     # Without edges each task waits for nothing. This counts its missing results anew.
     for seq in wrong:
-        wait_for(tx, seq, sorted(expected[seq]))
+        add_dependencies(tx, seq, sorted(expected[seq]))
 
 
 class _NewTasks:

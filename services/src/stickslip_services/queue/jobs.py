@@ -191,6 +191,22 @@ def list_samples(
     )
 
 
+def lost_slots(connection: Connection, job: int) -> list[int]:
+    """Return the slots of a job of which any task was rejected or failed, in order.
+
+    The render of a failed simulation never runs, so the state of the last task alone does not tell.
+    """
+    is_of_sample = tasks.c.seq.in_((samples.c.simulate_task, samples.c.render_task))
+    query = (
+        select(samples.c.slot)
+        .join(tasks, is_of_sample)
+        .where(samples.c.job == job, tasks.c.state.in_((TaskState.rejected, TaskState.failed)))
+        .distinct()
+        .order_by(samples.c.slot)
+    )
+    return list(connection.scalars(query))
+
+
 class _JobOfSamples(NamedTuple):
     seq: int
     planned: int
@@ -281,7 +297,7 @@ class StoredEvent:
 
 
 def read_events(connection: Connection, job: int, *, after: int, limit: int) -> list[StoredEvent]:
-    """Return the events of a job after the one with the id `after`."""
+    """Return the events of a job whose ids are above `after`."""
     query = select(events.c.id, events.c.name, events.c.data).where(
         events.c.job == job, events.c.id > after
     )

@@ -71,14 +71,14 @@ def remove(database: Database, store: Store, dataset: str, version: int) -> tupl
     """
     with database.write() as connection:
         columns = dataset_versions.c
-        own = (columns.dataset == dataset, columns.version == version)
-        publish_task = connection.scalar(select(columns.publish_task).where(*own))
+        is_version = (columns.dataset == dataset, columns.version == version)
+        publish_task = connection.scalar(select(columns.publish_task).where(*is_version))
         if publish_task is None and not store.is_shown(dataset, version):
             raise NotFoundError(f"there is no version {version} of a dataset {dataset[:100]!r}")
         jobs_, tasks_ = 0, 0
         if publish_task is not None:
             jobs_, tasks_ = _remove_jobs(connection, publish_task)
-            connection.execute(delete(dataset_versions).where(*own))
+            connection.execute(delete(dataset_versions).where(*is_version))
             if (
                 connection.scalar(
                     select(columns.version).where(columns.dataset == dataset).limit(1)
@@ -168,7 +168,7 @@ def needed_artifacts(database: Database, store: Store) -> set[bytes]:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class IndexedVersion:
     """A version of the store, and whether it was inserted."""
 
     name: str
@@ -179,25 +179,25 @@ class Found:
     is_new: bool = True
 
 
-def reindex(database: Database, store: Store) -> Iterator[Found]:
+def reindex(database: Database, store: Store) -> Iterator[IndexedVersion]:
     """Insert the versions that only the store has, one transaction each.
 
     Yields all versions of the store.
     """
-    for shown in store.versions(MANIFEST_NAME):
-        name = f"{shown.dataset}:v{shown.version}"
+    for version in store.versions(MANIFEST_NAME):
+        name = f"{version.dataset}:v{version.version}"
         try:
-            manifest, output = _read(store, shown)
+            manifest, output = _read(store, version)
         except (OSError, ValueError) as error:
-            yield Found(name, 0, str(error).splitlines()[0])
+            yield IndexedVersion(name, 0, str(error).splitlines()[0])
             continue
-        is_new = _insert(database, store, manifest, output, shown.modified_at)
-        yield Found(name, manifest.sample_count, "", is_new)
+        is_new = _insert(database, store, manifest, output, version.modified_at)
+        yield IndexedVersion(name, manifest.sample_count, "", is_new)
 
 
-def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
+def _read(store: Store, version: ShownVersion) -> tuple[Manifest, PublishOutput]:
     """Read a version, and restore lost artifacts from the files of the version."""
-    place = shown.dataset, shown.version
+    place = version.dataset, version.version
     content, group, seal = (
         store.read_shown(*place, name) for name in (MANIFEST_NAME, GROUP_NAME, SEAL_NAME)
     )
@@ -205,17 +205,17 @@ def _read(store: Store, shown: ShownVersion) -> tuple[Manifest, PublishOutput]:
     manifest = Manifest.model_validate_json(content)
     if (manifest.spec.dataset_id, manifest.version) != place:
         raise ValueError(f"the manifest is that of {manifest.spec.dataset_id}, v{manifest.version}")
-    own = sealed_digests(sha256(content), sha256(group))
+    digests = sealed_digests(sha256(content), sha256(group))
     listed = list(Contents(manifest, lambda file: store.read_shown(*place, file.path)).files())
 
-    def put_back(shown: tuple[str, Sha256]) -> None:
-        path, digest = shown
+    def put_back(entry: tuple[str, Sha256]) -> None:
+        path, digest = entry
         if not store.exists(digest, size=1):
             store.publish(store.read_shown(*place, path))
 
-    in_parallel(put_back, (own | {file.path: file.sha256 for file in listed}).items())
+    in_parallel(put_back, (digests | {file.path: file.sha256 for file in listed}).items())
     size = sum(file.size for file in listed) + len(content) + len(group) + len(seal)
-    output = PublishOutput(manifest=own[MANIFEST_NAME], group=own[GROUP_NAME], bytes=size)
+    output = PublishOutput(manifest=digests[MANIFEST_NAME], group=digests[GROUP_NAME], bytes=size)
     read_version(store, output)  # every file is there
     return manifest, output
 

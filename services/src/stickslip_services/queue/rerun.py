@@ -55,11 +55,11 @@ _PRODUCERS = RowQuery(
 def rerun_producers(tx: QueueTransaction, consumer: int, digests: Collection[Sha256]) -> None:
     """Reset the tasks that produced `digests`, and let the task `consumer` wait for them."""
     producers = _find_producers(tx, consumer, set(digests))
-    wait_for(tx, consumer, [producer.seq for producer in producers])
+    add_dependencies(tx, consumer, [producer.seq for producer in producers])
     reset_results(tx, producers)
 
 
-def wait_for(tx: QueueTransaction, consumer: int, producers: Sequence[int]) -> None:
+def add_dependencies(tx: QueueTransaction, consumer: int, producers: Sequence[int]) -> None:
     """Let a task depend on other tasks, too."""
     known = set(_DEPENDS_ON.values(tx.connection, {"b_task": consumer}))
     missing = [seq for seq in producers if seq not in known]

@@ -66,10 +66,10 @@ def scrub(context: Context, *, before: float, rate: float = inf) -> tuple[str, l
     files = damaged_files(context.store, version.manifest, version.group_digest, rate=rate)
     damaged = [MANIFEST_NAME] if files is None else sorted(files)
     with context.transaction() as tx:
-        own = update(dataset_versions).where(
+        statement = update(dataset_versions).where(
             dataset_versions.c.publish_task == version.publish_task
         )
-        tx.connection.execute(own.values(scrubbed_at=tx.now, damaged=len(damaged)))
+        tx.connection.execute(statement.values(scrubbed_at=tx.now, damaged=len(damaged)))
         if damaged:
             _recompute(tx, version.publish_task)
 

@@ -58,12 +58,12 @@ def idle_jobs(connection: Connection, now: float) -> list[IdleJob]:
 
     Progress is the result of a task, or an event of the job. `now` is in seconds since 1970.
     """
-    jobs: list[IdleJob] = []
+    idle: list[IdleJob] = []
     for row in _ACTIVE_JOBS.rows(connection):
         progress_at = max(row.created_at, row.result_at or 0.0, row.event_at or 0.0)
-        jobs.append(IdleJob(row.id, max(0.0, now - progress_at)))
-    jobs.sort(key=lambda job: job.seconds, reverse=True)
-    return jobs[:MAX_IDLE_JOBS]
+        idle.append(IdleJob(row.id, max(0.0, now - progress_at)))
+    idle.sort(key=lambda job: job.seconds, reverse=True)
+    return idle[:MAX_IDLE_JOBS]
 
 
 def silent_workers(connection: Connection, now: float) -> list[SilentWorker]:
@@ -71,8 +71,8 @@ def silent_workers(connection: Connection, now: float) -> list[SilentWorker]:
 
     A worker that has been silent for a day is left out. `now` is in seconds since 1970.
     """
-    workers: list[SilentWorker] = []
+    silent: list[SilentWorker] = []
     for worker in present_workers(connection, seen_since=now - FORGET_SECONDS):
         if worker.condition.state != "stopped":
-            workers.append(SilentWorker(worker.name, max(0.0, now - worker.last_seen_at)))
-    return workers
+            silent.append(SilentWorker(worker.name, max(0.0, now - worker.last_seen_at)))
+    return silent

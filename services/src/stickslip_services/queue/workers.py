@@ -205,7 +205,7 @@ def running_tasks(
         .where(IS_LEASED, is_visible_project(jobs.c.project))
         .order_by(tasks.c.state.desc(), tasks.c.started_at)
     )
-    found: dict[str, list[responses.RunningTask]] = {}
+    tasks_of_worker: dict[str, list[responses.RunningTask]] = {}
     for owner, key, stage, state, started_at, job in rows:
         since = as_datetime(started_at) if state == "running" else None
         name = task_id(stage, key)
@@ -216,8 +216,8 @@ def running_tasks(
             since=since,
             frames=frames.get(name) if since else None,
         )
-        found.setdefault(owner, []).append(running)
-    return found
+        tasks_of_worker.setdefault(owner, []).append(running)
+    return tasks_of_worker
 
 
 def alive_workers(context: Context, connection: Connection) -> list[RegisteredWorker]:

@@ -160,13 +160,6 @@ CHECKS = (
         "the fabrics were measured up to 1 + 1/6; drops reach 1.09 and heaps 1.17",
     ),
     Check(
-        "sharpness",
-        "side of a cell over the radius of the sharpest edge, ball or rod that bore cloth",
-        lambda seen: 1.0 / seen.total.sharpest,
-        2.0,
-        "cells catch on what has less than half their side as radius",
-    ),
-    Check(
         "missed",
         "largest share of a quarter of a second in steps that are further off than twice the "
         "preset's step error, and that no shorter step may replace",

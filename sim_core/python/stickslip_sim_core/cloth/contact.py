@@ -7,6 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stickslip_sim_core._sim_core import radius_least
 from stickslip_sim_core.arrays import Floats, check_positive
 
 ORTHONORMAL = 1e-6
@@ -18,8 +19,13 @@ MU_MAX = 10.0
 ROUNDING = 5e-3
 """Default radius of the edges of a box [m].
 
-A box thinner than two of these radii has half its shortest edge as the radius. Cells of up to twice
-the radius slide over such an edge.
+A box thinner than two of these radii has half its shortest edge as the radius.
+"""
+
+RADIUS_LEAST: float = radius_least
+"""Least radius of a ball, a rod or the edges of a box, over the side of a cell.
+
+On what is sharper friction is not right, so `Cloth` refuses it (`contact/bodies.hpp`).
 """
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -193,6 +199,15 @@ def box(
     # `size` is the outer size. The radius grows the core by as much on every side.
     a, b, c = (0.5 * whole - radius).tolist()
     return Body(mu, 1, (a, b, c), radius, origin, rotation)
+
+
+def default_rounding(size: ArrayLike, cell: float) -> float:
+    """Return the radius of the edges of a box (3,) [m] in a scene that gives none [m].
+
+    It is 5 mm or what cloth with cells of a side [m] slides over, but at most half the shortest
+    edge.
+    """
+    return min(max(ROUNDING, RADIUS_LEAST * cell), 0.5 * float(np.min(size)))
 
 
 THICKNESS = 5e-4

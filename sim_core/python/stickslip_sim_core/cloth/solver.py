@@ -241,8 +241,7 @@ class Cloth:
     def pair_forces(self) -> PairForces:
         """Forces of pairs of closest points at the end of the last step.
 
-        The pairs are between cloth and cloth, and between cloth and triangles of surfaces or
-        skeletons of bodies.
+        The pairs are between cloth and cloth, and between cloth and triangles of surfaces.
         """
         return self._solver.pair_forces()
 

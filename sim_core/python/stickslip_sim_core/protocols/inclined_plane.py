@@ -133,11 +133,11 @@ class SlopeProtocol(MeshedProtocol):
         return slope if moved <= DRIFT_MAX else np.nan, mu
 
     def reported(self) -> dict[str, Setting]:
-        own = {
+        limits = {
             "force_scale_over_node_weight": self.force_share,
             "drift_mm": 1e3 * self.tally.largest,
         }
-        return super().reported() | own
+        return super().reported() | limits
 
 
 @dataclass(kw_only=True, eq=False)

@@ -215,17 +215,17 @@ class ClothProtocol(Protocol):
     """Thickness of cloth that touches cloth [m]."""
 
     def reported(self) -> dict[str, Setting]:
-        found: dict[str, Setting] = {
+        numbers: dict[str, Setting] = {
             "preset": self.solver.name,
             self.time_step_name: self.solver.time_step,
         }
         total = self.tally.total
         # Not every protocol counts its steps.
         if total.steps:
-            found |= {"steps": total.steps, "unconverged_steps": total.unconverged}
+            numbers |= {"steps": total.steps, "unconverged_steps": total.unconverged}
         if self.thickness is not None:
-            found["least_distance_over_thickness"] = total.least_distance / self.thickness
-        return found
+            numbers["least_distance_over_thickness"] = total.least_distance / self.thickness
+        return numbers
 
 
 @dataclass(kw_only=True, eq=False)

@@ -70,9 +70,9 @@ class PullOut(MeshedProtocol):
 
     def measure(self, mu: float, at: Mapping[str, Any]) -> tuple[float, float]:
         pulled = Pulled(mu, at["load"], self.solver, self.cells, self.kinds[at["mesh"]])
-        found = pulled.force()
+        force = pulled.force()
         self.tally.count(pulled.cloth)
-        return found
+        return force
 
 
 class Pulled:

@@ -119,14 +119,16 @@ class Curve:
 
     def as_dict(self) -> dict[str, Any]:
         """Return parameters, points and errors, and for three meshes also limits and orders."""
-        found = {
+        document = {
             name: getattr(self, name)
             for name in ("parameters", "x", "measured", "master", "errors")
         }
         if self.refinement:
-            found |= {name: getattr(self.refinement, name) for name in ("limit", "order", "cells")}
-            found |= {"limit_errors": self.limit_errors, "errors_by_mesh": self.errors_by_mesh}
-        return found
+            document |= {
+                name: getattr(self.refinement, name) for name in ("limit", "order", "cells")
+            }
+            document |= {"limit_errors": self.limit_errors, "errors_by_mesh": self.errors_by_mesh}
+        return document
 
     def _errors_of(self, values: Numbers) -> Numbers:
         return tuple(_relative_error(*pair) for pair in zip(values, self.master, strict=True))
@@ -182,14 +184,14 @@ class ProtocolResult:
             "passed",
             "build_hash",
         )
-        found: dict[str, Any] = _plain(
+        document: dict[str, Any] = _plain(
             {"x": self.x_name, "y": self.y_name, **{name: getattr(self, name) for name in numbers}}
         )
         settings = {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in self.settings.items()
         }
-        return found | {
+        return document | {
             "settings": settings,
             "curves": [_plain(curve.as_dict()) for curve in self.curves],
         }

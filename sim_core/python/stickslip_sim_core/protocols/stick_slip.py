@@ -113,13 +113,13 @@ class StickSlip(RefinedProtocol):
         pressed = strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[mesh])
         # Frictions beyond the triple point have no strain on the master curve.
         onset = np.sqrt(master_curves.stick_slip_strain(mu)) if mu in self.friction else ROOT
-        found = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
+        outcome = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
         if mesh == 0 and cells == self.cells[-1]:
-            self.diagram += _phases(mu, found, end)
-        if cells == self.cells[-1] and np.isfinite(found.static_error):
-            self.tally.note(found.static_error)
-        self.tally.count(found.cloth)
-        return found
+            self.diagram += _phases(mu, outcome, end)
+        if cells == self.cells[-1] and np.isfinite(outcome.static_error):
+            self.tally.note(outcome.static_error)
+        self.tally.count(outcome.cloth)
+        return outcome
 
     def reported(self) -> dict[str, Setting]:
         # The measured curve ends at the triple point, and the diagram does not.
@@ -192,19 +192,25 @@ def press(
     on_curve = (strain_at > 0.25 * strain_at[-1:].max(initial=0.0)) & (
         strain_at <= master_curves.stick_slip_triple_point()[0]
     )
-    some = np.flatnonzero(on_curve)[:: max(1, int(on_curve.sum()) // 20)]
-    static = np.abs(ratio[some] / master_curves.stick_slip(strain_at[some]) - 1.0)
+    sampled = np.flatnonzero(on_curve)[:: max(1, int(on_curve.sum()) // 20)]
+    static = np.abs(ratio[sampled] / master_curves.stick_slip(strain_at[sampled]) - 1.0)
     return Press(slip, extended, float(static.max()) if len(static) else np.nan, cloth)
 
 
-def _phases(mu: float, one: Press, end: float) -> list[tuple[float, float, float]]:
+def _phases(mu: float, outcome: Press, end: float) -> list[tuple[float, float, float]]:
     """Return (mu, strain, regime) at the strains of the phase diagram.
 
     A tip that has slipped once counts as slipping from then on.
     """
     points = []
     for strain in PHASE_STRAIN:
-        if strain <= end or np.isfinite(one.slip):
-            regime = SLIP if strain >= one.slip else EXTENDED if strain >= one.extended else STICK
+        if strain <= end or np.isfinite(outcome.slip):
+            regime = (
+                SLIP
+                if strain >= outcome.slip
+                else EXTENDED
+                if strain >= outcome.extended
+                else STICK
+            )
             points.append((mu, strain, regime))
     return points

@@ -155,13 +155,13 @@ class _Boundary:
             return np.stack([tip[1], tip[2], tip[3], tip[4] - 1.0, clamp[0], clamp[4]])
 
         phi = near.phi * max(Lambda / near.Lambda, 1.0)
-        found = solve_boundary_values(change, ends, mesh, near.fields(place), np.array([phi]))
+        solution = solve_boundary_values(change, ends, mesh, near.fields(place), np.array([phi]))
         # A zero of eta before the clamp means that the rod was unstable already.
-        if found.y[4].min() < -1e-9:
+        if solution.y[4].min() < -1e-9:
             raise NotSolvedError(
                 f"bend_twist: at Lambda = {Lambda} another mode becomes unstable first"
             )
-        return _BoundaryPoint(Lambda, float(found.p[0]), found.sol)
+        return _BoundaryPoint(Lambda, float(solution.p[0]), solution.sol)
 
     def _anchor(self) -> _BoundaryPoint:
         """Follow the planar rod from large weights down until eta has passed zero at the clamp.
@@ -183,16 +183,16 @@ class _Boundary:
             def ends(tip: Floats, clamp: Floats) -> Floats:
                 return np.stack([tip[1], tip[2], tip[3], clamp[4] - 1.0, clamp[0]])
 
-            found = solve_boundary_values(change, ends, mesh, fields)
-            fields = found.sol(mesh)
-            tip = found.y[4, 0]
+            solution = solve_boundary_values(change, ends, mesh, fields)
+            fields = solution.sol(mesh)
+            tip = solution.y[4, 0]
             if tip < 0.0:
                 break
         else:
             raise NotSolvedError("bend_twist: the planar rod of phi = 7 stays stable")
         # `_solve` has eta = 1 at the free end, so scale the linear fields to it.
         scale = np.array([1.0, 1.0, tip, tip, tip])[:, None]
-        return self._solve(Lambda, _BoundaryPoint(Lambda, phi, lambda x: found.sol(x) / scale))
+        return self._solve(Lambda, _BoundaryPoint(Lambda, phi, lambda x: solution.sol(x) / scale))
 
 
 def _rates(sigma: Floats, y: Floats, k: float, C: float) -> Floats:

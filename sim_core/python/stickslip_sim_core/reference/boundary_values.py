@@ -27,10 +27,10 @@ def solve_boundary_values(
 
     Without `parameters`, `rate` and `ends` take no p.
     """
-    found = solve_bvp(rate, ends, mesh, y, parameters, tol=TOLERANCE, max_nodes=100_000)
-    if not found.success:
-        raise NotSolvedError(found.message)
-    return found
+    solution = solve_bvp(rate, ends, mesh, y, parameters, tol=TOLERANCE, max_nodes=100_000)
+    if not solution.success:
+        raise NotSolvedError(solution.message)
+    return solution
 
 
 def positive(name: str, values: ArrayLike) -> Floats:

@@ -65,10 +65,10 @@ def _cantilever(gamma: float) -> float:
 
     # The guess falls from the clamp like the linear solution of a heavy strip.
     hanging = np.pi / 2.0 * np.exp(-mesh * np.sqrt(gamma))
-    found = solve_boundary_values(
+    solution = solve_boundary_values(
         change, ends, mesh, np.stack([hanging, -hanging * np.sqrt(gamma) / rate, mesh, mesh])
     )
-    psi, _, drop, reach = found.y
+    psi, _, drop, reach = solution.y
     if psi.min() < -1e-9 or psi.max() > np.pi / 2.0 + 1e-9:
         raise NotSolvedError(f"cantilever: the solution at gamma = {gamma} is not the hanging one")
     return float(light * rate * drop[-1] / reach[-1])

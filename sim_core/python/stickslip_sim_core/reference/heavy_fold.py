@@ -85,7 +85,7 @@ def heavy_fold(gap: float) -> HeavyFold:
         s < 0.5, np.pi * 1.3 * np.sin(np.pi * s) ** 2, np.pi * (1.0 + 0.3 * np.sin(np.pi * s) ** 2)
     )
     x, y = (0.05 * np.cumsum(rate(theta)) for rate in (np.cos, np.sin))
-    found = solve_boundary_values(
+    solution = solve_boundary_values(
         change,
         ends,
         s,
@@ -94,22 +94,24 @@ def heavy_fold(gap: float) -> HeavyFold:
     )
 
     # The tangent is upright at the nose, and level again at the top.
-    H, V, length = found.p
+    H, V, length = solution.p
     nose, top = (
-        found.sol(
+        solution.sol(
             brentq(
-                lambda s, angle=angle: found.sol(s)[0] - angle, 0.0, found.x[found.y[0].argmax()]
+                lambda s, angle=angle: solution.sol(s)[0] - angle,
+                0.0,
+                solution.x[solution.y[0].argmax()],
             )
         )
         for angle in (np.pi / 2.0, np.pi)
     )
     # The equations have other solutions, which are no folds.
-    if not (found.y[0].max() > np.pi and length > 0.0 and V < 0.0):
+    if not (solution.y[0].max() > np.pi and length > 0.0 and V < 0.0):
         raise NotSolvedError(f"heavy_fold: the solution at gap = {gap} is not the fold")
     return HeavyFold(
         height=float(top[3]),
         loop_length=float(length),
-        nose_to_landing=float(nose[2] - found.y[2, -1]),
+        nose_to_landing=float(nose[2] - solution.y[2, -1]),
         landing_force=float(V + length),
         tension=-float(H),
     )

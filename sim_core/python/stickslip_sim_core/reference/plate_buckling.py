@@ -152,33 +152,33 @@ def _functions(breaks: Floats, degree: int, order: int, start: int | None) -> _A
 def _integral(
     along: _Axis,
     orders_along: tuple[int, int],
-    one: _Axis,
+    left: _Axis,
     orders_across: tuple[int, int],
-    two: _Axis,
+    right: _Axis,
     weight: Floats,
 ) -> Floats:
     """Integrate weight(x, y) times derivatives of the products of two sets of functions."""
     (a, b) = orders_along
     (c, d) = orders_across
-    pairs = np.einsum("yk,yl->ykl", one.values[c], two.values[d])
-    right = np.tensordot(weight, pairs, axes=1)
-    full = np.einsum("xi,xj,xkl->ikjl", along.values[a], along.values[b], right, optimize=True)
-    return np.asarray(full.reshape(along.size * one.size, along.size * two.size))
+    pairs = np.einsum("yk,yl->ykl", left.values[c], right.values[d])
+    weighted = np.tensordot(weight, pairs, axes=1)
+    full = np.einsum("xi,xj,xkl->ikjl", along.values[a], along.values[b], weighted, optimize=True)
+    return np.asarray(full.reshape(along.size * left.size, along.size * right.size))
 
 
 def _product(
     along: _Axis,
     orders_along: tuple[int, int],
-    one: _Axis,
+    left: _Axis,
     orders_across: tuple[int, int],
-    two: _Axis,
+    right: _Axis,
 ) -> Floats:
     """Integrate derivatives of the products of two sets of functions, with a weight of one."""
     # Without a weight the integral is the product of two integrals of one coordinate each.
     (a, b) = orders_along
     (c, d) = orders_across
     first = along.values[a].T @ (along.weights[:, None] * along.values[b])
-    second = one.values[c].T @ (one.weights[:, None] * two.values[d])
+    second = left.values[c].T @ (left.weights[:, None] * right.values[d])
     return np.asarray(np.kron(first, second))
 
 
@@ -204,9 +204,9 @@ def _membrane_forces(
     )
     weight = -np.kron(along.weights @ along.values[0], even.weights @ even.values[0])
     stiffness = np.block([[uu, uv], [uv.T, vv]])
-    found = np.linalg.solve(stiffness, np.concatenate([np.zeros(len(uu)), weight]))
-    u = found[: len(uu)].reshape(along.size, -1)
-    v = found[len(uu) :].reshape(along.size, -1)
+    coefficients = np.linalg.solve(stiffness, np.concatenate([np.zeros(len(uu)), weight]))
+    u = coefficients[: len(uu)].reshape(along.size, -1)
+    v = coefficients[len(uu) :].reshape(along.size, -1)
 
     def at(field: Floats, across: _Axis, i: int, j: int) -> Floats:
         return np.asarray(along.values[i] @ field @ across.values[j].T)

@@ -114,11 +114,11 @@ def _pressed(condition: Callable[[float, Floats], float], guess: float) -> tuple
     # The value of q / P for which int w^2 = 2.
     scale = 0.44510
     y = np.stack([scale * w, scale * bend, 0.0 * s, s])
-    found = solve_boundary_values(
+    solution = solve_boundary_values(
         change, ends, s, y, np.array([k**2, scale * k**2, np.sqrt(guess)])
     )
-    P, q, a = found.p
-    w = found.y[0]
+    P, q, a = solution.p
+    w = solution.y[0]
     if not (P > 0.0 and q > 0.0 and a * w.max() <= np.pi / 2.0 + 1e-6 and w[-1] > w.max() - 1e-9):
         raise NotSolvedError(
             f"stick_slip: near strain = {guess} the solution found is not the first mode"

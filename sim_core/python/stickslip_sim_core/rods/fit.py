@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rods.clamp import refuse_other_clamp
 from stickslip_sim_core.rods.hung_rod import (
     HungRod,
     HungRodModel,
@@ -19,7 +20,9 @@ from stickslip_sim_core.rods.hung_rod import (
     root_mean_square,
 )
 from stickslip_sim_core.rods.solve import (
+    CLAMP_FRAME,
     STIFFNESS,
+    Bools,
     RodSolution,
     bspline_matrix,
     finite_array,
@@ -29,8 +32,36 @@ from stickslip_sim_core.rods.solve import (
 CANDIDATES = 4
 """Number of rods of the library from which a fit starts."""
 
-RANGES = ((60.0, 2000.0), (0.0, 14.0), (4.0, 22.0))
-"""Ranges of gamma, phi0 and phi1 in the library."""
+MAX_CANDIDATES = 32
+"""Number of rods from which a fit starts that has not come down to the noise before."""
+
+NOISE_FACTOR = 1.2
+"""A residual of up to this many times the estimated noise is down to it. The estimate from 100
+points is off by 5 %, that from 8 points by a third, which costs more starts and no accuracy.
+"""
+
+
+@dataclass(frozen=True)
+class LibraryRanges:
+    """Ranges of the rods from which fits start."""
+
+    gamma: tuple[float, float]
+    phi0: tuple[float, float]
+    phi1: tuple[float, float]
+
+
+HANGING_RANGES = LibraryRanges((60.0, 2000.0), (0.0, 14.0), (4.0, 22.0))
+"""For a clamp along gravity. A rod without natural bend hangs straight, so it has no fit. A bend to
+the other side is the same rod, turned by half a turn about the vertical.
+"""
+
+LEANING_RANGES = LibraryRanges((5.0, 4000.0), (0.0, 14.0), (-22.0, 22.0))
+"""For any other clamp. A straight rod sags, and a bend up and a bend down are different rods."""
+
+VERTICAL_COSINE = 0.999
+"""A clamp is along gravity if the cosine between its d1 and gravity is at least this: 2.6 degrees,
+less than anybody sets a clamp by eye.
+"""
 
 INTERVALS = 24
 """Number of knot intervals in the splines of natural curvature."""
@@ -54,6 +85,15 @@ With it, cross validation seldom undersmooths [Kim and Gu 2004].
 """
 
 
+COUPLED_CORRELATION = 0.9
+"""From this correlation on, a bend makes up for a weight: four fifths of the variance of gamma are
+that of the bend.
+"""
+
+UNCERTAIN_GAMMA = 0.1
+"""Relative standard error of gamma from which on a coupled fit does not determine it."""
+
+
 @dataclass(frozen=True, eq=False)
 class ParameterFit:
     """The uniform rod (gamma, phi0, phi1) that hangs nearest to a centreline."""
@@ -73,11 +113,24 @@ class ParameterFit:
     The error of a given gamma is 0.
     """
 
+    correlation: Floats
+    """Correlations of the errors of log gamma, phi0 and phi1, (3, 3); NaN for what was given."""
+
     residual: float
     """Root mean square distance per coordinate between the hung rod and the centreline [L]."""
 
     solution: RodSolution
     """The hung rod at the P points, n = 1."""
+
+    @property
+    def trades_bend_for_weight(self) -> bool:
+        """Whether the centreline cannot tell a stiffer rod from one with another natural bend.
+
+        Then a small residual says nothing about gamma: measure the weight, or a longer rod.
+        """
+        relative_error = self.standard_error[0] / self.gamma
+        is_coupled = abs(self.correlation[0, 2]) > COUPLED_CORRELATION
+        return bool(is_coupled and relative_error > UNCERTAIN_GAMMA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +163,12 @@ class NaturalFit:
 
 
 def fit_parameters(
-    centerline: ArrayLike, *, gamma: float | None = None, stiffness: ArrayLike = STIFFNESS
+    centerline: ArrayLike,
+    *,
+    gamma: float | None = None,
+    phi0: float | None = None,
+    stiffness: ArrayLike = STIFFNESS,
+    clamp_frame: ArrayLike = CLAMP_FRAME,
 ) -> ParameterFit:
     """Fit (gamma, phi0, phi1) to a centreline.
 
@@ -122,37 +180,60 @@ def fit_parameters(
         centerline: Positions [L] from the clamp (at the origin) to the free end, at uniform arc
             length, z up, shape (P, 3), P >= 8.
         gamma: Weight against bending, if it is known. None fits it.
+        phi0: Natural twist times L [rad], if it is known. None fits it. A centreline in a plane
+            does not determine the twist: give 0 for a rod in one photograph.
         stiffness: K = (GJ, EI_2, EI_3) / EI [-], shape (3,).
+        clamp_frame: R(0), columns d1 (tangent), d2, d3 in the world (z up), shape (3, 3). phi1 is
+            the bend about d3. For a rod over the edge of a table in the plane of x and z, give
+            [[1, 0, 0], [0, 0, -1], [0, 1, 0]].
 
     Raises:
-        ValueError: An argument breaks its rule. The message names the field, the rule and the
-            value.
+        ValueError: An argument breaks its rule, or the centreline leaves the clamp in another
+            direction. The message names the field, the rule and the value.
         RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
-    model = HungRodModel.of(len(data), stiffness, intervals=None)
-    state = _fit_constant(model, data, gamma, components=(0, 2))
+    _refuse_bad_gamma(gamma)
+    if phi0 is not None and not np.isfinite(phi0):
+        raise ValueError(f"phi0: must be finite, got {phi0}")
+    model = HungRodModel.of(len(data), stiffness, None, clamp_frame)
+    refuse_other_clamp(data, model.clamp_frame)
+    bends = (2,) if phi0 is not None else (0, 2)
+    state = _fit_constant(model, data, gamma, phi0, components=bends)
 
-    # Standard errors of the fitted parameters follow from the curvature of the squared error. The
-    # clamped point has no error, so its three coordinates are no data.
+    is_fitted = np.array([gamma is None, phi0 is None, True])
     jacobian = model.jacobian(state)[:, [0, 1, 3]]
-    used = np.array([gamma is None, True, True])
-    variance = (state.residual(data) ** 2).sum() / (data.size - 3 - used.sum())
-    error = np.zeros(3)
-    error[used] = np.sqrt(
-        variance * np.diag(np.linalg.pinv(jacobian[:, used].T @ jacobian[:, used]))
-    )
+    error, correlation = _errors(jacobian, state.residual(data), is_fitted)
     # From the error of log gamma to the error of gamma.
     error[0] *= state.gamma
-    phi0, _, phi1 = state.coefficients[0]
+    fitted_phi0, _, fitted_phi1 = state.coefficients[0]
     return ParameterFit(
         state.gamma,
-        float(phi0),
-        float(phi1),
+        float(fitted_phi0),
+        float(fitted_phi1),
         error,
+        correlation,
         root_mean_square(state.residual(data)),
         model.solution(state, len(data)),
     )
+
+
+def _errors(jacobian: Floats, residual: Floats, is_fitted: Bools) -> tuple[Floats, Floats]:
+    """Return standard errors (3,) and correlations (3, 3) of log gamma, phi0 and phi1.
+
+    They follow from the curvature of the squared error. The clamped point has no error, so its
+    three coordinates are no data.
+    """
+    variance = (residual**2).sum() / (residual.size - 3 - is_fitted.sum())
+    fitted = jacobian[:, is_fitted]
+    covariance = variance * np.linalg.pinv(fitted.T @ fitted)
+    deviation = np.sqrt(np.diag(covariance))
+    error = np.zeros(3)
+    error[is_fitted] = deviation
+    correlation = np.full((3, 3), np.nan)
+    scale = np.maximum(np.outer(deviation, deviation), np.finfo(float).tiny)
+    correlation[np.ix_(is_fitted, is_fitted)] = covariance / scale
+    return error, correlation
 
 
 def fit_natural_curvature(
@@ -161,6 +242,7 @@ def fit_natural_curvature(
     gamma: float | None = None,
     noise: float | None = None,
     stiffness: ArrayLike = STIFFNESS,
+    clamp_frame: ArrayLike = CLAMP_FRAME,
 ) -> NaturalFit:
     """Fit natural curvature along the rod to a noisy centreline.
 
@@ -186,20 +268,23 @@ def fit_natural_curvature(
             Give it if the noise is correlated along the rod, because cross validation assumes white
             noise.
         stiffness: As for `fit_parameters`.
+        clamp_frame: As for `fit_parameters`.
 
     Raises:
-        ValueError: An argument breaks its rule. The message names the field, the rule and the
-            value.
+        ValueError: An argument breaks its rule, or the centreline leaves the clamp in another
+            direction. The message names the field, the rule and the value.
         RuntimeError: None of the rods from which the fit starts hangs in a stable equilibrium.
     """
     data = _centerline(centerline)
+    _refuse_bad_gamma(gamma)
     if noise is not None and not noise > 0:
         raise ValueError(f"noise: must be > 0, got {noise}")
 
     # The path begins with a uniform rod, the limit of a large weight of smoothness.
-    constant = HungRodModel.of(len(data), stiffness, intervals=None)
-    uniform = _fit_constant(constant, data, gamma, components=(0, 1, 2))
-    model = HungRodModel.of(len(data), stiffness, intervals=INTERVALS)
+    constant = HungRodModel.of(len(data), stiffness, None, clamp_frame)
+    refuse_other_clamp(data, constant.clamp_frame)
+    uniform = _fit_constant(constant, data, gamma, None, components=(0, 1, 2))
+    model = HungRodModel.of(len(data), stiffness, INTERVALS, clamp_frame)
     coefficients = np.tile(uniform.coefficients, (INTERVALS + 3, 1))
     state = model.relax(uniform.gamma, coefficients, uniform.frames)
     assert state is not None  # the same rod as before
@@ -260,20 +345,25 @@ def fit_natural_curvature(
 
 
 def _fit_constant(
-    model: HungRodModel, data: Floats, known_gamma: float | None, components: tuple[int, ...]
+    model: HungRodModel,
+    data: Floats,
+    known_gamma: float | None,
+    known_phi0: float | None,
+    components: tuple[int, ...],
 ) -> HungRod:
     """Fit a uniform rod from the nearest rods of the library."""
-    if known_gamma is not None and not (np.isfinite(known_gamma) and known_gamma > 0):
-        raise ValueError(f"gamma: must be > 0, got {known_gamma}")
     gammas, natural, centerlines, curvature = _library(
-        len(data), tuple(model.stiffness), known_gamma
+        len(data), tuple(model.stiffness), known_gamma, known_phi0, tuple(model.clamp_frame.ravel())
     )
 
     # The squared error has several minima, so start from the rods that hang nearest.
     distance = np.linalg.norm(centerlines - data, axis=(1, 2))
     free = np.array([0] * (known_gamma is None) + [1 + c for c in components])
     best: HungRod | None = None
-    for i in np.argsort(distance)[:CANDIDATES]:
+    target = NOISE_FACTOR * _noise_of(data)
+    for rank, i in enumerate(np.argsort(distance)[:MAX_CANDIDATES]):
+        if rank >= CANDIDATES and best and root_mean_square(best.residual(data)) <= target:
+            break
         state = model.hang(float(gammas[i]), natural[i][None], curvature[i])
         if state is None:
             continue
@@ -287,28 +377,60 @@ def _fit_constant(
     return best
 
 
+def _noise_of(data: Floats) -> float:
+    """Estimate the standard deviation of the white noise of a centreline (P, 3) per coordinate [L].
+
+    The fourth difference of white noise has 1 + 16 + 36 + 16 + 1 = 70 times its variance. That of a
+    smooth curve is of the order of the fourth power of the distance of points.
+    """
+    return root_mean_square(np.diff(data, n=4, axis=0)) / float(np.sqrt(70.0))
+
+
 @lru_cache(maxsize=8)
 def _library(
-    points: int, stiffness: tuple[float, ...], known_gamma: float | None
+    points: int,
+    stiffness: tuple[float, ...],
+    known_gamma: float | None,
+    known_phi0: float | None,
+    clamp: tuple[float, ...],
 ) -> tuple[Floats, ...]:
-    """Hang rods over RANGES of gamma, phi0, phi1: 10 x 8 x 8, or 1 x 16 x 16 with a known gamma.
+    """Hang rods over the ranges of gamma, phi0 and phi1.
+
+    Without known parameters there are 10 x 8 x 8 rods, with a known gamma 1 x 16 x 16. For a clamp
+    that is not along gravity, phi1 has both signs, and the straight rod in the middle.
 
     Returns gamma (n,), natural curvature (n, 3), and centreline and curvature (n, P, 3) of the
     stable rods.
     """
+    clamp_frame = np.reshape(clamp, (3, 3))
+    is_along_gravity = -clamp_frame[2, 0] >= VERTICAL_COSINE
+    ranges = HANGING_RANGES if is_along_gravity else LEANING_RANGES
     per_axis = 8 if known_gamma is None else 16
+    bends = per_axis if is_along_gravity else 2 * per_axis + 1
     axes = (
-        np.geomspace(*RANGES[0], 10) if known_gamma is None else np.array([float(known_gamma)]),
-        np.linspace(*RANGES[1], per_axis),
-        np.linspace(*RANGES[2], per_axis),
+        np.geomspace(*ranges.gamma, 10) if known_gamma is None else np.array([float(known_gamma)]),
+        np.linspace(*ranges.phi0, per_axis)
+        if known_phi0 is None
+        else np.array([float(known_phi0)]),
+        np.linspace(*ranges.phi1, bends),
     )
     gamma, phi0, phi1 = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     natural = np.stack([phi0, 0.0 * phi0, phi1], axis=1)
     rods = solve_general_rods(
-        natural[:, None], gamma, stiffness=stiffness, elements=96, points=points
+        natural[:, None],
+        gamma,
+        stiffness=stiffness,
+        clamp_frame=clamp_frame,
+        elements=96,
+        points=points,
     )
     good = rods.stable
     return gamma[good], natural[good], rods.centerline[good], rods.curvature[good]
+
+
+def _refuse_bad_gamma(gamma: float | None) -> None:
+    if gamma is not None and not (np.isfinite(gamma) and gamma > 0):
+        raise ValueError(f"gamma: must be > 0, got {gamma}")
 
 
 def _centerline(centerline: ArrayLike) -> Floats:

@@ -18,6 +18,7 @@ from stickslip_sim_core.rods.solve import (
     RodSolution,
     bspline_matrix,
     clamp_quaternions,
+    finite_array,
     interpolation_matrix,
     rod_stiffness,
     solve_general_rods,
@@ -51,13 +52,18 @@ class HungRodModel:
     """From gamma and spline coefficients to the hung centreline at P points."""
 
     stiffness: Floats
-    clamp: Floats  # quaternion
+    clamp_frame: Floats  # R(0), (3, 3)
     intervals: int | None  # None: constant
     strides: tuple[int, ...]  # of the chains, in elements per point
     bases: tuple[Floats, ...]  # spline values in the middles of each chain's elements
 
     @staticmethod
-    def of(points: int, stiffness: ArrayLike, intervals: int | None) -> "HungRodModel":
+    def of(
+        points: int,
+        stiffness: ArrayLike,
+        intervals: int | None,
+        clamp_frame: ArrayLike = CLAMP_FRAME,
+    ) -> "HungRodModel":
         # Both chains have nodes at the P points. The second has elements of half the length.
         stride = -(-ELEMENTS_MIN // (points - 1))
         strides = (stride, 2 * stride)
@@ -69,7 +75,9 @@ class HungRodModel:
                 np.ones((n, 1)) if intervals is None else bspline_matrix(intervals, middles)
             )
         K = rod_stiffness(stiffness, 1)[0]
-        clamp = clamp_quaternions(CLAMP_FRAME, 1)[0]
+        clamp = finite_array("clamp_frame", clamp_frame, (3, 3))
+        # A matrix that is no rotation is refused now, and not when the first rod hangs.
+        clamp_quaternions(clamp, 1)
         return HungRodModel(K, clamp, intervals, strides, tuple(bases))
 
     def relax(
@@ -88,11 +96,12 @@ class HungRodModel:
 
     def hang(self, gamma: float, coefficients: Floats, curvature: Floats) -> HungRod | None:
         """Hang the rod from a shape of this curvature, (m, 3) at uniform arc length."""
+        clamp = clamp_quaternions(self.clamp_frame, 1)[0]
         frames = []
         for basis in self.bases:
             n = len(basis)
             middles = interpolation_matrix(len(curvature), (np.arange(n) + 0.5) / n) @ curvature
-            frames.append(_sim_core.chain_frames(middles, self.clamp))
+            frames.append(_sim_core.chain_frames(middles, clamp))
         return self.relax(gamma, coefficients, tuple(frames))
 
     def jacobian(self, state: HungRod) -> Floats:
@@ -132,6 +141,7 @@ class HungRodModel:
             natural[None],
             [state.gamma],
             stiffness=self.stiffness,
+            clamp_frame=self.clamp_frame,
             start_curvature=start[None],
             elements=elements,
             points=points,

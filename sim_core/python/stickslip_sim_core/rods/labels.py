@@ -167,28 +167,28 @@ def other_minima(
     twist = finite_array("phi0", phi0, (n,))
     bend = finite_array("phi1", phi1, (n,))
     options = {"elements": elements, "points": points}
-    found = (
+    rods = (
         solve_rods(weight, twist, bend, poisson=poisson, **options)
         if solution is None
         else solution
     )
-    if found.centerline.shape != (n, points, 3):
+    if rods.centerline.shape != (n, points, 3):
         raise ValueError(
-            f"solution: must be of {n} rods at {points} points, got shape {found.centerline.shape}"
+            f"solution: must be of {n} rods at {points} points, got shape {rods.centerline.shape}"
         )
 
     natural = np.stack([twist, np.zeros(n), bend], axis=1)[:, None, :]
     stiffness = (1.0 / (1.0 + poisson), 1.0, 1.0)
     # The curvature of the start is cut down to the limit of the coarsest level. Rods without an
     # equilibrium start straight.
-    start = np.nan_to_num(found.curvature * MIRROR)
+    start = np.nan_to_num(rods.curvature * MIRROR)
     largest = np.linalg.norm(start, axis=2).max(axis=1, initial=0.0)
     limit = 0.9 * ELEMENT_TURN_MAX * (elements // 4)
     start = start * np.minimum(1.0, limit / np.maximum(largest, 1e-300))[:, None, None]
     other = solve_general_rods(
         natural, weight, stiffness=stiffness, start_curvature=start, **options
     )
-    distance = np.linalg.norm(other.centerline - found.centerline, axis=2).max(axis=1)
+    distance = np.linalg.norm(other.centerline - rods.centerline, axis=2).max(axis=1)
     # `not <=` is also true for the NaN of a rod that `solve_rods` did not solve.
     distinct = other.stable & ~(distance <= DISTINCT)
     centerline = np.where(distinct[:, None, None], other.centerline, np.nan)

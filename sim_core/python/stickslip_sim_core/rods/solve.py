@@ -236,14 +236,14 @@ def solve_general_rods(
     parts = []
     # Even without rods the core runs once, which gives the result its fields.
     for begin in range(0, max(n, 1), RODS_AT_ONCE):
-        some = slice(begin, begin + RODS_AT_ONCE)
-        fields = to_grid @ natural[some]
-        starts = fields if start is natural else start_to_grid @ start[some]
+        batch = slice(begin, begin + RODS_AT_ONCE)
+        fields = to_grid @ natural[batch]
+        starts = fields if start is natural else start_to_grid @ start[batch]
         # The core checks the largest curvature against `elements`. Without rods it is 0.
         largest = max(np.linalg.norm(f, axis=2).max(initial=0.0) for f in (fields, starts))
-        slope = to_slope @ natural[some]
-        at_points = to_points @ natural[some]
-        arrays = (weight[some], K[some], clamp[some], fields, starts, slope, at_points)
+        slope = to_slope @ natural[batch]
+        at_points = to_points @ natural[batch]
+        arrays = (weight[batch], K[batch], clamp[batch], fields, starts, slope, at_points)
         parts.append(_sim_core.solve_general_rods(*arrays, elements, largest))
     return RodSolution(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 

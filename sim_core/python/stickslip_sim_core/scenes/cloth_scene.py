@@ -59,8 +59,10 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
             raise ValueError(f"sheets.{name}.mesh: must hang together in one piece")
         sheets.append(part)
     things = []
+    cell = max(part.mesh.spacing for part in sheets)
     for name, body in sorted(document["bodies"].items()):
-        things.append(thing(name, body, [mu[sheet_name, name] for sheet_name in names]))
+        by_sheet = [mu[sheet_name, name] for sheet_name in names]
+        things.append(thing(name, body, by_sheet, cell=cell))
     # The solver numbers the vertices of all sheets together, one sheet after the other.
     ends = np.cumsum([0, *(len(part.start) for part in sheets)])
     holders = []
@@ -255,11 +257,7 @@ class _Forces:
                 reactions[touching],
             )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
-            # Vertices of skeletons come after all others. Their owner is the body of the pair, and
-            # -1 stands for no owner.
-            owner = np.append(self._owner, -1)[np.minimum(pairs.vertices, len(self._owner))]
-            of_body = np.append(self._others, -1)[pairs.body]
-            owner = np.where(owner < 0, of_body[:, None], owner)
+            owner = self._owner[pairs.vertices]
             # The four nodes of a pair belong to its two sides: the first node is on one side, and
             # the last node on the other.
             first = owner[:, 0]

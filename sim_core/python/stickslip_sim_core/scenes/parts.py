@@ -12,7 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import Body, Surface, box, capsule, cylinder, plane, sphere
+from stickslip_sim_core.cloth.contact import (
+    Body,
+    Surface,
+    box,
+    capsule,
+    cylinder,
+    default_rounding,
+    plane,
+    sphere,
+)
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.scenes.holders import ALWAYS, Holder, Hung, hung
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
@@ -220,8 +229,11 @@ class Thing:
     """Whether the vertices of a surface move relative to its axes."""
 
 
-def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
-    """Return a body of a document. `mu` has its coefficients of friction with each sheet.
+def thing(name: str, given: Document, mu: Sequence[float], *, cell: float) -> Thing:
+    """Return a body of a document.
+
+    `mu` has its coefficients of friction with each sheet. `cell` is the largest side of a cell of a
+    sheet [m].
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
@@ -240,12 +252,16 @@ def thing(name: str, given: Document, mu: Sequence[float]) -> Thing:
     motion = rigid_motion(given["motion"], origin)
     pose = _carried(motion, rotation(given["turn"]), origin)
 
+    rounding = given.get("rounding")
+    if given["type"] == "box" and rounding is None:
+        rounding = default_rounding(given["size"], cell)
+
     # Only the pose changes with time, so each shape takes it when the solver needs the body.
     made: Callable[..., Body] = {
         "sphere": lambda **placed: sphere(mu, given["radius"], **placed),
         "cylinder": lambda **placed: cylinder(mu, given["radius"], **placed),
         "capsule": lambda **placed: capsule(mu, given["radius"], given["length"], **placed),
-        "box": lambda **placed: box(mu, given["size"], rounding=given["rounding"], **placed),
+        "box": lambda **placed: box(mu, given["size"], rounding=rounding, **placed),
     }[given["type"]]
 
     def rigid(time: float) -> Body:

@@ -91,10 +91,10 @@ inline void factor_columns(float* panel, long ld, int width, int rows) {
   float l[tile_columns][tile_columns], inverse[tile_columns];
   for (int j = 0; j < width; ++j) {
     float pivot = panel[j * ld + j];
-    const float own = pivot;
+    const float diagonal = pivot;
     for (int q = 0; q < j; ++q) pivot -= l[j][q] * l[j][q];
-    if (!(pivot > 1e-6f * own))
-      pivot = own > 0.0f ? 1e-6f * own : 1.0f;  // rounding: the factor may be inexact
+    if (!(pivot > 1e-6f * diagonal))
+      pivot = diagonal > 0.0f ? 1e-6f * diagonal : 1.0f;  // rounding: the factor may be inexact
     l[j][j] = __builtin_sqrtf(pivot);
     inverse[j] = 1.0f / l[j][j];
     for (int i = j + 1; i < width; ++i) {
@@ -180,26 +180,27 @@ inline void keep_rows(const float* from, Kept* to) {
 template <class Kept>
 inline void keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, long begin) {
   Kept* tile = static_cast<Kept*>(factor.tiles) + begin;
-  const int first = j + width, own = size.columns - first, end = own + 3 * size.rows;
-  float some[tile_columns * tile_rows] = {};
-  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, some);
-  for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(some + q * tile_rows, tile);
+  const int first = j + width, columns_left = size.columns - first,
+            end = columns_left + 3 * size.rows;
+  float padded[tile_columns * tile_rows] = {};
+  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, padded);
+  for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(padded + q * tile_rows, tile);
   // Pivot rows and other rows lie apart in the panel.
   const float *upper = factor.panel + j * size.ld + first,
-              *lower = factor.panel + j * size.ld + size.pivot_rows - own;
+              *lower = factor.panel + j * size.ld + size.pivot_rows - columns_left;
   for (int i = 0; i < end; i += tile_rows) {
-    if (i + tile_rows <= own || (i >= own && i + tile_rows <= end)) {
-      const float* from = (i < own ? upper : lower) + i;
+    if (i + tile_rows <= columns_left || (i >= columns_left && i + tile_rows <= end)) {
+      const float* from = (i < columns_left ? upper : lower) + i;
       for (int q = 0; q < width; ++q, from += size.ld, tile += tile_rows) keep_rows(from, tile);
       continue;
     }
     for (int q = 0; q < width; ++q, tile += tile_rows) {
       for (int r = 0; r < tile_rows; ++r) {
-        some[r] = i + r < own   ? upper[q * size.ld + i + r]
-                  : i + r < end ? lower[q * size.ld + i + r]
-                                : 0.0f;
+        padded[r] = i + r < columns_left ? upper[q * size.ld + i + r]
+                    : i + r < end        ? lower[q * size.ld + i + r]
+                                         : 0.0f;
       }
-      keep_rows(some, tile);
+      keep_rows(padded, tile);
     }
   }
 }
@@ -236,12 +237,12 @@ void factor(const Factor& factor, const ClothMatrix& matrix, const float* added)
     __builtin_memset(panel, 0, sizeof(float) * size.ld * size.columns);
     const int pivot0 = factor.pivot_begin[front];
     for (int i = 0; i < size.pivots; ++i) {
-      const float* own = added + 6L * (pivot0 + i);
+      const float* addend = added + 6L * (pivot0 + i);
       const float mass = matrix.diagonal[pivot0 + i];
       float* at = panel + 3L * i * size.ld + 3L * i;
       for (int c = 0; c < 3; ++c, at += size.ld) {
         at[c] += mass;
-        for (int r = c; r < 3; ++r) at[r] += *own++;
+        for (int r = c; r < 3; ++r) at[r] += *addend++;
       }
     }
     for (long e = factor.entry_begin[front]; e < factor.entry_begin[front + 1]; ++e) {

@@ -106,10 +106,10 @@ inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact,
     } else if (contact.mode[i] == contact_slip) {
       const Node n = *(reinterpret_cast<const Node*>(contact.normal) + i);
       const Node t = *(reinterpret_cast<const Node*>(contact.direction) + i);
-      const Node own = *(reinterpret_cast<const Node*>(v) + i);
+      const Node value = *(reinterpret_cast<const Node*>(v) + i);
       const float normal = dot3(n, *at);
       *at -= spread(normal) * n;
-      *at += spread(contact.turning[i]) * (own - spread(dot3(t, own)) * t) -
+      *at += spread(contact.turning[i]) * (value - spread(dot3(t, value)) * t) -
              spread(contact.coupling[i] * normal) * t;
     }
   }

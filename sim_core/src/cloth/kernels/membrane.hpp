@@ -153,7 +153,7 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
       const Lane c02 = quarter * (law.aq + law.hq), c12 = quarter * (law.aq - law.hq);
       const int* slots = data.slots + 9L * W * group;
       constexpr int first[3] = {0, 0, 1}, second[3] = {1, 2, 2};
-      Lane own[3][3][3] = {};  // a translation costs nothing: rows add up to zero
+      Lane diagonal[3][3][3] = {};  // a translation costs nothing: rows add up to zero
       for (int pair = 0; pair < 3; ++pair) {
         const Lane *a = n[first[pair]], *b = n[second[pair]];
         const Lane ab00 = a[0] * b[0], ab01 = a[0] * b[1], ab10 = a[1] * b[0], ab11 = a[1] * b[1],
@@ -168,14 +168,14 @@ double membrane_groups(const MembraneData& data, const double* x, double* gradie
           const Lane u = m00 * f[0][r] + m10 * f[1][r], v = m01 * f[0][r] + m11 * f[1][r];
           for (int c = 0; c < 3; ++c) {
             block[r][c] = u * f[0][c] + v * f[1][c] + (r == c ? geometric : zero);
-            own[first[pair]][r][c] -= block[r][c];
-            own[second[pair]][c][r] -= block[r][c];
+            diagonal[first[pair]][r][c] -= block[r][c];
+            diagonal[second[pair]][c][r] -= block[r][c];
           }
         }
         add_blocks(blocks, slots, 2 * pair, block, false);
         add_blocks(blocks, slots, 2 * pair + 1, block, true);
       }
-      for (int a = 0; a < 3; ++a) add_blocks(blocks, slots, 6 + a, own[a], false);
+      for (int a = 0; a < 3; ++a) add_blocks(blocks, slots, 6 + a, diagonal[a], false);
     }
   }
   double total = 0.0;

@@ -89,12 +89,12 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
     slope[c] = p[1] + y * (2.0 * p[2] + y * (3.0 * p[3] + y * (4.0 * p[4])));
     if (matrix) bend[c] = 2.0 * p[2] + y * (6.0 * p[3] + y * (12.0 * p[4]));
   }
-  const Quadratic own = quadratic(value, a, h, q), turn = quadratic(slope, a, h, q);
+  const Quadratic base = quadratic(value, a, h, q), turn = quadratic(slope, a, h, q);
   const Lane h2 = 2.0 * h, q2 = 2.0 * q;  // of z by h and q
   const Lane y_a = h * w_a, y_z = h * w_z, y_h = w + y_z * h2, y_q = y_z * q2;
-  const Lane Q = own.value;
-  const Lane Q_a = own.a + turn.value * y_a, Q_h = own.h + turn.value * y_h,
-             Q_q = own.q + turn.value * y_q;
+  const Lane Q = base.value;
+  const Lane Q_a = base.a + turn.value * y_a, Q_h = base.h + turn.value * y_h,
+             Q_q = base.q + turn.value * y_q;
   const Lane u_h = u_z * h2, u_q = u_z * q2;
   law.energy += u * Q;
   law.a += u_a * Q + u * Q_a;
@@ -140,9 +140,17 @@ inline void add_table(StretchLaw& law, const double* k, Lane a, Lane h, Lane q) 
 template <bool matrix>
 inline StretchLaw stretch_law(const double* k, bool tabulated, Lane a, Lane h, Lane q) {
   const Lane zero{}, none[4] = {zero + k[0], zero + k[1], zero + k[2], zero + k[3]};
-  const Quadratic own = quadratic(none, a, h, q);
-  StretchLaw law{0.5 * own.value, 0.5 * own.a, 0.5 * own.h, 0.5 * own.q, none[0],
-                 none[1],         zero,        none[2],     zero,        none[3]};
+  const Quadratic stretch = quadratic(none, a, h, q);
+  StretchLaw law{0.5 * stretch.value,
+                 0.5 * stretch.a,
+                 0.5 * stretch.h,
+                 0.5 * stretch.q,
+                 none[0],
+                 none[1],
+                 zero,
+                 none[2],
+                 zero,
+                 none[3]};
   if (tabulated) add_table<matrix>(law, k + 4, a, h, q);
   return law;
 }

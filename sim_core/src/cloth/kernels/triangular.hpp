@@ -94,9 +94,9 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
     const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front];
     const int* rows = factor.rows + factor.row_begin[front];
     const int height = size.columns + 3 * size.rows;
-    float* own = x + 4L * factor.pivot_begin[front];
+    float* pivots = x + 4L * factor.pivot_begin[front];
     for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) y[3 * i + c] = own[4 * i + c];
+      for (int c = 0; c < 3; ++c) y[3 * i + c] = pivots[4 * i + c];
     }
     __builtin_memset(y + size.columns, 0, sizeof(float) * (3 * size.rows + tile_rows));
     for (int j = 0; j < size.columns; j += tile_columns) {
@@ -106,7 +106,7 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
       tile += tile_floats(width, below);
     }
     for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) own[4 * i + c] = y[3 * i + c];
+      for (int c = 0; c < 3; ++c) pivots[4 * i + c] = y[3 * i + c];
     }
     for (int i = 0; i < size.rows; ++i) {
       float* at = x + 4L * rows[i];
@@ -118,9 +118,9 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
     const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front + 1];
     const int* rows = factor.rows + factor.row_begin[front];
     const int height = size.columns + 3 * size.rows;
-    float* own = x + 4L * factor.pivot_begin[front];
+    float* pivots = x + 4L * factor.pivot_begin[front];
     for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) y[3 * i + c] = own[4 * i + c];
+      for (int c = 0; c < 3; ++c) y[3 * i + c] = pivots[4 * i + c];
     }
     for (int i = 0; i < size.rows; ++i) {
       const float* at = x + 4L * rows[i];
@@ -134,7 +134,7 @@ void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
       with_width(width, [&]<int w>() { backward<w>(tile, y + j, below); });
     }
     for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) own[4 * i + c] = y[3 * i + c];
+      for (int c = 0; c < 3; ++c) pivots[4 * i + c] = y[3 * i + c];
     }
   }
 }

@@ -72,10 +72,10 @@ class NamedSet:
                 f"{self.name}` prints it"
             )
         slots = reader.slots(self.split)
-        if (found := labels_digest(self.task, reader, slots)) != self.labels:
+        if (digest := labels_digest(self.task, reader, slots)) != self.labels:
             raise ValueError(
                 f"{refused}the labels of its {len(slots)} samples to answer have SHA-256 "
-                f"{found}, and those of the set "
+                f"{digest}, and those of the set "
                 f"{self.labels}. Samples were rejected here, or the dataset is in parts"
             )
         for name, found_here in self.task.seen(reader, slots).items():
@@ -193,13 +193,13 @@ def read_record(path: Path) -> Record:
 def table(name: str, records: Iterable[Record]) -> str:
     """Return the Markdown table of the records of a set, best first."""
     task = load_set(name).task
-    mine = sorted(
+    ranked = sorted(
         (record for record in records if record.set == name),
         key=lambda each: task.rank(each.scores),
     )
     titles = ("method", *task.columns, "trained on", "by", "set")
     lines = [_line(titles), "|---" * len(titles) + "|"]
-    for record in mine:
+    for record in ranked:
         method = record.method if record.link is None else f"[{record.method}]({record.link})"
         lines.append(
             _line((method, *task.row(record.scores), record.trained_on, record.by, record.making))
@@ -215,7 +215,7 @@ def with_tables(page: str, records: Iterable[Record]) -> str:
     known = list(records)
     place = re.compile(r"(<!-- results of (\S+) -->)\n.*?(<!-- end -->)", flags=re.S)
     changed, count = place.subn(
-        lambda found: f"{found[1]}\n{table(found[2], known)}\n{found[3]}", page
+        lambda match: f"{match[1]}\n{table(match[2], known)}\n{match[3]}", page
     )
     missing = {record.set for record in known} - set(re.findall(r"<!-- results of (\S+) -->", page))
     if missing or not count:

@@ -88,10 +88,10 @@ def inputs(
         slots = chosen.check(reader)[0]
         if not secret.exists():
             write_durably(secret, token_bytes(32))
-        given = chosen.task.inputs(reader, slots, secret.read_bytes())
+        inputs = chosen.task.inputs(reader, slots, secret.read_bytes())
         with out.open("wb") as file:
-            np.savez(file, **given)  # type: ignore[arg-type]  # its stub takes no dictionary
-    shapes = ", ".join(f"{key} {values.shape}" for key, values in given.items())
+            np.savez(file, **inputs)  # type: ignore[arg-type]  # its stub takes no dictionary
+    shapes = ", ".join(f"{key} {values.shape}" for key, values in inputs.items())
     typer.echo(f"{out}: {shapes}")
 
 

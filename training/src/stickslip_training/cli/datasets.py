@@ -20,7 +20,7 @@ from stickslip_schemas.spec.arrays import SPLITS
 
 from stickslip_training.cli.shared import DatasetArgument, readable_errors
 from stickslip_training.data.reader import DatasetReader
-from stickslip_training.export import formats, lerobot
+from stickslip_training.export import coco, formats, lerobot
 from stickslip_training.export.formats import Content, OnBytes, made_whole, to_directory
 
 
@@ -104,6 +104,7 @@ FORMATS = {
     "--hdf5": Format(formats.write_hdf5, ("h5py",), is_file=True),
     "--webdataset": Format(formats.write_webdataset),
     "--huggingface": Format(formats.write_huggingface, ("datasets", "pyarrow")),
+    "--coco": Format(coco.write, ("PIL",)),
     "--lerobot": Format(lerobot.write, ("av", "pandas", "pyarrow")),
     "--obj": Format(formats.write_obj),
 }
@@ -123,6 +124,10 @@ def export(
         typer.Option(
             "--huggingface", metavar="DIR", help="Parquet files for Hugging Face datasets"
         ),
+    ] = None,
+    to_coco: Annotated[
+        Path | None,
+        typer.Option("--coco", metavar="DIR", help="frames with masks and boxes for COCO tools"),
     ] = None,
     to_lerobot: Annotated[
         Path | None,
@@ -148,6 +153,7 @@ def export(
         "--hdf5": to_hdf5,
         "--webdataset": to_webdataset,
         "--huggingface": to_huggingface,
+        "--coco": to_coco,
         "--lerobot": to_lerobot,
         "--obj": to_obj,
     }

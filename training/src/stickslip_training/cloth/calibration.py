@@ -49,9 +49,9 @@ def covering_temperature(
     tried = np.geomspace(0.4, 6.0, 55)
 
     def held(temperature: float) -> float:
-        found = estimates(
+        interval = estimates(
             Posterior.of(material, mu, (), bins, (of_material, temperature)).mu, bins, share
         )
-        return float(((found.low <= true_mu) & (true_mu <= found.high)).mean())
+        return float(((interval.low <= true_mu) & (true_mu <= interval.high)).mean())
 
     return float(tried[int(np.argmin([abs(held(each) - share) for each in tried]))])

@@ -384,14 +384,14 @@ def training_clips(
             )
     runs = zip([*train.material, *validation.material], [*train.mu, *validation.mu], strict=True)
     numbers = {run: number for number, run in enumerate(runs)}
-    shown = Clips.joined([clips_of_file(Path(source), train.materials)[0] for source in sources])
-    places = [numbers.get(clip, -1) for clip in zip(shown.material, shown.mu, strict=True)]
+    clips = Clips.joined([clips_of_file(Path(source), train.materials)[0] for source in sources])
+    places = [numbers.get(clip, -1) for clip in zip(clips.material, clips.mu, strict=True)]
     if others := places.count(-1):
         raise ValueError(
             f"clips must show simulations to train on or to validate: {others} of "
-            f"{len(shown)} do not"
+            f"{len(clips)} do not"
         )
-    known = replace(shown, run=np.array(places))
+    known = replace(clips, run=np.array(places))
     named = [sha256(Path(source).read_bytes()) for source in sources]
     return named, RenderedClips(known[known.run < len(train)], known[known.run >= len(train)])
 

@@ -120,29 +120,32 @@ class Familiarity:
         held = holders_at(INSTANTS)
         sorts = [
             runs,
-            *(replace(runs, positions=made(runs.positions, held)) for _, made in WITHOUT_ANSWER),
+            *(
+                replace(runs, positions=placed(runs.positions, held))
+                for _, placed in WITHOUT_ANSWER
+            ),
         ]
-        shown = [
+        silhouettes = [
             render_clips(
-                some, 1 if place else 4, seed + place, with_surroundings=True, device=device
+                group, 1 if place else 4, seed + place, with_surroundings=True, device=device
             ).cover
-            for place, some in enumerate(sorts)
+            for place, group in enumerate(sorts)
         ]
-        pixels = pooled(torch.cat(shown)).flatten(1).numpy()
+        pixels = pooled(torch.cat(silhouettes)).flatten(1).numpy()
         mean = pixels.mean(axis=0)
         components = np.linalg.svd(pixels - mean, full_matrices=False)[2][:COMPONENTS]
-        sort = np.repeat(np.arange(len(sorts)), [len(each) for each in shown])
+        sort = np.repeat(np.arange(len(sorts)), [len(each) for each in silhouettes])
         known = ((pixels - mean) @ components.T).astype(np.float16)
-        found = Familiarity(mean, components.astype(np.float16), known, sort, np.zeros(1))
-        return replace(found, good_oddness=np.sort(found.measure(good)[0]))
+        familiarity = Familiarity(mean, components.astype(np.float16), known, sort, np.zeros(1))
+        return replace(familiarity, good_oddness=np.sort(familiarity.measure(good)[0]))
 
     def measure(self, silhouettes: SingleFloats) -> tuple[Floats, Integers]:
         """Return the oddness of silhouettes (clips, F, 18, 22), and the sort of the nearest clip.
 
         The nearest clip is one of the known clips.
         """
-        seen = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
-        far = cdist(seen, self.known)
+        coordinates = (silhouettes.reshape(len(silhouettes), -1) - self.mean) @ self.components.T
+        far = cdist(coordinates, self.known)
         parts = (far[:, chosen] for chosen in (self.sort == 0, self.sort > 0))
         good, bad = (np.partition(part, NEAREST - 1)[:, :NEAREST].mean(axis=1) for part in parts)
         return good**3 / np.maximum(bad, 1e-9), self.sort[far.argmin(axis=1)]

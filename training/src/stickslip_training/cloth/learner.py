@@ -64,8 +64,8 @@ FIRST = 8
 """Batches that standardize the units of a new network. 600 steps over dark floors learned mu to
 0.08 with it, and to 0.14 without it."""
 
-KEPT = 20
-"""Batches of clips that a step chooses from, the last ones."""
+RECENT_BATCHES = 20
+"""Batches of clips that a step chooses from: the newest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +295,7 @@ class FrictionLearner(Learner):
     def sample(self, step: int) -> Batch:
         """Return the batch of a step: clips of the last batches, half of them mirrored."""
         newest = step // self.settings.repeats
-        last = range(max(0, newest - KEPT + 1), newest + 1)
+        last = range(max(0, newest - RECENT_BATCHES + 1), newest + 1)
         self.batches = {number: self.batches.get(number) or self.batch(number) for number in last}
         random = np.random.default_rng((self.settings.seed, CHOICE, step))
         count = self.settings.batch_size

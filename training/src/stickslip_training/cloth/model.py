@@ -48,9 +48,9 @@ class PosteriorNet(nn.Module):
         layers: list[nn.Module] = []
         for number, (before, after) in enumerate(pairwise(channels)):
             kernel = 5 if number == 0 else 3
-            seen = before + (number == _SILHOUETTE_AT)
+            inputs = before + (number == _SILHOUETTE_AT)
             layers += [
-                nn.Conv2d(seen, after, kernel, stride=2, padding=kernel // 2),
+                nn.Conv2d(inputs, after, kernel, stride=2, padding=kernel // 2),
                 nn.GroupNorm(8, after),
                 nn.ReLU(),
             ]
@@ -77,12 +77,12 @@ class PosteriorNet(nn.Module):
         After [Mishkin & Matas 2016].
         """
 
-        def scaled(layer: nn.Module, _: Any, found: torch.Tensor) -> torch.Tensor:
+        def scaled(layer: nn.Module, _: Any, activation: torch.Tensor) -> torch.Tensor:
             assert isinstance(layer, nn.Linear)
-            deviation, mean = torch.std_mean(found, dim=0)
+            deviation, mean = torch.std_mean(activation, dim=0)
             layer.weight.div_(deviation[:, None])
             layer.bias.sub_(mean).div_(deviation)
-            return (found - mean) / deviation
+            return (activation - mean) / deviation
 
         hooks = [
             layer.register_forward_hook(scaled)
@@ -108,8 +108,8 @@ class PosteriorNet(nn.Module):
         )[:, None]
         early = self.encoder[: 3 * _SILHOUETTE_AT]
         late = self.encoder[3 * _SILHOUETTE_AT :]
-        seen = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), masks], dim=1)
-        features = self.frame(late(seen))
+        encoded = torch.cat([early(x.reshape(clips * frames, 1, *crops.shape[2:])), masks], dim=1)
+        features = self.frame(late(encoded))
         return torch.as_tensor(
             self.joined(torch.cat([features.reshape(clips, -1), direction], dim=1))
         )
@@ -221,8 +221,8 @@ def _in_chunks(
     with torch.inference_mode():
         chunks = [slice(first, first + CHUNK) for first in range(0, len(clips), CHUNK)]
         parts = [
-            of(clips.crops[some].to(device), clips.direction[some].to(device)).cpu()
-            for some in chunks
+            of(clips.crops[chunk].to(device), clips.direction[chunk].to(device)).cpu()
+            for chunk in chunks
         ]
     return np.asarray(torch.cat(parts).numpy())
 

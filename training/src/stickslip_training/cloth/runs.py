@@ -101,11 +101,11 @@ def runs_of_dataset(
             )
     slots = []
     meshes = []
-    seen = set()
+    shapes = set()
     for slot in reader.slots(split).tolist():
         mesh = reader.read("positions", [slot])[0][list(instants)]
-        if (key := mesh[-1].tobytes()) not in seen:
-            seen.add(key)
+        if (key := mesh[-1].tobytes()) not in shapes:
+            shapes.add(key)
             slots.append(slot)
             meshes.append(mesh)
     if not slots:

@@ -359,10 +359,10 @@ def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.N
     import cv2
 
     matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    found = {
+    frames = {
         number: picture for number, (_, picture) in enumerate(_frames(path)) if number in chosen
     }
-    return [cv2.undistort(found[number], matrix, np.array(camera.distortion)) for number in chosen]
+    return [cv2.undistort(frames[number], matrix, np.array(camera.distortion)) for number in chosen]
 
 
 def floor_motion(
@@ -385,7 +385,9 @@ def floor_motion(
         cv2.GaussianBlur(picture, (0, 0), 0.7) - cv2.GaussianBlur(picture, (0, 0), 3.0)
         for picture in small
     )
-    return min((_aligned(a, b, start) for start in (near, np.zeros(2))), key=lambda found: found[1])
+    return min(
+        (_aligned(a, b, start) for start in (near, np.zeros(2))), key=lambda alignment: alignment[1]
+    )
 
 
 def _aligned(a: Any, b: Any, start: Floats) -> tuple[Floats, float]:

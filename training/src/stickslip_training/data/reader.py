@@ -263,12 +263,12 @@ class DatasetReader:
         inline = inline.get("metadata") if isinstance(inline, dict) else None
         for name, array in self.arrays.items():
             if isinstance(inline, dict):
-                found = inline.get(name)
+                metadata = inline.get(name)
             else:
                 file = self.index.file(f"{name}/{GROUP_NAME}", "metadata")
-                found = _parse_metadata(self.index.read_document(file), self.index.at(file))
+                metadata = _parse_metadata(self.index.read_document(file), self.index.at(file))
             size = self.manifest.spec.samples_per_file(array)
-            _check_array(found, array, sample_count=len(self), samples_per_file=size)
+            _check_array(metadata, array, sample_count=len(self), samples_per_file=size)
 
     def _check_labels(self) -> None:
         """Check that the manifest fits the arrays `valid` and `split`.
@@ -392,17 +392,17 @@ def _check_array(
     defaults = _DEFAULTS | (
         {"bytes": {"endian": "little"}} if np.dtype(array.dtype).itemsize == 1 else {}
     )
-    found = {
+    stated = {
         **metadata,
         "chunk_key_encoding": _normalised(metadata.get("chunk_key_encoding"), defaults),
         "codecs": _normalised(metadata.get("codecs"), defaults),
         "storage_transformers": metadata.get("storage_transformers") or [],
     }
     for field, rule in expected.items():
-        if found.get(field) != rule:
+        if stated.get(field) != rule:
             raise InvalidDatasetError(
                 f"array {array.name}: {field} must be {json.dumps(rule)}, and is "
-                f"{json.dumps(found.get(field))}"
+                f"{json.dumps(stated.get(field))}"
             )
 
 

@@ -175,8 +175,8 @@ class _Run:
     on_epoch: Callable[[EpochReport], None] | None
 
     def __post_init__(self) -> None:
-        kept = ("epoch", "seed", "averaging", "clip")
-        self.identity |= {name: getattr(self.settings, name) for name in kept}
+        names = ("epoch", "seed", "averaging", "clip")
+        self.identity |= {name: getattr(self.settings, name) for name in names}
         self.net = self.learner.net.to(
             self.settings.device
         )  # the learner sees it move, and puts its batches there

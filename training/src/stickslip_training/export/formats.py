@@ -21,12 +21,14 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.base import sha256
 from stickslip_schemas.format.selection import Selection
+from stickslip_schemas.kinds.cloth.arrays import PICTURE_SIZE
 from stickslip_schemas.spec.arrays import SPLITS, ArrayLayout, describe
 from stickslip_schemas.store import sync
 
 from stickslip_training.arrays import Array
 from stickslip_training.data.reader import DatasetReader
 from stickslip_training.data.sources import CorruptDataError
+from stickslip_training.export.masks import SEGMENTATION, document
 from stickslip_training.export.strict_json import strict_json
 
 OnBytes = Callable[[int], None]
@@ -94,6 +96,17 @@ class Content:
         if self.reader.arrays[name].is_label:
             return self.reader.label(name)[slots]
         return self.reader.read(name, slots)
+
+    def picture(self, name: str, slot: int) -> Array:
+        """Return the frames (n, y, x, ...) of a sample, as large as its picture is.
+
+        If viewpoints differ in size, arrays have the largest one.
+        """
+        frames: Array = self.read(name, np.array([slot]))[0]
+        if PICTURE_SIZE.name not in self.reader.arrays:
+            return frames
+        width, height = self.reader.label(PICTURE_SIZE.name)[slot].tolist()
+        return frames[:, :height, :width]
 
     def parts(self) -> Iterator[tuple[str, int, int, npt.NDArray[np.int64]]]:
         """Yield split, number, count of the files of that split, and slots of each file.
@@ -234,7 +247,8 @@ def write_hdf5(content: Content, path: Path, on_bytes: OnBytes) -> None:
 def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     """Write `train-000000.tar` and so on.
 
-    A sample is `SLOT.json` with its labels, and `SLOT.ARRAY.npy` for each other array.
+    A sample is `SLOT.json` with its labels, `SLOT.ARRAY.npy` for each other array, and, if the
+    dataset has segmentation, `SLOT.coco.json` with masks and boxes of all things in all frames.
 
     Categories are codes, as in the version, and `dataset.json` names them. A label that is infinite
     or NaN is null.
@@ -244,17 +258,27 @@ def write_webdataset(content: Content, directory: Path, on_bytes: OnBytes) -> No
         path = directory / f"{split}-{number:06d}.tar"
         with tarfile.open(path, "x", format=tarfile.USTAR_FORMAT) as tar:
             for slot in slots.tolist():
-                _add(tar, f"{slot:08d}.json", strict_json(_sample_labels(content, slot)).encode())
+                _add(tar, f"{slot:08d}.json", strict_json(sample_labels(content, slot)).encode())
                 # WebDataset groups the files of a sample by the name before the first dot.
                 for name in big:
                     buffer = io.BytesIO()
                     values = content.read(name, np.array([slot]))[0]
                     np.save(buffer, values, allow_pickle=False)
                     _add(tar, f"{slot:08d}.{name}.npy", buffer.getvalue())
+                if SEGMENTATION in big:
+                    _add(tar, f"{slot:08d}.coco.json", _coco_document(content, slot))
                 on_bytes(content.sample_bytes)
 
 
-def _sample_labels(content: Content, slot: int) -> dict[str, Any]:
+def _coco_document(content: Content, slot: int) -> bytes:
+    """Return masks and boxes of the frames of a sample as a COCO document."""
+    arrays = {array.name: array for array in content.arrays}
+    names = arrays[SEGMENTATION].attributes["categories"]
+    codes = content.picture(SEGMENTATION, slot)
+    return strict_json(document(codes, names, f"{slot:08d}.video.npy[{{frame}}]")).encode()
+
+
+def sample_labels(content: Content, slot: int) -> dict[str, Any]:
     """Return the labels of a sample as plain values."""
     alone = np.array([slot])
     return {array.name: content.read(array.name, alone)[0].tolist() for array in content.labels}
@@ -281,7 +305,7 @@ def write_obj(content: Content, directory: Path, on_bytes: OnBytes) -> None:
     for slot in content.slots.tolist():
         folder = directory / f"{slot:08d}"
         folder.mkdir()
-        labels = strict_json(_sample_labels(content, slot), indent=2)
+        labels = strict_json(sample_labels(content, slot), indent=2)
         (folder / "labels.json").write_text(labels + "\n")
         for instant, text in enumerate(_obj_files(content, sheets, slot)):
             (folder / f"{instant:04d}.obj").write_text(text)
@@ -355,13 +379,13 @@ def write_huggingface(content: Content, directory: Path, on_bytes: OnBytes) -> N
             path, schema, compression="zstd", write_page_checksum=True
         ) as writer:
             for first in range(0, len(slots), rows):
-                some = slots[first : first + rows]
+                batch = slots[first : first + rows]
                 columns = [
-                    _column(content.read(array.name, some), schema.field(array.name).type)
+                    _column(content.read(array.name, batch), schema.field(array.name).type)
                     for array in content.arrays
                 ]
                 writer.write_table(pyarrow.Table.from_arrays(columns, schema=schema))
-                on_bytes(len(some) * content.sample_bytes)
+                on_bytes(len(batch) * content.sample_bytes)
     (directory / "README.md").write_text(_card(content, splits), encoding="utf-8")
 
 

@@ -9,7 +9,8 @@ this frame, the poses of all bodies, and the places of five vertices of each she
 the middle. `observation.time` is the time in the scene [s], for videos have their frames evenly.
 Labels are columns of the episodes.
 
-Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has.
+Videos are H.264 without loss, in RGB: a frame has the bytes that the dataset has. If the dataset
+has depth, each view has a depth map, too, in the twelve bits of lerobot 0.6 and later (`videos`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,14 +25,19 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_training.arrays import Array
 from stickslip_training.export.formats import Content, OnBytes
 from stickslip_training.export.strict_json import strict_json
+from stickslip_training.export.videos import (
+    DepthRange,
+    encode_depth,
+    encode_pictures,
+    statistics_of_codes,
+)
 
 FILES = 1000
 """Files of a folder."""
 EPISODES_IN_FILE = 1000
 """Episodes whose numbers go into one file."""
-KEY_FRAMES = 10
-"""Frames from one that is whole to the next: a frame is found by decoding so many at most."""
-
+PICTURES = "observation.images.{view}"
+DEPTH = "observation.images.{view}_depth"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 NEEDED = ("video", "holder_pose", "grasped")
@@ -94,9 +100,13 @@ class _Export:
             instants=np.array(arrays["video"].attributes["instants"]),
             per_second=per_second.limit_denominator(1000),
         )
-        self.clip_shape = arrays["video"].shape
         self.episodes = list(_episodes(content))
-        self.views = list(self.episodes[0][1])
+        first = self.episodes[0][1]
+        self.views = list(first)
+        self.sizes = {view: _picture_size(content, slot) for view, slot in first.items()}
+        self.depth_range: DepthRange | None = None
+        if "depth" in arrays:
+            self.depth_range = DepthRange.spanning(_depth_maps(content, self.episodes))
         self.statistics: list[dict[str, Any]] = []
         """Of each episode, by feature."""
         self.rows: list[dict[str, Any]] = []
@@ -135,19 +145,33 @@ class _Export:
         chunk, file = divmod(number, FILES)
         columns: dict[str, Any] = {}
         for view, slot in slots.items():
-            key = f"observation.images.{view}"
-            video = self.content.read("video", np.array([slot]))[0]
-            path = self.directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
-            _encode(video, path, self.clock.rate)
-            self.statistics[-1][key] = _statistics(video.reshape(-1, 3) / 255.0, (3, 1, 1))
-            columns |= {
-                f"videos/{key}/chunk_index": chunk,
-                f"videos/{key}/file_index": file,
-                f"videos/{key}/from_timestamp": 0.0,
-                f"videos/{key}/to_timestamp": float(self.clock.length / self.clock.rate),
-            }
+            for key in self._write_views(view, slot, chunk, file):
+                columns |= {
+                    f"videos/{key}/chunk_index": chunk,
+                    f"videos/{key}/file_index": file,
+                    f"videos/{key}/from_timestamp": 0.0,
+                    f"videos/{key}/to_timestamp": float(self.clock.length / self.clock.rate),
+                }
             self.on_bytes(self.content.sample_bytes)
         return columns
+
+    def _write_views(self, view: str, slot: int, chunk: int, file: int) -> Iterator[str]:
+        """Write the clip of a sample and its depth map, and yield the features that they are."""
+        key = PICTURES.format(view=view)
+        video = self.content.picture("video", slot)
+        encode_pictures(video, self._video_path(key, chunk, file), self.clock.rate)
+        self.statistics[-1][key] = statistics_of_codes(video, np.arange(256) / 255.0)
+        yield key
+        if self.depth_range is not None:
+            key = DEPTH.format(view=view)
+            codes = self.depth_range.codes(self.content.picture("depth", slot))
+            encode_depth(codes, self._video_path(key, chunk, file), self.clock.rate)
+            levels = self.depth_range.levels
+            self.statistics[-1][key] = statistics_of_codes(codes[..., None], levels)
+            yield key
+
+    def _video_path(self, key: str, chunk: int, file: int) -> Path:
+        return self.directory / VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
 
     def _add_row(
         self,
@@ -190,8 +214,66 @@ class _Export:
         for feature in self.statistics[0]:
             totals[feature] = _merged([episode[feature] for episode in self.statistics])
         (meta / "stats.json").write_text(strict_json(totals))
-        info = _info(self.episodes, names, self.views, float(self.clock.rate), self.clip_shape)
+        info = _info(self.episodes, names, self._views(), self.clock)
         (meta / "info.json").write_text(strict_json(info, indent=2))
+
+    def _views(self) -> dict[str, Any]:
+        """Return the features of all videos, by name."""
+        rate = float(self.clock.rate)
+        features: dict[str, Any] = {}
+        for view, (width, height) in self.sizes.items():
+            pictures = {"codec": "h264", "pix_fmt": "gbrp", "is_depth_map": False}
+            key = PICTURES.format(view=view)
+            features[key] = _video_feature(width, height, 3, rate, pictures)
+            if self.depth_range is not None:
+                depth = {
+                    "codec": "hevc",
+                    "pix_fmt": "gray12le",
+                    "is_depth_map": True,
+                    "depth_min": self.depth_range.near,
+                    "depth_max": self.depth_range.far,
+                    "shift": 0.0,
+                    "use_log": False,
+                }
+                key = DEPTH.format(view=view)
+                features[key] = _video_feature(width, height, 1, rate, depth)
+                # LeRobot looks for the mark under its name alone.
+                features[key]["info"]["is_depth_map"] = True
+        return features
+
+
+def _video_feature(
+    width: int, height: int, channels: int, rate: float, details: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the feature of a video; `details` are those of its encoding."""
+    info = {
+        "height": height,
+        "width": width,
+        **details,
+        "fps": rate,
+        "channels": channels,
+    }
+    return {
+        "dtype": "video",
+        "shape": [height, width, channels],
+        "names": ["height", "width", "channels"],
+        "info": {f"video.{name}": value for name, value in info.items()} | {"has_audio": False},
+    }
+
+
+def _picture_size(content: Content, slot: int) -> tuple[int, int]:
+    """Return width and height of the pictures of a sample [px]."""
+    height, width = content.picture("video", slot).shape[1:3]
+    return width, height
+
+
+def _depth_maps(
+    content: Content, episodes: Sequence[tuple[str, dict[str, int]]]
+) -> Iterator[Array]:
+    """Yield the depth maps of all clips, one clip at a time."""
+    for _, slots in episodes:
+        for slot in slots.values():
+            yield content.picture("depth", slot)
 
 
 def _file_of(number: int) -> dict[str, int]:
@@ -302,25 +384,6 @@ def _flat_poses(poses: Array) -> Array:
     return np.concatenate([poses[..., 3], poses[..., 0], poses[..., 1]], axis=-1)
 
 
-def _encode(video: Array, path: Path, rate: Fraction) -> None:
-    """Write a clip (frames, height, width, 3), 8-bit sRGB, as a video without loss."""
-    import av
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as file:
-        options = {"qp": "0", "bf": "0", "g": str(KEY_FRAMES)}
-        stream = file.add_stream("libx264rgb", rate=rate, options=options)
-        stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "rgb24"
-        stream.thread_count = 1  # the same clip has the same bytes
-        for picture in video:
-            file.mux(
-                stream.encode(
-                    av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-                )
-            )
-        file.mux(stream.encode())
-
-
 def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
     """Return the frames of an episode, one a row."""
     import pyarrow
@@ -343,11 +406,8 @@ def _table(frames: dict[str, Array], number: int, rate: Fraction) -> Any:
     return pyarrow.table(columns)
 
 
-def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
-    """Return the statistics with which LeRobot normalises, of values (n, k).
-
-    They are lists of a shape, (k,) by default.
-    """
+def _statistics(values: Array) -> dict[str, Any]:
+    """Return the statistics with which LeRobot normalises, of values (n, k): lists of k."""
     exact = values.astype(np.float64)
     statistics = {
         "min": exact.min(axis=0),
@@ -355,7 +415,7 @@ def _statistics(values: Array, shape: tuple[int, ...] | None = None) -> dict[str
         "mean": exact.mean(axis=0),
         "std": exact.std(axis=0),
     }
-    lists = {name: value.reshape(shape or -1).tolist() for name, value in statistics.items()}
+    lists = {name: value.tolist() for name, value in statistics.items()}
     return lists | {"count": [len(values)]}
 
 
@@ -394,41 +454,23 @@ def _labels(content: Content, slot: int) -> dict[str, Any]:
 def _info(
     episodes: list[tuple[str, Any]],
     names: dict[str, list[str]],
-    views: list[str],
-    rate: float,
-    shape: tuple[int, ...],
+    views: dict[str, Any],
+    clock: _Clock,
 ) -> dict[str, Any]:
-    """Return `info.json`; `shape` is that of a clip."""
-    length, height, width, _ = shape
+    """Return `info.json`; `views` are the features of the videos."""
+    rate = float(clock.rate)
     features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": [len(numbers)], "names": numbers}
         for name, numbers in names.items()
     }
-    features |= {
-        f"observation.images.{view}": {
-            "dtype": "video",
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": height,
-                "video.width": width,
-                "video.codec": "h264",
-                "video.pix_fmt": "gbrp",
-                "video.is_depth_map": False,
-                "video.fps": rate,
-                "video.channels": 3,
-                "has_audio": False,
-            },
-        }
-        for view in views
-    }
+    features |= views
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
     return {
         "codebase_version": "v3.0",
         "robot_type": "holders",
         "total_episodes": len(episodes),
-        "total_frames": length * len(episodes),
+        "total_frames": clock.length * len(episodes),
         "total_tasks": 1,
         "chunks_size": FILES,
         "data_files_size_in_mb": 100,

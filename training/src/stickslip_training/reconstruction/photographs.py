@@ -19,7 +19,7 @@ from stickslip_schemas.spec.cameras import Camera, read_rigs
 from stickslip_training.reconstruction.pipeline import Reconstruction, reconstruct
 from stickslip_training.reconstruction.views import ReconstructionError
 
-FOUND = (0, 255, 255)
+RECONSTRUCTED = (0, 255, 255)
 TRUE = (255, 60, 255)
 """Colours of centrelines."""
 LEAST_HEIGHT = 600  # [px]: smaller pictures are enlarged by a whole factor
@@ -40,7 +40,7 @@ def save_overlay(
     path: Path,
     views: Sequence[npt.NDArray[np.uint8]],
     cameras: Sequence[Camera],
-    found: npt.NDArray[np.float64],
+    centerline: npt.NDArray[np.float64],
     true: npt.NDArray[np.float64] | None = None,
 ) -> None:
     """Write a PNG of the views (y, x, rgb) side by side, with centrelines over them.
@@ -50,7 +50,11 @@ def save_overlay(
     module = import_pillow()
     from PIL import ImageDraw
 
-    curves = [(found, FOUND)] if true is None else [(true, TRUE), (found, FOUND)]
+    curves = (
+        [(centerline, RECONSTRUCTED)]
+        if true is None
+        else [(true, TRUE), (centerline, RECONSTRUCTED)]
+    )
     panels = []
     for pixels, camera in zip(views, cameras, strict=True):
         factor = max(1, round(LEAST_HEIGHT / camera.height))
@@ -167,9 +171,11 @@ def read_photograph(folder: Path, camera: Camera) -> npt.NDArray[np.uint8]:
 def write_results(result: FolderReconstruction, out: Path) -> list[str]:
     """Write centerline.csv, centerline.npz, overlay.png and report.json; return their names."""
     out.mkdir(parents=True, exist_ok=True)
-    found = result.reconstruction
-    s = np.linspace(0.0, result.length, len(found.centerline))
-    table = np.column_stack([s, found.centerline, found.deviation, found.views_seen])
+    reconstruction = result.reconstruction
+    s = np.linspace(0.0, result.length, len(reconstruction.centerline))
+    table = np.column_stack(
+        [s, reconstruction.centerline, reconstruction.deviation, reconstruction.views_seen]
+    )
     header = "arc_length,x,y,z,deviation,views_seen"
     np.savetxt(
         out / "centerline.csv",
@@ -180,26 +186,26 @@ def write_results(result: FolderReconstruction, out: Path) -> list[str]:
         comments="",
     )
     arrays: dict[str, Any] = {
-        name: getattr(found, name) for name in ("deviation", "residual", "views_seen")
+        name: getattr(reconstruction, name) for name in ("deviation", "residual", "views_seen")
     }
-    np.savez(out / "centerline.npz", arc_length=s, centerline=found.centerline, **arrays)
-    save_overlay(out / "overlay.png", result.views, result.cameras, found.centerline)
+    np.savez(out / "centerline.npz", arc_length=s, centerline=reconstruction.centerline, **arrays)
+    save_overlay(out / "overlay.png", result.views, result.cameras, reconstruction.centerline)
     report = {
-        "verdict": found.verdict.value,
-        "reasons": list(found.reasons),
+        "verdict": reconstruction.verdict.value,
+        "reasons": list(reconstruction.reasons),
         "length": result.length,
-        "radius": found.radius,
-        "points": len(found.centerline),
-        "misfit": found.misfit,
-        "unexplained": found.unexplained,
-        "unsupported": found.unsupported,
-        "rival": found.rival if np.isfinite(found.rival) else None,
-        "residual_rms_px": found.residual_rms,
+        "radius": reconstruction.radius,
+        "points": len(reconstruction.centerline),
+        "misfit": reconstruction.misfit,
+        "unexplained": reconstruction.unexplained,
+        "unsupported": reconstruction.unsupported,
+        "rival": reconstruction.rival if np.isfinite(reconstruction.rival) else None,
+        "residual_rms_px": reconstruction.residual_rms,
         "residual_rms_px_by_view": {
             camera.name: float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else None
-            for camera, row in zip(result.cameras, found.residual, strict=True)
+            for camera, row in zip(result.cameras, reconstruction.residual, strict=True)
         },
-        "median_deviation": float(np.median(found.deviation)),
+        "median_deviation": float(np.median(reconstruction.deviation)),
     }
     (out / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return ["centerline.csv", "centerline.npz", "overlay.png", "report.json"]

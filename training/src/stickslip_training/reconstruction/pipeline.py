@@ -124,10 +124,10 @@ def reconstruct(
     if not np.linalg.norm(heading) > 0.0:
         raise ValueError("direction must not be zero")
     heading = heading / np.linalg.norm(heading)
-    seen = _silhouettes(views, cameras, length, origin)
-    size = radius / length if radius is not None else _radius(seen)
-    fits = _refined(seen, size, heading, radius is not None)
-    judged = sorted(((_match(seen, fit), fit) for fit in fits), key=lambda item: item[0])
+    silhouettes = _silhouettes(views, cameras, length, origin)
+    size = radius / length if radius is not None else _radius(silhouettes)
+    fits = _refined(silhouettes, size, heading, radius is not None)
+    judged = sorted(((_match(silhouettes, fit), fit) for fit in fits), key=lambda item: item[0])
     (misfit, unexplained, unsupported), fit = judged[0]
     shape = at_uniform_arc_length(fit.control, points)
     rivals = [
@@ -136,7 +136,7 @@ def reconstruct(
         if _distance(rival.control, fit.control) > APART
     ]
     rival = min(rivals, default=float("inf"))
-    residual = _residual(seen, fit, points)
+    residual = _residual(silhouettes, fit, points)
     verdict, reasons = _judge(
         (misfit, unexplained, unsupported, abs(arc_length(shape)[-1] - 1.0)), rival
     )
@@ -270,14 +270,14 @@ def _match(views: Sequence[View], fit: Fit) -> tuple[float, float, float]:
         # Behind the clamp nothing is known.
         known = np.ones(view.coverage.size, dtype=bool)
         known[image.left_out] = False
-        seen = np.minimum(view.coverage.ravel(), 1.5)[known]
+        coverage = np.minimum(view.coverage.ravel(), 1.5)[known]
         drawn = drawn[known]
         # Pixels of one without the other count as unexplained or unsupported.
-        seen_sum += seen.sum()
+        seen_sum += coverage.sum()
         drawn_sum += drawn.sum()
-        difference += np.abs(seen - drawn).sum()
-        unexplained += seen[(drawn < 0.1 * seen) & (seen > 0.3)].sum()
-        unsupported += drawn[(seen < 0.1 * drawn) & (drawn > 0.3)].sum()
+        difference += np.abs(coverage - drawn).sum()
+        unexplained += coverage[(drawn < 0.1 * coverage) & (coverage > 0.3)].sum()
+        unsupported += drawn[(coverage < 0.1 * drawn) & (drawn > 0.3)].sum()
     return (difference / seen_sum, unexplained / seen_sum, unsupported / max(drawn_sum, 1e-9))
 
 

@@ -108,13 +108,13 @@ def _ground(light: Floats) -> Floats:
     y = np.linspace(-1.0, 1.0, height)
     powers = [(i, j) for i in range(GROUND_DEGREE + 1) for j in range(GROUND_DEGREE + 1 - i)]
     grid_y, grid_x = np.meshgrid(y[::step], x[::step], indexing="ij")
-    some = np.stack([(grid_y**i * grid_x**j).ravel() for i, j in powers], axis=1)
+    basis = np.stack([(grid_y**i * grid_x**j).ravel() for i, j in powers], axis=1)
     values = light[::step, ::step].reshape(-1, channels)
     luminance = values.mean(axis=1)
     ground = luminance <= np.quantile(luminance, 0.7)
     for _ in range(4):
-        coefficients = np.linalg.lstsq(some[ground], values[ground], rcond=None)[0]
-        excess = luminance - (some @ coefficients).mean(axis=1)
+        coefficients = np.linalg.lstsq(basis[ground], values[ground], rcond=None)[0]
+        excess = luminance - (basis @ coefficients).mean(axis=1)
         spread = 1.4826 * np.median(np.abs(excess[ground])) + 1e-4
         ground = np.abs(excess) < 4.0 * spread
     fitted = np.zeros_like(light)
@@ -347,15 +347,15 @@ def _passes(pixels: Floats, reach: Floats, shape: tuple[int, ...]) -> tuple[Inte
     y = nearest[:, 1:] + y[disc]
     apart = (x - pixels[:, :1]) ** 2 + (y - pixels[:, 1:]) ** 2
     height, width = shape
-    found = np.flatnonzero(
+    near = np.flatnonzero(
         (apart <= reach[:, None] ** 2) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     )
-    sample = found // x.shape[1]
-    pixel = y.ravel()[found] * width + x.ravel()[found]
+    sample = near // x.shape[1]
+    pixel = y.ravel()[near] * width + x.ravel()[near]
     order = np.argsort(pixel * len(pixels) + sample)  # no two are equal
     pixel = pixel[order]
     sample = sample[order]
-    distance = apart.ravel()[found][order]
+    distance = apart.ravel()[near][order]
     if len(pixel) == 0:
         return pixel, sample
     starts = np.flatnonzero(np.concatenate([[True], (np.diff(pixel) != 0) | (np.diff(sample) > 1)]))
@@ -379,16 +379,16 @@ def _compose(
     last = np.append(first[1:], len(order)) - 1
     has_back = last > first
     back = order[np.where(has_back, first + 1, first)]
-    kept = ~left_out[front] & ~(left_out[back] & has_back)
-    hidden = pixel[front[~kept]]
-    front = front[kept]
-    back = back[kept]
-    seen = has_back[kept].astype(np.float64)
-    through = seen * (1.0 - part.by_light[front])
+    is_front = ~left_out[front] & ~(left_out[back] & has_back)
+    hidden = pixel[front[~is_front]]
+    front = front[is_front]
+    back = back[is_front]
+    has_light = has_back[is_front].astype(np.float64)
+    through = has_light * (1.0 - part.by_light[front])
     # The front's own derivatives act on I_1 (1 - I_2 c_1 / I_1): its light does not change what it
     # covers.
     lost = (
-        seen
+        has_light
         * value[back]
         * np.divide(
             part.by_light[front], value[front], out=np.zeros(len(front)), where=value[front] > 1e-6

@@ -91,7 +91,8 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
         )
     arrays = ("centerline", "curvature")
     return {
-        split: Rods(*(reader.read(name, some) for name in arrays)) for split, some in slots.items()
+        split: Rods(*(reader.read(name, batch) for name in arrays))
+        for split, batch in slots.items()
     }, notes
 
 

@@ -207,13 +207,13 @@ def _method(name: str, estimate: Floats, truth: Floats, started: float) -> dict[
     seconds = (time.perf_counter() - started) / len(truth)
     errors = relative_rms_error(estimate, truth)
     median, p90 = np.quantile(errors, (0.5, 0.9)).tolist()
-    found = {
+    report = {
         "method": name,
         "rms": rms(estimate - truth),
         "relative_median": median,
         "relative_p90": p90,
     }
-    return found | {"seconds_per_rod": seconds}
+    return report | {"seconds_per_rod": seconds}
 
 
 def bending(strains: AnyFloats) -> Floats:

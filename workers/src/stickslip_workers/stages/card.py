@@ -41,7 +41,7 @@ def card(manifest: Manifest) -> bytes:
     name = f"{manifest.dataset}:v{manifest.version}"
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
     arrays = layout(spec)
-    told = next((array for array in arrays if array.per_sample), arrays[0])
+    example = next((array for array in arrays if array.per_sample), arrays[0])
     where = (
         ", the most of them in its sections, `manifest/0.json` and so on"
         if manifest.sections
@@ -86,7 +86,7 @@ def card(manifest: Manifest) -> bytes:
         "## How to read it",
         "Any Zarr v3 reader opens this directory:",
         '```python\nimport zarr\n\ngroup = zarr.open_group(".", mode="r")\n'
-        f'valid = group["valid"][:]\nsample = group["{told.name}"][int(valid.argmax())]\n```',
+        f'valid = group["valid"][:]\nsample = group["{example.name}"][int(valid.argmax())]\n```',
         "Read `valid` first: a rejected sample keeps its slot and holds fill values. The reader of "
         "stickslip checks every file against `manifest.json` and raises an error where one is "
         "missing or damaged:",
@@ -113,8 +113,8 @@ def _values(axis: AnyAxis) -> str:
     if not isinstance(axis, ListAxis):
         low, high = (axis.start, axis.stop) if axis.type == "linspace" else (axis.low, axis.high)
         return f"{axis.num} from {low:g} to {high:g} ({axis.type})"
-    shown = ", ".join(str(value) for value in axis.values[:SHOWN_VALUES])
-    return shown if axis.num <= SHOWN_VALUES else f"{shown} and {axis.num - SHOWN_VALUES} more"
+    text = ", ".join(str(value) for value in axis.values[:SHOWN_VALUES])
+    return text if axis.num <= SHOWN_VALUES else f"{text} and {axis.num - SHOWN_VALUES} more"
 
 
 def _array_row(array: Any) -> tuple[str, str, str, str]:
@@ -177,12 +177,12 @@ def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 def pictured(spec: JobSpec) -> ArrayLayout | None:
     """Return the array that shows a dataset of `spec` best, or None if it has no pictures."""
-    seen = (
+    pictured_arrays = (
         array
         for array in layout(spec)
         if array.per_sample and array.dimensions[-3:] == ("y", "x", "rgb")
     )
-    return next(seen, None)
+    return next(pictured_arrays, None)
 
 
 def preview(
@@ -195,12 +195,15 @@ def preview(
     """
     if not valid:
         return None
-    shown = [valid[place] for place in shown_frames(min(SHOWN_SAMPLES, len(valid)), len(valid))]
-    points = {slot: point for slot, point in enumerate(spec.grid()) if slot in shown}
+    slots = [valid[place] for place in shown_frames(min(SHOWN_SAMPLES, len(valid)), len(valid))]
+    points = {slot: point for slot, point in enumerate(spec.grid()) if slot in slots}
     tiles = []
-    for slot in shown:
+    for slot in slots:
         pictures = np.empty(array.shape, dtype=np.uint8)
         decode_sample(array, chunk(slot), pictures)
+        part = spec.picture_part(points[slot])
+        if part is not None:
+            pictures = pictures[:, : part[1], : part[0]]
         count = min(FRAMES, len(pictures)) if array.is_clip else 1
         varied = {
             name: value for name, value in points[slot].items() if spec.named_axes[name].num > 1

@@ -183,7 +183,6 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
             0.1,
         ),
         "passages": ("triangles that passed the core of a body", 0.0),
-        "sharpness": ("side of a cell over the radius of the sharpest body that bore cloth", 2.0),
     }
 )
 """Checks of the solver by name: the quantity, at its worst, and the limit of valid samples;

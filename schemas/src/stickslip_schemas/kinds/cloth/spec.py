@@ -153,8 +153,12 @@ class ClipRender(Render):
         return (self.camera.width, self.camera.height) if self.camera else self.resolution
 
     @property
-    def pixels(self) -> int:
-        return len(self.instants) * prod(self.picture_size)
+    def frame_pixels(self) -> int:
+        return prod(self.picture_size)
+
+    @property
+    def clip_pixels(self) -> int:
+        return len(self.instants) * self.frame_pixels
 
     @property
     def shading(self) -> dict[str, Any]:
@@ -328,6 +332,9 @@ class ClipSpec(JobSpec):
     def shown_instants(self) -> tuple[int, ...]:
         """Which instants of the trajectory the frames of a clip show."""
         return shown_frames(self.frames, self.instants)
+
+    def picture_part(self, point: Mapping[str, Any]) -> tuple[int, int] | None:
+        return self.picture_size(point["viewpoint"]) if self.canvas else None
 
     def fields_of(self, axis: str) -> tuple[str, ...]:
         return (axis, self.custom[axis].field) if axis in self.custom else (axis,)

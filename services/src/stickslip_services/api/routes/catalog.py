@@ -120,7 +120,7 @@ def _serve(
     request: Request, context: ContextDep, dataset: str, version: int, path: str
 ) -> Response:
     with context.database.read() as connection:
-        found = find_version(connection, dataset, version)
+        row = find_version(connection, dataset, version)
     if path == SIGNATURE_NAME:  # it may be made, and replaced, at any time
         try:
             signature = context.store.read_shown(dataset, version, path)
@@ -129,7 +129,7 @@ def _serve(
         return Response(
             signature, headers={"Cache-Control": "no-store"}, media_type="application/octet-stream"
         )
-    file = find_file(context.store, found, path)
+    file = find_file(context.store, row, path)
     return serve(request, context.store, file.sha256, name=path, size=file.size)
 
 

@@ -29,13 +29,13 @@ function drawPlot(figure) {
   const axis = { stroke: css("--quiet"), grid: { stroke: css("--rule"), width: 1 }, ticks: { show: false }, size: 50 };
   const scale = (values) => log && values.every((value) => value === null || value > 0)
     ? { time: false, distr: 3, range: (_, low, high) => [low / 1.1, high * 1.1] } : { time: false };
-  const curves = tables.flatMap(({ curves, dots }) => Object.keys(curves).map((label) => ({ label, ...(dots && { paths: () => null, points: { show: true } }) })));
+  const curves = tables.flatMap(({ curves, dots, dashed }) => Object.keys(curves).map((label, i) => ({ label, colour: dashed ? i : null, ...(dots && { paths: () => null, points: { show: true } }), ...(dashed && { dash: [6, 4] }) })));
   const value = (_, shown) => (shown === null || shown === undefined ? "–" : `${+shown.toPrecision(4)}`);
   const size = () => ({ width: figure.clientWidth, height: 150 });
   let now = 0;
   const plot = new uPlot({
     ...size(),
-    series: [{ label: x, value }, ...curves.map((curve, i) => ({ ...curve, value, stroke: css(`--c${i % 6}`), width: 1.5 }))],
+    series: [{ label: x, value }, ...curves.map((curve, i) => ({ ...curve, value, stroke: css(`--c${(curve.colour ?? i) % 6}`), width: 1.5 }))],
     axes: [{ ...axis, size: 24 }, axis],
     scales: { x: scale(tables.flatMap((table) => table.x)), y: scale(tables.flatMap(({ curves }) => Object.values(curves).flat())) },
     hooks: { draw: [({ ctx, bbox, valToPos }) => {
@@ -58,33 +58,82 @@ function drawPlot(figure) {
 // One cursor of time, an instant of the record, runs through the clip, its ground truth, the view in space and the curves.
 function showSample(view) {
   const slider = view.querySelector(".time"), play = view.querySelector(".play"), output = view.querySelector("output");
-  const clips = [...view.querySelectorAll("[data-root]")], layer = view.querySelector("select");
-  const instants = JSON.parse(view.dataset.frames);
-  let frames = [];
-  const load = () => {
-    frames = clips.map(({ dataset }) => instants.map((_, i) => Object.assign(new Image(), { src: `${dataset.root}${layer.value}/${i}.png` })));
-    for (const link of view.querySelectorAll(".mp4")) link.href = `${link.parentElement.dataset.root}${layer.value}.mp4`;
-  };
+  const layer = view.querySelector(".layer"), rate = +view.dataset.rate, instants = JSON.parse(view.dataset.frames);
+  const screens = [...view.querySelectorAll("[data-root]")].filter((clip) => clip.querySelector(".screen")).map((clip) => makeScreen(clip));
+  let now = 0;
   const show = () => {
-    const now = slider ? +slider.value : 0;
-    if (output) output.textContent = +view.dataset.rate ? `${(now / view.dataset.rate).toFixed(2)} s` : `frame ${now + 1}`;
+    if (output) output.textContent = rate ? `${(now / rate).toFixed(2)} of ${(slider.max / rate).toFixed(2)} s` : `frame ${Math.floor(now) + 1}`;
     const frame = Math.max(0, instants.findLastIndex((instant) => instant <= now));
-    if (layer) clips.forEach((clip, i) => { clip.querySelector("img").src = frames[i][frame].src; });
-    view.dispatchEvent(new CustomEvent("instant", { detail: now }));
+    for (const screen of screens) screen.show(frame);
+    view.dispatchEvent(new CustomEvent("instant", { detail: Math.floor(now) }));
   };
+  const go = (instant) => { now = instant; slider.value = Math.floor(now); show(); };
+  const load = () => { for (const screen of screens) screen.load(layer.value); };
   if (layer) load();
   layer?.addEventListener("change", () => { load(); show(); });
   if (slider) {
-    let timer = null;
-    const stride = Math.max(1, Math.round(slider.max / 60));
-    slider.addEventListener("input", show);
+    const speed = view.querySelector(".speed"), pace = rate || 10;
+    let playing = null;
+    const tick = (before) => (moment) => {
+      if (!playing) return;
+      go((now + (moment - before) / 1000 * pace * +speed.value) % (+slider.max + 1));
+      playing = requestAnimationFrame(tick(moment));
+    };
+    slider.addEventListener("input", () => { now = +slider.value; show(); });
     play.addEventListener("click", () => {
-      if (timer) { clearInterval(timer); timer = null; } else {
-        timer = setInterval(() => { slider.value = (+slider.value + stride) % (+slider.max + 1); show(); }, 80);
+      if (playing) { cancelAnimationFrame(playing); playing = null; } else { playing = requestAnimationFrame((moment) => tick(moment)(moment)); }
+      play.textContent = playing ? "Stop" : "Play";
+      play.setAttribute("aria-pressed", String(Boolean(playing)));
+    });
+    // A step leads to the next frame of the clip, or to the next instant where there is no clip.
+    const stops = instants.length ? instants : Array.from({ length: +slider.max + 1 }, (_, i) => i);
+    for (const button of view.querySelectorAll(".step")) button.addEventListener("click", () => {
+      const at = stops.findLastIndex((stop) => stop <= now) + +button.dataset.step;
+      go(stops[Math.min(Math.max(at, 0), stops.length - 1)]);
+    });
+  }
+  for (const figure of view.querySelectorAll(".space")) {
+    const button = figure.querySelector(".load"), message = figure.querySelector(".message");
+    button.addEventListener("click", async () => {
+      button.disabled = true;
+      message.textContent = "The motion is being loaded.";
+      try {
+        await (await import(view.dataset.space)).show(figure, Math.floor(now));
+        message.textContent = "";
+      } catch (error) {
+        message.textContent = error.message;
       }
-      play.textContent = timer ? "Stop" : "Play";
-      play.setAttribute("aria-pressed", String(Boolean(timer)));
+      button.remove();
     });
   }
   show();
+}
+
+// A clip as MP4, which is loaded as a whole so that any frame is at hand; as pictures where no MP4 can be played.
+function makeScreen(clip) {
+  const video = clip.querySelector("video"), picture = clip.querySelector("img.screen"), query = clip.dataset.query;
+  let name = "", shown = 0, isVideo = Boolean(video);
+  const draw = () => {
+    // The middle of the frame, so that rounding leads to no other one.
+    if (isVideo && video.readyState) video.currentTime = (shown + 0.5) / 10;
+    else if (!isVideo) picture.src = `${clip.dataset.root}${name}/${shown}.png${query}`;
+  };
+  const fallBack = () => { isVideo = false; video.hidden = true; picture.hidden = false; draw(); };
+  video?.addEventListener("loadedmetadata", draw);
+  video?.addEventListener("error", fallBack);
+  return {
+    show(frame) { if (frame !== shown) { shown = frame; draw(); } },
+    async load(layer) {
+      name = layer;
+      const file = `${clip.dataset.root}${layer}.mp4${query}`, link = clip.querySelector(".mp4");
+      if (link) link.href = file;
+      if (!isVideo) { draw(); return; }
+      const answer = await fetch(file);
+      if (!answer.ok) { fallBack(); return; }
+      const old = video.src;
+      video.src = URL.createObjectURL(await answer.blob());
+      video.dataset.layer = layer;
+      if (old) URL.revokeObjectURL(old);
+    },
+  };
 }

@@ -45,30 +45,35 @@ setTimeout(check, CHECK_MS);
 
 if (document.body.hasAttribute("data-live")) follow();
 
+// What a user pressed or filled in, by the word that stands on it.
+function nameOf(element) {
+  const button = element.matches("form") ? element.querySelector("button") : element;
+  return button?.getAttribute("aria-label") || button?.textContent.trim() || element.getAttribute("aria-label") || "The search";
+}
+
 // A request of htmx that failed: say which press it was, and offer it again.
 function tellLost(element, reason) {
   const item = document.createElement("p"), text = document.createElement("span"), again = document.createElement("button");
-  const name = element.getAttribute("aria-label") || element.textContent.trim() || "the request";
   item.className = "notice";
-  text.textContent = `“${name.slice(0, 60)}” had no effect: ${reason} `;
+  text.textContent = `“${nameOf(element).slice(0, 60)}” had no effect: ${reason} `;
   again.textContent = "Try again";
   again.type = "button";
   again.addEventListener("click", () => {
     item.remove();
     // The part of the page may have been drawn anew since.
     const target = element.isConnected ? element : document.getElementById(element.id);
-    if (target) htmx.trigger(target, "click"); else location.reload();
+    if (target) htmx.trigger(target, target.matches("form") ? "submit" : "click"); else location.reload();
   });
   item.append(text, again);
   lost.replaceChildren(item);
 }
 
-const isPress = ({ elt }) => elt.matches("button, a");
+const isPress = ({ elt }) => elt.matches("button, a, form");
 const unanswered = ({ detail }) => { if (isPress(detail)) tellLost(detail.elt, "the service did not answer."); };
 document.body.addEventListener("htmx:sendError", unanswered);
 document.body.addEventListener("htmx:timeout", unanswered);
 document.body.addEventListener("htmx:responseError", ({ detail }) => {
-  if (!isPress(detail)) return;
+  if (!isPress(detail) && !detail.elt.matches("aside")) return;
   let reason = `the service answered with status ${detail.xhr.status}.`;
   try {
     reason = `${JSON.parse(detail.xhr.responseText).detail}.`;

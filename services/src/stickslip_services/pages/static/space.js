@@ -3,11 +3,7 @@ import * as three from "./three.min.js";
 
 const STATES = ["--open", "--stick", "--slip"]; // colours of the states of contact, by code
 
-for (const figure of document.querySelectorAll(".space")) {
-  show(figure).catch((error) => { figure.querySelector(".message").textContent = error.message; });
-}
-
-async function show(figure) {
+export async function show(figure, start) {
   const canvas = figure.querySelector("canvas"), view = figure.closest(".sample");
   let renderer;
   try {
@@ -16,6 +12,8 @@ async function show(figure) {
     canvas.remove();
     throw Error("This browser has no WebGL, which the view in three dimensions needs. Everything else is here.");
   }
+  canvas.hidden = false;
+  figure.querySelector(".legend").hidden = false;
   const answer = await fetch(figure.dataset.motion);
   if (!answer.ok) throw Error("The motion of this sample could not be read.");
   const motion = await answer.json(), paints = [], moves = [];
@@ -83,7 +81,7 @@ async function show(figure) {
         sphere: () => new three.SphereGeometry(body.radius, 48, 24),
         capsule: () => new three.CapsuleGeometry(body.radius, body.length, 12, 32).rotateX(Math.PI / 2),
         cylinder: () => new three.CylinderGeometry(body.radius, body.radius, 2 * extent, 48, 1, true).rotateX(Math.PI / 2),
-        box: () => new three.RoundedBoxGeometry(...body.size, 4, body.rounding ?? Math.min(0.005, ...body.size.map((side) => side / 2))),
+        box: () => new three.RoundedBoxGeometry(...body.size, 4, body.rounding),
         mesh: () => shape(body),
       }[body.type]();
       solid(geometry, "--body", body.poses);
@@ -95,7 +93,7 @@ async function show(figure) {
   }
 
   const controls = new three.OrbitControls(camera, canvas), draw = () => renderer.render(scene, camera);
-  let now = +(view.querySelector(".time")?.value ?? 0);
+  let now = start;
   const go = () => {
     const step = Math.max(0, motion.instants.findLastIndex((instant) => instant <= now));
     for (const move of moves) move(step);
@@ -105,9 +103,16 @@ async function show(figure) {
   view.addEventListener("instant", (event) => { now = event.detail; go(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   controls.target.copy(middle);
-  const far = 0.56 * extent / Math.sin(Math.PI / 360 * camera.fov) / Math.min(1, canvas.clientWidth / canvas.clientHeight);
-  camera.position.copy(middle).addScaledVector(new three.Vector3(0.5, -0.78, 0.38), far);
-  controls.update();
+  // Two samples beside each other have one scale: that of the larger one.
+  const place = (size) => {
+    const far = 0.56 * size / Math.sin(Math.PI / 360 * camera.fov) / Math.min(1, canvas.clientWidth / canvas.clientHeight);
+    camera.position.copy(middle).addScaledVector(new three.Vector3(0.5, -0.78, 0.38), far);
+    controls.update();
+    draw();
+  };
+  view.addEventListener("extent", ({ detail }) => place(detail));
+  view.dataset.extent = Math.max(extent, +(view.dataset.extent ?? 0));
+  view.dispatchEvent(new CustomEvent("extent", { detail: +view.dataset.extent }));
   controls.listenToKeyEvents(canvas);
   controls.addEventListener("change", draw);
   new ResizeObserver(() => {

@@ -4,11 +4,12 @@ They come from the document of the scene and a record. The arrays have the names
 `cloth_scene`. Everything in a document is in the order of its names.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from stickslip_schemas.scene.shapes import cell_side, with_roundings
 from stickslip_schemas.spec.cameras import Camera, framed
 
 from stickslip_blender.cloth.geometry import (
@@ -36,7 +37,6 @@ SUNK = -FLOOR
 ENDLESS = 1.0  # half the visible size of an endless cylinder, or of a plane besides the floor [m]
 TILE = 0.1  # side of the tiles of bodies [m]
 JAWS = 0.004  # excess of a holder over the held part, along each axis [m]
-ROUNDING = 0.005  # default radius of the edges of a box [m], as in the simulation
 MOVING = 0.005  # least way of a moving vertex [m]: cameras frame all moving vertices
 PLAIN = (168, 164, 156)  # sRGB colour of a sheet without a texture from the scene or an axis
 
@@ -92,7 +92,8 @@ class Stage:
                 )
 
         # The first level plane is the floor. It has marks and a mirror image, but no mesh.
-        for number, (name, body) in enumerate(scene["bodies"].items()):
+        bodies = with_roundings(scene["bodies"], self._largest_cell(scene["sheets"]))
+        for number, (name, body) in enumerate(bodies.items()):
             if body["type"] == "plane" and body["normal"][:2] == [0.0, 0.0] and self.floor is None:
                 self.floor = body["origin"][2] + FLOOR
                 self.ground = codes[name]
@@ -201,6 +202,12 @@ class Stage:
         self._placers.append(self._posed("body_pose", number, vertices))
         return Prop(name, vertices, faces, color, look["roughness"], segment=segment)
 
+    def _largest_cell(self, sheets: Iterable[str]) -> float:
+        cells = []
+        for name in sheets:
+            cells.append(cell_side(self._record[f"{name}.rest"], self._record[f"{name}.triangles"]))
+        return max(cells)
+
     def _posed(self, array: str, number: int, vertices: Array) -> Callable[[int], Array]:
         poses = np.asarray(self._record[array][:, number], dtype=np.float64)
 
@@ -225,7 +232,7 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:
         vertices, faces = square(body["normal"], 2.0 * ENDLESS)
         return vertices - SUNK * np.asarray(body["normal"]) / np.linalg.norm(body["normal"]), faces
     if kind == "box":
-        rounding = max(body["rounding"] or min(ROUNDING, 0.5 * min(body["size"])), 2.0 * SUNK)
+        rounding = max(body["rounding"], 2.0 * SUNK)
         return rounded(0.5 * np.asarray(body["size"]) - rounding, rounding - SUNK)
     half = {"sphere": 0.0, "capsule": 0.5 * body.get("length", 0.0), "cylinder": ENDLESS}[kind]
     return rounded((0.0, 0.0, half), body["radius"] - SUNK)

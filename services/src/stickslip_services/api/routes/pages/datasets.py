@@ -5,10 +5,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
 
+import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import RedirectResponse, StreamingResponse
+from pydantic import BaseModel, Field
 from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
@@ -29,19 +32,21 @@ from stickslip_services.catalog.versions import (
 )
 from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
-from stickslip_services.pages.browsing import histograms, losses, sliders, thumbs
+from stickslip_services.pages.browsing import histograms, losses, picture_array, shards, thumbs
+from stickslip_services.pages.choosing import CONDITIONS, OPERATORS, choose, sliders, sortable
 from stickslip_services.pages.motion import motion
-from stickslip_services.pages.pictures import coloured, mp4, shown_part
-from stickslip_services.pages.rendering import html_page, plot, spec_text, table
-from stickslip_services.pages.sample_page import sample_view
+from stickslip_services.pages.pictures import Range, coloured, mp4, range_of, shown_part
+from stickslip_services.pages.rendering import html_page, plot, scene_text, spec_text, table
+from stickslip_services.pages.sample_page import overlaid, sample_view
 from stickslip_services.pages.samples import Array, SampleData
+from stickslip_services.pages.zipping import MAX_ZIPPED, zipped
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.jobs import jobs_of_version
 from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter(include_in_schema=False)
 
-SHOWN_DATASETS = 100
+SHOWN_DATASETS = 50
 SHOWN_CERTIFICATES = 200
 SHOWN_CURVES = 6
 """Curves of a protocol that its page shows."""
@@ -49,8 +54,25 @@ SHOWN_CURVES = 6
 PICTURE_SECONDS = 24 * 3600
 """Time for which a browser keeps a picture [s]."""
 
+COVER_SIDE = 56
+"""Least shorter side of the picture of a dataset in the list [px]."""
+
+_NO_PICTURE = png(np.full((2, 2, 3), 127, np.uint8))
+"""A grey picture for a dataset without one."""
+
+
+class DatasetFilter(BaseModel):
+    """What the form of the list asks for; all of it stands in the address of the page."""
+
+    search: str = Field("", max_length=100)
+    order: Literal["newest", "oldest"] = "newest"
+    after: int | None = Field(None, ge=0, lt=10**18)
+
+
+DatasetFilterDep = Annotated[DatasetFilter, Query()]
 Slot = Annotated[int, Path(ge=0)]
 Step = Annotated[int, Query(ge=1, le=32)]
+Beside = Annotated[int | None, Query(ge=0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +104,39 @@ OpenedDep = Annotated[Opened, Depends(_opened)]
 
 
 @router.get("/datasets")
-def get_datasets(context: ContextDep) -> Response:
-    """Show the newest datasets."""
+def get_datasets(context: ContextDep, chosen: DatasetFilterDep) -> Response:
+    """Show a page of the datasets that fit the form."""
     with context.database.read() as connection:
-        datasets = list_datasets(connection, PageRequest(SHOWN_DATASETS, None)).items
-    return html_page("datasets.html", here="datasets", datasets=datasets)
+        page = list_datasets(
+            connection,
+            PageRequest(SHOWN_DATASETS, chosen.after),
+            chosen.search,
+            newest_first=chosen.order == "newest",
+        )
+    query = chosen.model_dump(mode="json", exclude_defaults=True)
+    return html_page(
+        "datasets.html",
+        here="datasets",
+        datasets=page.items,
+        chosen=chosen,
+        query=query,
+        more=page.next_page_token and urlencode(query | {"after": page.next_page_token}),
+    )
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/cover.png")
+def get_cover(opened: OpenedDep) -> Response:
+    """Return a small picture of the first valid sample; a grey one if there is none."""
+    data = opened.data
+    headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}"}
+    name = picture_array(data)
+    valid = np.flatnonzero(data.label("valid"))
+    if name is None or not valid.size:
+        return Response(_NO_PICTURE, media_type="image/png", headers=headers)
+    values = _value(data, name, int(valid[0]))
+    (picture,) = coloured(data.arrays[name], values, [len(values) // 2])
+    step = max(1, min(picture.shape[:2]) // COVER_SIDE)
+    return Response(png(picture[::step, ::step]), media_type="image/png", headers=headers)
 
 
 @router.get("/datasets/{dataset}")
@@ -113,27 +163,57 @@ def get_version(request: Request, opened: OpenedDep) -> Response:
         jobs=opened.jobs,
         sliders=sliders(data.manifest.spec),
         histograms=histograms(data),
+        labels=sortable(data),
+        operators=OPERATORS,
+        conditions=range(CONDITIONS),
+        shards=shards(data),
+        max_zipped=MAX_ZIPPED,
         splits=SPLITS,
         file_count=None if data.manifest.sections else len(data.manifest.files) + 3,
         card="README.md" if data.contents.file("README.md") else None,
         picture="preview.webp" if data.contents.file("preview.webp") else None,
+        is_continued=False,
         **values,
     )
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/thumbs")
 def get_thumbs(
-    request: Request, opened: OpenedDep, start: Annotated[int, Query(ge=0, lt=2**31)] = 0
+    request: Request,
+    opened: OpenedDep,
+    start: Annotated[int, Query(ge=0, lt=2**31)] = 0,
+    part: Literal["all", "more"] = "all",
 ) -> Response:
     """Show the samples within the filters of the query, from one of them on."""
     values = thumbs(opened.data, request.query_params, start)
-    page = html_page("thumbs.html", dataset=opened.dataset, version=opened.version, **values)
-    if start == 0:
+    page = html_page(
+        "thumbs.html",
+        dataset=opened.dataset,
+        version=opened.version,
+        is_continued=part == "more",
+        max_zipped=MAX_ZIPPED,
+        **values,
+    )
+    if part != "more":
         # The address of the page shows the filters, so that it can be sent to somebody.
         page.headers["HX-Replace-Url"] = link(
             f"/datasets/{opened.dataset.id}/v{opened.version.version}?{request.url.query}"
         )
     return page
+
+
+@router.get("/ui/datasets/{dataset}/v{version}/selection.zip")
+def get_selection(request: Request, opened: OpenedDep) -> Response:
+    """Return the samples within the filters of the query as a zip file."""
+    slots = choose(opened.data, request.query_params).slots
+    if len(slots) > MAX_ZIPPED:
+        raise NotFoundError(
+            f"a zip file has at most {MAX_ZIPPED} samples, and the filters choose {len(slots)}: "
+            "use the command that the page shows"
+        )
+    name = f"{opened.dataset.name or opened.dataset.id}-v{opened.version.version}.zip"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(zipped(opened.data, slots), 200, headers, "application/zip")
 
 
 @router.get("/datasets/{dataset}/v{version}/samples/{slot}")
@@ -152,6 +232,7 @@ def get_sample(
     # A rejected sample has labels of its rejection, and no arrays.
     rejections = {number: data.rejection(number) for number in slots}
     valid = [number for number in slots if rejections[number] is None]
+    views = [sample_view(data, number) for number in valid]
     return html_page(
         "sample.html",
         here="datasets",
@@ -161,21 +242,36 @@ def get_sample(
         slot=slot,
         last_slot=last,
         rejections=[rejection for rejection in rejections.values() if rejection is not None],
-        shown=[sample_view(data, number) for number in valid],
+        views=views,
+        plots=overlaid(views),
         has_mp4=find_spec("av") is not None,
     )
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.mp4")
-def get_film(opened: OpenedDep, slot: Slot, array: str) -> Response:
-    """Return a clip, or its ground truth, as MP4 with 10 frames a second."""
+def get_film(opened: OpenedDep, slot: Slot, array: str, beside: Beside = None) -> Response:
+    """Return a clip, or its ground truth, as MP4 with 10 frames a second.
+
+    Numbers have one scale with those of the sample `beside` it.
+    """
     # The browser plays the film; without PyAV the page shows its frames.
     data = opened.data
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
         raise NotFoundError(f"{array[:50]} is no clip")
-    film = mp4(coloured(data.arrays[array], values, range(len(values))))
-    return Response(film, media_type="video/mp4")
+    scale = _scale(data, array, values, beside)
+    film = mp4(coloured(data.arrays[array], values, range(len(values)), scale))
+    headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}"}
+    return Response(film, media_type="video/mp4", headers=headers)
+
+
+def _scale(data: SampleData, array: str, values: Array, beside: int | None) -> Range | None:
+    """Return the range of an array over two samples; None if there is one sample, or no number."""
+    is_number = values.dtype.kind == "f"
+    if beside is None or not is_number:
+        return None
+    ranges = [range_of(values), range_of(_value(data, array, beside))]
+    return min(low for low, _ in ranges), max(high for _, high in ranges)
 
 
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
@@ -192,6 +288,7 @@ def get_picture(
     index: Annotated[int, Path(ge=0)],
     request: Request,
     step: Step = 1,
+    beside: Beside = None,
 ) -> Response:
     """Return a picture or a frame of ground truth of a sample as PNG.
 
@@ -199,14 +296,15 @@ def get_picture(
     """
     data = opened.data
     # Without the name of the array, which is in the address.
-    tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}"'
+    tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}-{beside}"'
     headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}", "ETag": tag}
     if matches(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=headers)
     values = _value(data, array, slot)
     if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
         raise NotFoundError(f"{array[:50]} has no picture {index}")
-    (picture,) = coloured(data.arrays[array], values, [index])
+    scale = _scale(data, array, values, beside)
+    (picture,) = coloured(data.arrays[array], values, [index], scale)
     content = png(picture[::step, ::step])
     return Response(content, media_type="image/png", headers=headers)
 
@@ -250,7 +348,13 @@ def get_scene(digest: str, context: ContextDep) -> Response:
         known = known_scenes(connection).get(digest)
     if known is None:
         raise NotFoundError(f"there is no scene {digest[:64]!r}")
-    return html_page("scene.html", here="scenes", known=known, scene=known.scene)
+    return html_page(
+        "scene.html",
+        here="scenes",
+        known=known,
+        scene=known.scene,
+        text=scene_text(known.scene),
+    )
 
 
 @router.get("/certificates")

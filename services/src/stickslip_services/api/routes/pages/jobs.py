@@ -35,6 +35,7 @@ from stickslip_services.queue.jobs import (
     list_jobs,
     list_previews,
     list_samples,
+    lost_slots,
     show_job,
     slowest_tasks,
 )
@@ -56,8 +57,6 @@ MAX_SAMPLES = 20_000
 
 MAY_RETRY = (TaskState.failed, TaskState.soft_failed)
 """States of a task that may run again."""
-
-LOST = (TaskState.rejected, TaskState.failed)
 
 CHANGE_SECONDS = 1.0
 """Least time between two updates of a page [s]."""
@@ -160,10 +159,12 @@ def get_job_map(job_id: str, context: ContextDep) -> Response:
         if spec.sample_count > MAX_SAMPLES:
             return html_page("map.html", maps=None, count=spec.sample_count)
         samples = list_samples(connection, row.seq, PageRequest(MAX_SAMPLES, None), None).items
+        lost_ones = lost_slots(connection, row.seq)
     if len(samples) < spec.sample_count:
         return html_page("map.html", maps=[], count=spec.sample_count)
     done = np.array([sample.state is TaskState.succeeded for sample in samples])
-    lost = np.array([sample.state in LOST for sample in samples])
+    lost = np.zeros(len(samples), dtype=bool)
+    lost[lost_ones] = True
     maps = grid_maps(spec, done, lost, most=SHOWN_MAPS)
     return html_page("map.html", maps=maps, count=spec.sample_count)
 

@@ -1,5 +1,5 @@
-"""Bodies that are small against a cell: they carry cloth, nothing jumps over them, and friction on
-them is right.
+"""Bodies of about the size of a cell: they carry cloth, nothing jumps over them, and friction on
+them is right. What is smaller is refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,6 +21,7 @@ from stickslip_sim_core import (
 )
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks, meshes
+from stickslip_sim_core.cloth.contact import RADIUS_LEAST
 from stickslip_sim_core.cloth.solver import GRAVITY
 
 CELL = 0.01
@@ -31,18 +32,8 @@ FLOOR = plane(0.5, origin=(0.0, 0.0, -0.2))
 
 def body_forces(cloth: Cloth) -> np.ndarray:
     """Return the forces of the two bodies on the cloth in the last step (2, 3) [N]."""
-    pairs, contacts, reactions = cloth.pair_forces, cloth.contacts, cloth.reactions
-    free = np.setdiff1d(np.arange(len(contacts)), cloth.held)
-    on_cloth = (pairs.weights * (pairs.vertices < len(contacts))).sum(axis=1)[
-        :, None
-    ] * pairs.forces
-    return np.stack(
-        [
-            reactions[free][contacts[free] == body].sum(axis=0)
-            + on_cloth[pairs.body == body].sum(axis=0)
-            for body in (0, 1)
-        ]
-    )
+    contacts, reactions = cloth.contacts, cloth.reactions
+    return np.stack([reactions[contacts == body].sum(axis=0) for body in (0, 1)])
 
 
 def turned(angle: float) -> Floats:
@@ -63,7 +54,7 @@ def weight(cloth: Cloth) -> float:
 
 @pytest.mark.physics
 class TestCarries:
-    @pytest.mark.parametrize("cells", [0.3, 0.5, 1.0, 1.8])
+    @pytest.mark.parametrize("cells", [RADIUS_LEAST, 1.0, 1.8])
     @pytest.mark.parametrize(
         "body",
         [
@@ -73,9 +64,7 @@ class TestCarries:
         ],
         ids=["rod", "ball", "pillar"],
     )
-    def test_what_is_small_against_a_cell(
-        self, body: Callable[[float], Body], cells: float
-    ) -> None:
+    def test_what_is_as_large_as_a_cell(self, body: Callable[[float], Body], cells: float) -> None:
         bodies = [FLOOR, body(cells * CELL)]
         cloth = started(cells * CELL + 0.002, bodies)
         force = 0.0
@@ -87,33 +76,38 @@ class TestCarries:
             body_forces(cloth).sum(axis=0), abs=2e-3 * weight(cloth)
         )
         assert cloth.positions[:, 2].max() == pytest.approx(cells * CELL, abs=0.4 * CELL)
-        expected = cells if cells < 0.9 else np.inf
-        assert cloth.total.sharpest == pytest.approx(expected, rel=1e-3)
         assert cloth.total.unconverged <= 1
 
-    def test_a_blade_lifts(self) -> None:
-        blade = [box(0.5, (0.3, 0.002, 0.05), origin=(0.0, 0.0, -0.025))]
-        cloth = started(0.003, blade)
-        for step in range(1, 31):
-            up = [box(0.5, (0.3, 0.002, 0.05), origin=(0.0, 0.0, -0.025 + 0.002 * step))]
-            cloth.step(0.01, bodies=up, damping=5.0)
-        assert cloth.positions[:, 2].max() > 0.06 - 1e-4
 
-    def test_large_bodies_need_no_pairs(self) -> None:
-        cloth = started(0.052, [sphere(0.5, 0.05)])
-        for _ in range(10):
-            cloth.step(0.01, bodies=[sphere(0.5, 0.05)])
-        assert (cloth.contacts == 0).any()
-        assert cloth.total.sharpest == np.inf
-        assert not len(cloth.pair_forces.forces)
+@pytest.mark.parametrize(
+    "body",
+    [
+        sphere(0.5, 0.0089),
+        cylinder(0.5, 0.0089),
+        capsule(0.5, 0.0089, 0.2),
+        box(0.5, (0.3, 0.3, 0.3), rounding=0.0089),
+        box(0.5, (0.3, 0.002, 0.05)),
+    ],
+    ids=["ball", "rod", "pillar", "box", "blade"],
+)
+def test_what_is_sharper_than_cells_slide_over_is_refused(body: Body) -> None:
+    message = (
+        r"bodies: must have a radius of 0\.9 cells of the cloth or more, 9 mm, and body 1 has "
+        r"(8\.9|1) mm: give a finer cloth"
+    )
+    with pytest.raises(ValueError, match=message):
+        started(1.0, [FLOOR, body])
+    cloth = started(1.0)
+    with pytest.raises(ValueError, match=message):
+        cloth.step(0.01, bodies=[FLOOR, body])
+    with pytest.raises(ValueError, match=message):
+        started(1.0).advance(0.01, lambda _: (cloth.gravity, np.empty((0, 3)), [FLOOR, body]))
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("cells", [0.6, 1.9])
+@pytest.mark.parametrize("cells", [1.0, 1.9])
 def test_a_turning_rod_does_the_work_that_cloth_gets(cells: float) -> None:
-    """Its axis rests, but its face rubs: with the work on the axis alone, up to 20 % of the flow
-    was a gain.
-    """
+    """Its axis rests, but its face rubs."""
     mesh, radius = SHEET, cells * CELL
     held = np.flatnonzero(mesh.rest[:, 0] < -0.0499)
     cloth = Cloth(mesh, FABRIC, preset_named("certified"), held=held)
@@ -142,7 +136,7 @@ class TestSweeps:
             return [
                 sphere(0.5, 0.03, origin=origin)
                 if body == "ball"
-                else box(0.5, (0.06,) * 3, origin=origin)
+                else box(0.5, (0.06,) * 3, rounding=0.01, origin=origin)
             ]
 
         cloth = started(0.0, at(0.0))
@@ -167,34 +161,42 @@ class TestSweeps:
         assert cloth.positions[middle, 2] > top - 0.1 * CELL
 
     def test_a_paddle(self) -> None:
-        """A plate 0.4 cells thick turns upward at 20 rad/s: all that it sweeps stays on its upper
+        """A plate of 1.8 cells turns upward at 20 rad/s: all that it sweeps stays on its upper
         side.
         """
 
         def paddle(time: float) -> list[Body]:
             turn = turned(-20.0 * time)
-            return [box(0.5, (0.2, 0.2, 0.004), origin=turn @ [0.1, 0.0, 0.0], rotation=turn)]
+            return [
+                box(
+                    0.5,
+                    (0.2, 0.2, 0.018),
+                    rounding=0.009,
+                    origin=turn @ [0.1, 0.0, 0.0],
+                    rotation=turn,
+                )
+            ]
 
-        cloth = started(0.004, paddle(0.0))
+        cloth = started(0.0095, paddle(0.0))
         for step in range(1, 13):
             cloth.step(0.005, bodies=paddle(0.005 * step))
         pose = paddle(0.06)[0].pose
         local = (cloth.positions - pose[:, 3]) @ pose[:, :3]
-        within = np.abs(local[:, 0]) < 0.1
+        within = np.abs(local[:, 0]) < 0.09
         assert within.any()
         assert local[within, 2].min() > 0.0
 
 
-EDGE = {0.02: 1.085, 0.01: 1.048, 0.005: 1.015, 0.002: 1.014}
+EDGE = {0.02: 1.085, 0.01: 1.048, 0.005: 1.015}
 """By radius of the edge [m]: the mean force that pulls a strip over it, over its weight, with cells
 of 1.25 mm.
 """
 
 
-def pulled(radius: float, cell: float) -> tuple[float, float]:
+def pulled(radius: float, cell: float) -> float:
     """Pull a strip that hangs over a table's edge by its upper end.
 
-    Return the mean force over its weight, and the radius of the edge in cells.
+    Return the mean force over its weight.
     """
     mu, upper, speed, dt = 0.3, 0.1, 0.03, 0.01
     mesh = meshes.grid(0.02, 0.3, round(0.02 / cell), round(0.3 / cell))
@@ -218,7 +220,7 @@ def pulled(radius: float, cell: float) -> tuple[float, float]:
         cloth.step(dt, held=ends, bodies=table, damping=5.0 if way == 0.0 else 1.0)
         if step > 50:
             forces.append(-cloth.reactions[held, 1].sum())
-    return float(np.mean(forces)) / weight(cloth), cloth.total.sharpest
+    return float(np.mean(forces)) / weight(cloth)
 
 
 @pytest.mark.physics
@@ -227,17 +229,13 @@ def pulled(radius: float, cell: float) -> tuple[float, float]:
     [
         (0.02, 0.01),
         (0.01, 0.01),
-        (0.005, 0.01),
         pytest.param(0.01, 0.005, marks=pytest.mark.slow),
         pytest.param(0.005, 0.005, marks=pytest.mark.slow),
         pytest.param(0.005, 0.0025, marks=pytest.mark.slow),
-        pytest.param(0.002, 0.0025, marks=pytest.mark.slow),
     ],
 )
 def test_strip_over_an_edge(radius: float, cell: float) -> None:
-    force, sharpest = pulled(radius, cell)
-    assert force == pytest.approx(EDGE[radius], rel=0.05)
-    assert sharpest == np.inf or sharpest == pytest.approx(radius / cell, rel=1e-3)
+    assert pulled(radius, cell) == pytest.approx(EDGE[radius], rel=0.03)
 
 
 @pytest.mark.physics
@@ -247,7 +245,7 @@ class TestFriction:
         other turn. Its upper side goes to -y where it turns about x."""
         mesh = meshes.grid(0.02, 0.16, 2, 16)
         ends = np.flatnonzero(np.abs(mesh.rest[:, 1]) > 0.08 - 1e-9)
-        mu, radius = 0.2, 0.8 * CELL
+        mu, radius = 0.2, 1.0 * CELL
         pulls = []
         for speed in (3.0, -3.0):
 
@@ -312,8 +310,8 @@ def _about_x(angle: float) -> Floats:
 
 
 def test_bodies_keep_their_shapes() -> None:
-    cloth = started(0.1, [sphere(0.5, 0.01)])
+    cloth = started(0.1, [sphere(0.5, 0.02)])
     with pytest.raises(
         ValueError, match="bodies: must keep their shapes and friction, and body 0 does not"
     ):
-        cloth.step(0.01, bodies=[sphere(0.5, 0.02)])
+        cloth.step(0.01, bodies=[sphere(0.5, 0.03)])
