@@ -134,10 +134,10 @@ def test_pip_takes_the_commands_of_messages(distribution: str, extras: tuple[str
     assert done.returncode == 0, done.stderr
 
 
-def setup_tool() -> ModuleType:
-    """Return tools/setup_environment.py as a module."""
-    path = ROOT / "tools" / "setup_environment.py"
-    spec = importlib.util.spec_from_file_location("setup_environment", path)
+def tool_named(name: str) -> ModuleType:
+    """Return a program of tools/ as a module."""
+    path = ROOT / "tools" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -148,7 +148,7 @@ def setup_tool() -> ModuleType:
 
 def test_uv_looks_where_pip_looks() -> None:
     """uv reads no file of pip, so a company's index must be handed over."""
-    tool = setup_tool()
+    tool = tool_named("setup_environment")
     listing = (
         ":env:.find-links='/srv/wheels'\n"
         "global.index-url='https://pypi.example.org/simple'\n"
@@ -169,9 +169,28 @@ def test_packages_of_other_places_do_not_count(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("PYTHONPATH", "/opt/ros/lib")
     monkeypatch.setenv("PIP_USER", "1")
     monkeypatch.setenv("STICKSLIP_OTHER", "stays")
-    environment = setup_tool().clean_environment()
+    environment = tool_named("setup_environment").clean_environment()
     assert not {"PYTHONPATH", "PIP_USER"} & environment.keys()
     assert environment["STICKSLIP_OTHER"] == "stays"
+
+
+def test_cpu_time_of_processes_without_a_parent_counts(tmp_path: Path) -> None:
+    """Ray's processes outlive the one that starts them, and nobody waits for them."""
+    work = (
+        "import pathlib, time\n"
+        "while time.process_time() < 1.5: pass\n"
+        "time.sleep(0.5)\n"
+        "pathlib.Path('done').touch()\n"
+    )
+    launcher = (
+        "import subprocess, sys, time\n"
+        f"subprocess.Popen([sys.executable, '-c', {work!r}], start_new_session=True)\n"
+        "time.sleep(1)\n"
+    )
+    # The shell stays until the orphan has ended.
+    command = f'{sys.executable} -c "$0"; while [ ! -e done ]; do sleep 0.1; done'
+    measured = tool_named("release_check").run_measured(["sh", "-c", command, launcher], tmp_path)
+    assert 1.4 < measured.cpu_seconds < 6.0
 
 
 def test_the_readme_has_the_measured_minutes_and_gigabytes() -> None:

@@ -97,6 +97,8 @@ OWNED = {
         ("GET", f"/ui/datasets/{{dataset}}/v{{version}}/{rest}")
         for rest in (
             "thumbs",
+            "cover.png",
+            "selection.zip",
             "spec.yaml",
             "samples/{slot}/motion.json",
             "samples/{slot}/{array}.mp4",

@@ -179,6 +179,28 @@ def test_a_wrong_document_is_refused_as_a_file_and_as_a_body(
         assert str(first["value"]) in line
 
 
+BODIES = {
+    "not UTF-8": (b'{"kind": "\xe4"}', "it must be text in UTF-8, and byte 10 is not"),
+    "UTF-16": ('{"kind": 1}'.encode("utf-16"), "it must be text in UTF-8, and byte 0 is not"),
+    "cut off": (b'{"kind": ', "Expecting value, line 1, column 10"),
+    "surrogate": (b'{"kind": "\\ud800"}', "it must not have the lone surrogate '\\ud800'"),
+    "a long integer": (
+        b'{"seed": ' + b"7" * 5000 + b"}",
+        "an integer must have at most 4000 digits, and one has 5000",
+    ),
+    "a key twice": (b'{"kind": 1, "kind": 2}', "the key 'kind' is there twice"),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_body_that_is_no_json_is_refused_in_plain_words(api: httpx.Client, name: str) -> None:
+    body, fault = BODIES[name]
+    headers = {"Content-Type": "application/json"}
+    answer = api.post("/v1/jobs:validate", content=body, headers=headers)
+    assert answer.status_code == 400
+    assert answer.json()["detail"] == f"the body is not JSON: {fault}"
+
+
 NUMBER = "not a valid integer range"
 FLAGS: list[tuple[str, int, str]] = [
     ("submitt", 2, "No such command 'submitt'. Did you mean 'submit'?"),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from stickslip_schemas.base import replace_at
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.errors import UnfitStartError
@@ -39,6 +40,7 @@ SCENE: dict[str, Any] = {
     },
     "bodies": {"floor": {"type": "plane"}},
     "default_friction": 0.4,
+    "gravity": [0.0, 0.0, -9.81],
 }
 OTHER = SCENE["sheets"]["cloth"]
 CLOTH = ("sheets", "cloth")
@@ -403,6 +405,19 @@ FAULTS += [
         None,
     ),
     (
+        # Gravity draws the sheet along y, to the ball.
+        {
+            ("gravity",): [0.0, 9.81, 0.0],
+            ORIGIN: [0.0, 0.0, 0.02],
+            (*CLOTH, "start"): {"type": "hung"},
+            HOLDERS: {"h": {"edge": "top"}},
+            ("bodies", "ball"): {**BALL, "origin": [0.0, 0.1, 0.02]},
+        },
+        ORIGIN,
+        "where it hangs, vertex",
+        None,
+    ),
+    (
         {
             ORIGIN: [0.0, 0.0, 0.12],
             (*CLOTH, "start"): {"type": "hung"},
@@ -445,6 +460,16 @@ def test_it_is_refused(
         assert fault.value == pytest.approx(value, rel=1e-2)
     elif value is not None:
         assert fault.value == value
+
+
+def test_a_sheet_without_weight_is_not_hung() -> None:
+    changes: dict[tuple[str, ...], Any] = {
+        ("gravity",): [0.0, 0.0, 0.0],
+        (*CLOTH, "start"): {"type": "hung"},
+        HOLDERS: {"h": {"edge": "top"}},
+    }
+    with pytest.raises(ValidationError, match="must not be hung where gravity is zero"):
+        faults_of(changes)
 
 
 CAN_START: list[dict[tuple[str, ...], Any]] = [

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stickslip_sim_core import ClothRun, fabric, fabric_names
+from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes import cloth_drag, holders
@@ -138,6 +139,29 @@ class TestClothRun:
         ]
         assert (starts[0] == starts[1]).all()
         assert (starts[0] == starts[2]).all()
+
+    def test_hangs_under_its_gravity(self) -> None:
+        """A scene that is turned has the turned shape, and half the gravity another one."""
+        mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 8, 8)
+        made = fabric("gray-interlock")
+        held = cloth_drag.held_by_holders(mesh)
+        flat = np.column_stack([0.0 * mesh.rest[:, 0], mesh.rest])
+        down = np.array([0.0, 0.0, -GRAVITY])
+        # From z to x, from x to y, from y to z.
+        turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+        def shape(turn: Floats, gravity: Floats) -> Floats:
+            found = holders.hung(
+                mesh, made, flat @ turn.T, held, normal=turn[:, 0], seed=0, gravity=turn @ gravity
+            )
+            assert found.reason == ""
+            return found.positions @ turn
+
+        upright = shape(np.eye(3), down)
+        assert shape(turn, down) == pytest.approx(upright, abs=1e-6)
+        assert np.abs(shape(turn, 0.5 * down) - upright).max() > 1e-4
+        with pytest.raises(ValueError, match="gravity: cloth can only hang under gravity, got"):
+            shape(turn, 0.0 * down)
 
     def test_every_fabric_comes_to_rest(self) -> None:
         """Also one that stiffens so fast that its steps swing about the shape at rest."""

@@ -25,6 +25,7 @@ from stickslip_schemas.scene.parts import (
     Body,
     FileMesh,
     FromFile,
+    Hung,
     Looks,
     MeshBody,
     Motion,
@@ -238,6 +239,17 @@ class Physics(Document):
                 position = holder.vertices.index(last)
                 rule = f"must be a vertex of the sheet, below {count}"
                 refuse(self, (*location, "holders", key, "vertices", position), rule, last)
+
+    @model_validator(mode="after")
+    def _hangs_under_gravity(self) -> Self:
+        # A sheet without a weight has no shape of hanging.
+        if any(self.gravity):
+            return self
+        for name, sheet in self.sheets.items():
+            if isinstance(sheet.start, Hung):
+                rule = "must not be hung where gravity is zero: start it flat, or give it a gravity"
+                refuse(self, ("sheets", name, "start"), rule, sheet.start.type)
+        return self
 
     @model_validator(mode="after")
     def _friction_of_each_two(self) -> Self:

@@ -1,8 +1,8 @@
 """Where hung sheets hang, as far as geometry alone tells.
 
 A sheet whose holders take a level line across its whole width, at one side of it, hangs straight
-down from there: no vertex can hang lower. Sheets that hang from corners or from strips are left to
-the simulation.
+down from there, along gravity: no vertex can hang lower. Sheets that hang from corners or from
+strips are left to the simulation.
 """
 
 from collections.abc import Mapping
@@ -35,6 +35,8 @@ def hung_positions(document: Mapping[str, Any], sheet: SheetStart) -> Floats | N
 
     `document` is the physics as JSON, with the arrays of files.
     """
+    gravity = np.array(document["gravity"], float)
+    down = gravity / np.linalg.norm(gravity)
     held = np.zeros(len(sheet.rest), dtype=bool)
     for holder in document["sheets"][sheet.name]["holders"].values():
         held |= held_vertices(sheet, holder)
@@ -52,12 +54,12 @@ def hung_positions(document: Mapping[str, Any], sheet: SheetStart) -> Floats | N
     heights = offsets @ np.array([-along[1], along[0]])
     direction = (sheet.positions[last] - sheet.positions[first]) / length
     is_line = np.abs(heights[held]).max() <= STRAIGHT * size
-    is_level = abs(direction[2]) <= LEVEL
+    is_level = abs(direction @ down) <= LEVEL
     is_at_one_side = min(heights.max(), -heights.min()) <= STRAIGHT * size
     is_across = np.ptp(places[held]) >= (1.0 - UNCERTAIN_SHARE) * np.ptp(places)
     if not (is_line and is_level and is_at_one_side and is_across):
         return None
-    below = np.abs(heights)[:, None] * [0.0, 0.0, -1.0]
+    below = np.abs(heights)[:, None] * down
     return np.asarray(sheet.positions[first] + places[:, None] * direction + below)
 
 

@@ -72,7 +72,7 @@ def choose(data: SampleData, query: Query) -> Choice:
 
 def conditions(query: Query) -> tuple[str, ...]:
     """Return the conditions on labels of a query, such as `mu<0.5`."""
-    found = []
+    texts = []
     for number in range(CONDITIONS):
         label, operator, value = (
             query.get(f"where{number}.{part}", "").strip()
@@ -80,8 +80,8 @@ def conditions(query: Query) -> tuple[str, ...]:
         )
         # A row of the form that is not filled in is no condition.
         if label and value and operator in OPERATORS:
-            found.append(f"{label}{operator}{value}")
-    return tuple(found)
+            texts.append(f"{label}{operator}{value}")
+    return tuple(texts)
 
 
 def _options(axes: list[Slider], query: Query) -> tuple[str, ...]:
@@ -146,15 +146,15 @@ def sliders(spec: JobSpec) -> list[Slider]:
 
     The values are in order.
     """
-    found = []
+    axes = []
     for name, column in zip(spec.named_axes, spec.columns(), strict=True):
         values = sorted(set(column))
         if len(values) > MAX_STOPS:
             stops = np.unique(np.linspace(0, len(values) - 1, MAX_STOPS).astype(int))
             values = [values[stop] for stop in stops]
         if len(values) > 1:
-            found.append({"name": name, "values": values})
-    return found
+            axes.append({"name": name, "values": values})
+    return axes
 
 
 def _within_slider(data: SampleData, axis: Slider, query: Query) -> Flags:

@@ -110,15 +110,15 @@ def _size(data: SampleData, name: str, slot: int) -> tuple[int, int]:
     return (width, height) if size is None else (int(size[0]), int(size[1]))
 
 
-def overlaid(shown: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def overlaid(views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the plots of one sample, or those of two with the curves of both on one scale."""
-    if len(shown) == 1:
-        plots: list[dict[str, Any]] = shown[0]["plots"]
+    if len(views) == 1:
+        plots: list[dict[str, Any]] = views[0]["plots"]
         return plots
     joined = []
-    for of_samples in zip(*(view["plots"] for view in shown), strict=True):
+    for of_samples in zip(*(view["plots"] for view in views), strict=True):
         tables = []
-        for position, (view, of_sample) in enumerate(zip(shown, of_samples, strict=True)):
+        for position, (view, of_sample) in enumerate(zip(views, of_samples, strict=True)):
             for part in of_sample["tables"]:
                 # A curve names its sample, and those of the second one are dashed.
                 curves = {

@@ -51,7 +51,12 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     sheets = []
     for name in names:
         part = sheet(
-            name, document["sheets"][name], document["materials"], seed=seed, kernel=kernel
+            name,
+            document["sheets"][name],
+            document["materials"],
+            gravity=document["gravity"],
+            seed=seed,
+            kernel=kernel,
         )
         # The solver counts every connected piece as a sheet. Two pieces under one name would shift
         # the numbers of all later sheets.

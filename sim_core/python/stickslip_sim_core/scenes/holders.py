@@ -179,9 +179,10 @@ def hung(
     *,
     normal: ArrayLike,
     seed: int,
+    gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
     kernel: str | None = None,
 ) -> Hung:
-    """Return the shape at rest, under gravity along -z, of a cloth that is let down.
+    """Return the shape at rest, under its gravity, of a cloth that is let down.
 
     The cloth is flat at first.
 
@@ -196,8 +197,17 @@ def hung(
         held: Vertices under the holders: (K,).
         normal: Normal of the flat sheet, which is the direction of the tilt: (3,).
         seed: Seed of the bias.
+        gravity: Acceleration of gravity: (3,) [m/s^2].
         kernel: Level of the kernels, see `Cloth`.
+
+    Raises:
+        ValueError: Gravity is zero.
     """
+    weight = np.asarray(gravity, float)
+    size = float(np.linalg.norm(weight))
+    # Without a weight the cloth would keep its flat shape, which is no shape of hanging.
+    if not size > 0.0:
+        raise ValueError(f"gravity: cloth can only hang under gravity, got {weight.tolist()} m/s^2")
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
     rng = np.random.default_rng(seed)
     side = 1 if rng.random() < 0.5 else -1
@@ -206,11 +216,11 @@ def hung(
     twist = float(rng.uniform(-0.3, 0.3))
     tilt = side * bias * (1.0 + twist * mesh.rest[:, 0] / np.abs(mesh.rest[:, 0]).max())
     tilts = tilt[:, None] * np.asarray(normal, float)
-    down = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+    down = np.tile(weight, (len(mesh.rest), 1))
     cloth.set_state(flat)
     dt = FIRST_STEP
     for times in HANGING_TILTS:
-        cloth.gravity = down + times * tilts * GRAVITY
+        cloth.gravity = down + times * tilts * size
         for _ in range(SETTLING_STEPS):
             cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
             dt = min(GROWTH * dt, HANGING.time_step)

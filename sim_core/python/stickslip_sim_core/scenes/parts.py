@@ -63,11 +63,17 @@ class Sheet:
 
 
 def sheet(
-    name: str, given: Document, materials: Document, *, seed: int, kernel: str | None
+    name: str,
+    given: Document,
+    materials: Document,
+    *,
+    gravity: ArrayLike,
+    seed: int,
+    kernel: str | None,
 ) -> Sheet:
     """Return a sheet of a document. `materials` are its custom fabrics.
 
-    `seed` draws the tilt of hung cloth.
+    Hung cloth hangs under `gravity` (3,) [m/s^2], and `seed` draws its tilt.
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
@@ -121,7 +127,14 @@ def sheet(
     hanging = None
     if begin["type"] == "hung":
         hanging = hung(
-            mesh, made, start, np.flatnonzero(taken), normal=turn[:, 2], seed=seed, kernel=kernel
+            mesh,
+            made,
+            start,
+            np.flatnonzero(taken),
+            normal=turn[:, 2],
+            seed=seed,
+            gravity=gravity,
+            kernel=kernel,
         )
         start = hanging.positions
     return Sheet(name, mesh, made, given["thickness"], start, hanging, holders, tracks, boxes, last)

@@ -232,7 +232,7 @@ def get_sample(
     # A rejected sample has labels of its rejection, and no arrays.
     rejections = {number: data.rejection(number) for number in slots}
     valid = [number for number in slots if rejections[number] is None]
-    shown = [sample_view(data, number) for number in valid]
+    views = [sample_view(data, number) for number in valid]
     return html_page(
         "sample.html",
         here="datasets",
@@ -242,8 +242,8 @@ def get_sample(
         slot=slot,
         last_slot=last,
         rejections=[rejection for rejection in rejections.values() if rejection is not None],
-        shown=shown,
-        plots=overlaid(shown),
+        views=views,
+        plots=overlaid(views),
         has_mp4=find_spec("av") is not None,
     )
 

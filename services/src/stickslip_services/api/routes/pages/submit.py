@@ -89,7 +89,7 @@ def get_form(
 async def post_check(request: Request, context: ContextDep) -> Response:
     """Show the faults, the size and the cost of the job, and the spec in three forms."""
     sent = await _sent(request)
-    return await run_in_threadpool(lambda: _shown(_checked(context, sent), is_submission=False))
+    return await run_in_threadpool(lambda: _answer(_checked(context, sent), is_submission=False))
 
 
 @router.post("/ui/submit")
@@ -143,7 +143,7 @@ def _checked(context: Context, sent: Sent) -> Check:
 def _submitted(context: Context, sent: Sent) -> Response:
     check = _checked(context, sent)
     if check.spec is None or check.faults:
-        return _shown(check, is_submission=True)
+        return _answer(check, is_submission=True)
     # One form makes one job of a spec, however often the button is pressed.
     content = sha256(check.spec.model_dump_json().encode())[:16]
     key = f"form-{(sent.get('token') or [''])[0][:64]}-{content}"
@@ -151,12 +151,13 @@ def _submitted(context: Context, sent: Sent) -> Response:
         job = submit_job(context, check.spec, key)
     except StickslipError as error:
         check.add("", str(error))
-        return _shown(check, is_submission=True)
+        return _answer(check, is_submission=True)
     job_id = job.id if isinstance(job, JobDetail) else job.job_id
     return Response(status_code=204, headers={"HX-Redirect": link(f"/jobs/{job_id}")})
 
 
-def _shown(check: Check, *, is_submission: bool) -> Response:
+def _answer(check: Check, *, is_submission: bool) -> Response:
+    """Return the faults of a form, its size and cost, and its spec in three forms."""
     return html_page(
         "submit_check.html",
         check=check,
