@@ -150,7 +150,7 @@ class ContactSet {
   void linearize_at(const Buffer<double>& x);
 
   // A triangle whose closest point to a vertex lies on this feature.
-  struct Found {
+  struct NearFeature {
     int feature;
     const Candidate* candidate;
     Eigen::Vector4d weights;
@@ -163,7 +163,7 @@ class ContactSet {
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_;
-  std::vector<Found> found_;                     // of the vertex at hand
+  std::vector<NearFeature> near_features_;       // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
   std::vector<int> nodes_;                       // of `rows`
